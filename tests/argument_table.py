@@ -412,7 +412,7 @@ NOT_HERE: dict[str, str] = {
         CameraConformance EmulatedCamera.application_of EmulatedCamera.from_scenario
         EmulatedCamera.lost EmulatedCamera.make_machine EmulatedCamera.mistake
         EmulatedCamera.received EmulatedCamera.serves EmulatedCamera.state_options
-        WireCamera.arrived WireCamera.parted WireCamera.passed WireCamera.traced
+        WireCamera.arrived WireCamera.connection_ended WireCamera.passed WireCamera.traced
         WireCamera.mistake WireCamera.application_of WireCamera.state_options
         WireCamera.from_scenario WireCamera.lost WireCamera.make_machine WireCamera.received
         WireCamera.serves EmulatedInSight.admits EmulatedInSight.execute

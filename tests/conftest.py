@@ -8,6 +8,7 @@ import gc
 import importlib
 import inspect
 import os
+import re
 import shutil
 import signal
 import sys
@@ -31,6 +32,15 @@ settings.register_profile("nightly", deadline=None, max_examples=2000, print_blo
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 ROOT = Path(__file__).parent.parent
+
+ONLY_LONG = frozenset({"long", "long and not widest", "judged"})
+"""Choices of marks by which only ``long`` tests run."""
+
+SOME_LONG = re.compile(r"\b(long|sampled|judged|widest|LONG|ONE_LONG)\b|_long\b")
+"""Pattern of the words of which each module that has ``long`` tests has one."""
+
+ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", re.MULTILINE)
+"""Pattern of the line that marks all tests of a module as ``long``."""
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     # Tests run side by side, and their matrices are small: more threads of one test wait for each
@@ -101,7 +111,8 @@ def _import_from_ones_own_place_on(session: pytest.Session) -> None:
     if worker is None or worker["workercount"] == 1:
         return
     paths = [Path(one.split("::")[0]).absolute() for one in session.config.args]
-    files = sorted({file for path in paths for file in _test_files(path)})
+    found = {file for path in paths for file in _test_files(path)}
+    files = sorted(one for one in found if not pytest_ignore_collect(one, session.config))
     number, count = int(worker["workerid"].removeprefix("gw")), worker["workercount"]
     begin = len(files) * number // count
     for file in files[begin:] + files[:begin]:
@@ -119,27 +130,49 @@ def _test_files(path: Path) -> list[Path]:
     return list(path.rglob("test_*.py")) if path.is_dir() else [path] if path.is_file() else []
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Spare a run the modules of which it has no test: all are ``long``, or none is."""
+    marks = config.option.markexpr
+    if not collection_path.match("test_*.py") or marks not in {"not long", *ONLY_LONG}:
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    none = SOME_LONG.search(text) is None if marks in ONLY_LONG else ALL_LONG.search(text)
+    return True if none else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark as ``long`` the cases of a ``sampled`` test that the short run leaves out.
 
     Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
-    values of the parameter that changes fastest take turns. Of the others every second one is
-    ``judged``, and the rest ``widest``.
+    values of the parameter that changes fastest take turns. Of the others every third one is
+    ``judged``, and the rest ``widest``. With ``SMARTCAM_TEST_CASES=first`` one case of each test
+    stays. What is marked ``judged`` is ``long``.
     """
+    first_alone = os.environ.get("SMARTCAM_TEST_CASES") == "first"
     counts: Counter[tuple[Any, str]] = Counter()
     left_out: Counter[tuple[Any, str]] = Counter()
+    long_ones: set[Path] = set()
     for item in items:
         marker = item.get_closest_marker("sampled")
-        if marker is None or item.get_closest_marker("long"):
+        if item.get_closest_marker("judged"):
+            item.add_marker(pytest.mark.long)
+        if item.get_closest_marker("long"):
+            long_ones.add(item.path)
             continue
-        test, every = (item.parent, getattr(item, "originalname", "")), marker.kwargs["every"]
+        if marker is None and not first_alone:
+            continue
+        test = (item.parent, getattr(item, "originalname", ""))
+        every = sys.maxsize if marker is None or first_alone else marker.kwargs["every"]
         row, place = divmod(counts[test], every)
         if (row + place) % every:
             item.add_marker(pytest.mark.long)
-            item.add_marker(pytest.mark.widest if left_out[test] % 2 else pytest.mark.judged)
+            item.add_marker(pytest.mark.widest if left_out[test] % 3 else pytest.mark.judged)
             left_out[test] += 1
         counts[test] += 1
+    for path in long_ones:
+        if SOME_LONG.search(path.read_text(encoding="utf-8")) is None:
+            raise pytest.UsageError(f"{path} has long tests, but not a word of {SOME_LONG.pattern}")
 
 
 def pytest_collection_finish() -> None:

@@ -1,8 +1,8 @@
 """The event loops that tests run in, and others that one run may have in their place.
 
 ``SMARTCAM_TEST_LOOP`` is ``eager`` (every task begins where it is made, Python 3.12 and later),
-``debug`` (asyncio's debug mode), or ``uvloop``, whose time cannot be moved: then the tests that
-need a time of their own are left out.
+``debug`` (asyncio's debug mode), ``eager debug``, or ``uvloop``, whose time cannot be moved: then
+the tests that need a time of their own are left out.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from tests.timed_loop import TimedLoop
 LOOP = os.environ.get("SMARTCAM_TEST_LOOP", "")
 """The loop that all tests are to have; empty for the usual ones."""
 
-if LOOP not in {"", "eager", "debug", "uvloop"}:
-    raise ValueError(f"SMARTCAM_TEST_LOOP is eager, debug or uvloop, not {LOOP!r}")
+if LOOP not in {"", "eager", "debug", "eager debug", "uvloop"}:
+    raise ValueError(f"SMARTCAM_TEST_LOOP is eager, debug, both or uvloop, not {LOOP!r}")
 
 
 def timed() -> asyncio.AbstractEventLoop:
@@ -35,9 +35,9 @@ def real() -> asyncio.AbstractEventLoop:
 
 
 def _changed(loop: asyncio.AbstractEventLoop) -> asyncio.AbstractEventLoop:
-    if LOOP == "eager":
+    if "eager" in LOOP:
         loop.set_task_factory(getattr(asyncio, "eager_task_factory"))  # noqa: B009 - of 3.12
-    if LOOP == "debug":
+    if "debug" in LOOP:
         loop.set_debug(True)
     return loop
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.calibrate_files import (
-    OWN,
+    DEFAULT,
     WIZARDS,
-    OwnContext,
-    WithFiles,
-    WithParts,
+    DefaultCommand,
+    DefaultCommandContext,
+    GroupWithDefault,
     compare,
     draw,
 )
@@ -50,7 +50,7 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 
 
 @click.command(
-    cls=WithParts,
+    cls=DefaultCommand,
     hidden=True,
     help=f"{HELP}"
     "Asks step by step; each answer is saved before the next step is shown, so the same "
@@ -227,10 +227,10 @@ async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[Fr
         yield source
 
 
-wizard_command.context_class = OwnContext
-calibrate = WithFiles(
+wizard_command.context_class = DefaultCommandContext
+calibrate = GroupWithDefault(
     "calibrate",
-    commands={OWN: wizard_command, "lens": calibrate_lens, "compare": compare, "draw": draw},
+    commands={DEFAULT: wizard_command, "lens": calibrate_lens, "compare": compare, "draw": draw},
     help=HELP,
 )
 

@@ -34,12 +34,12 @@ WIZARDS = ("plane", "sheet", "hand-eye")
 MIN_LIKENESS = 0.75
 """Likeness to a command, 0 to 1, from which a word counts as that command and not as a host."""
 
-OWN = "wizard"
+DEFAULT = "wizard"
 """Name of the default command below ``calibrate``, which users need not type."""
 
 
-class OwnContext(click.Context):
-    """The context of a group's default command: usage texts show it by the group's name."""
+class DefaultCommandContext(click.Context):
+    """The context of a group's default command, which usage texts show under the group's name."""
 
     @property
     def command_path(self) -> str:
@@ -47,7 +47,7 @@ class OwnContext(click.Context):
         return super().command_path.rstrip()
 
 
-class WithParts(click.Command):
+class DefaultCommand(click.Command):
     """The default command; its help also lists the other commands."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -57,7 +57,7 @@ class WithParts(click.Command):
             write_commands(ctx.parent.command, ctx, formatter)
 
 
-class WithFiles(ListedGroup):
+class GroupWithDefault(ListedGroup):
     """A group of commands; arguments without a command go to the default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -65,7 +65,7 @@ class WithFiles(ListedGroup):
         own = not args or args[0] not in self.commands
         if own and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
             self._check_host(ctx, *args[:2])
-        return super().parse_args(ctx, [OWN, *args] if own else args)
+        return super().parse_args(ctx, [DEFAULT, *args] if own else args)
 
     def _check_host(self, ctx: click.Context, word: str, after: str = "-") -> None:
         """Refuse a word that is more probably a command, or a wizard, than the name of a host."""
@@ -73,7 +73,7 @@ class WithFiles(ListedGroup):
 
         if word in WIZARDS:
             ctx.fail(f"{word!r} is no command but a wizard: smartcam calibrate URL --wizard {word}")
-        commands = [name for name in self.list_commands(ctx) if name != OWN]
+        commands = [name for name in self.list_commands(ctx) if name != DEFAULT]
         if (
             after.startswith("-")
             and closest(word, [*commands, *WIZARDS], least=MIN_LIKENESS) is None
@@ -90,7 +90,7 @@ class WithFiles(ListedGroup):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command, and the arguments that are left for it."""
         name, command, rest = super().resolve_command(ctx, args)
-        return (None if name == OWN else name), command, rest
+        return (None if name == DEFAULT else name), command, rest
 
 
 def _svg(_context: object, _option: object, path: str | None) -> str | None:

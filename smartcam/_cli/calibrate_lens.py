@@ -174,7 +174,7 @@ def read_target(path: str) -> Target:
 
 def _check_free(file: str, force: bool) -> None:
     if Path(file).exists() and not force:
-        raise ConfigurationError(f"{file}: the file is there already; --force takes its place")
+        raise ConfigurationError(f"{file}: the file exists already; --force replaces it")
     if not Path(file).parent.is_dir():
         raise ConfigurationError(f"{file}: there is no folder {Path(file).parent}")
 

@@ -153,9 +153,7 @@ async def convert(
 
     def work() -> tuple[int, Cloud]:
         if Path(target).exists() and not force:
-            raise ConfigurationError(
-                f"{target}: the file is there already; --force takes its place"
-            )
+            raise ConfigurationError(f"{target}: the file exists already; --force replaces it")
         cloud = load_cloud(source, unit=unit)
         before = len(cloud)
         for axis, low, high in ranges:

@@ -21,8 +21,8 @@ STAMP_PERIOD: Final = 0.1
 STAMP_ROWS: Final = 16
 """Number of rows of a picture that a stamp covers."""
 
-STRANGE: Final = 60.0
-"""Latency in seconds above which the stamp must be another machine's clock; also below 0."""
+MAX_LATENCY: Final = 60.0
+"""Largest plausible latency, seconds; a larger or negative one shows another machine's clock."""
 
 
 async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
@@ -85,7 +85,7 @@ class _Stamps:
 
     async def _look(self, frame: Frame, now: float) -> None:
         found = await asyncio.to_thread(_stamp_of, frame)
-        if found is not None and 0 <= now - found < STRANGE:
+        if found is not None and 0 <= now - found < MAX_LATENCY:
             self.latencies.append(now - found)
 
 

@@ -88,7 +88,7 @@ async def list_(scheme: str | None, options: Options) -> None:
         click.echo(
             f"nothing found; looked for: {', '.join(searched)}"
             if searched
-            else f"{scheme}:// is not looked for: its sources are opened by their URLs"
+            else f"{scheme}:// has no search: open its sources by their URLs"
         )
 
 
@@ -101,7 +101,7 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
     from smartcam.registry import FRAMES
 
     try:
-        if scheme in FRAMES and _usual_discover(FRAMES.load(scheme)):
+        if scheme in FRAMES and _has_no_search(FRAMES.load(scheme)):
             return None
         async with asyncio.timeout(seconds):
             return await discover(scheme)
@@ -111,7 +111,7 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
         return exc
 
 
-def _usual_discover(driver: Any) -> bool:
+def _has_no_search(driver: Any) -> bool:
     from smartcam.frames import FrameDriver
 
     return next(kind for kind in driver.__mro__ if "discover" in vars(kind)) is FrameDriver
@@ -119,7 +119,7 @@ def _usual_discover(driver: Any) -> bool:
 
 def _show_broken(scheme: str, error: Exception, options: Options) -> None:
     reason = str(error) if isinstance(error, (SmartCamError, OSError)) else repr(error)
-    options.show({"scheme": scheme, "error": reason}, f"{scheme}: cannot be looked for: {reason}")
+    options.show({"scheme": scheme, "error": reason}, f"{scheme}: the search failed: {reason}")
 
 
 def _found(one: FoundSource) -> dict[str, Any]:
@@ -210,7 +210,7 @@ async def grab(
 
     suffix = Path(output).suffix.lower()
     if trigger and after_now:
-        raise click.UsageError("--trigger is after now: no --after-now beside it")
+        raise click.UsageError("--trigger includes --after-now: leave --after-now out")
     if suffix == ".raw" and (grey or eight):
         raise click.UsageError("a .raw file has the bytes as they came: no --grey or --8-bit")
     files = numbered(output, options.count or 1)
@@ -275,7 +275,7 @@ def _check_free(files: Sequence[str], force: bool) -> None:
         raise ConfigurationError(f"{files[0]}: there is no folder {folder}")
     there = next((file for file in files if Path(file).exists()), None)
     if there is not None and not force:
-        raise ConfigurationError(f"{there}: the file is there already; --force takes its place")
+        raise ConfigurationError(f"{there}: the file exists already; --force replaces it")
 
 
 def _write(file: str, data: bytes) -> None:
@@ -291,9 +291,9 @@ def _write(file: str, data: bytes) -> None:
 @frames.command(
     name="measure",
     help="Read a source for some seconds and report its rate and jitter, the age of arriving "
-    "frames, lost and skipped frames, and this process' part of a core. The latency is that "
-    "of pictures with a stamp, as synthetic:// draws it, seen by any camera or through any "
-    "codec; the clock must be this machine's.",
+    "frames, lost and skipped frames, and this process' part of a core. The latency is "
+    "measured by the stamp that synthetic:// on this machine draws into its pictures; they may "
+    "come through any camera or codec.",
 )
 @click.argument("url")
 @option("--seconds", default=5.0, show_default=True, help="Seconds from the first frame on.")

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 MAX_SHOWN = 4
 """Largest number of sources side by side on a page."""
 
-FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
-"""Errors that stay: another try to open the source would fail, too."""
+PERMANENT_ERRORS = (ConfigurationError, FrameFormatError, UnsupportedError)
+"""Errors after which another try to open the source would fail, too."""
 
 FIRST_TRY_TIMEOUT = 3.0
 """Seconds to wait for the first try of each source, before the others are served."""
@@ -212,7 +212,7 @@ class _Tries:
         return tried
 
     def _all_for_good(self) -> bool:
-        wrong = [isinstance(one, FOR_GOOD) for one in self._first.values()]
+        wrong = [isinstance(one, PERMANENT_ERRORS) for one in self._first.values()]
         return len(wrong) == self._count and all(wrong)
 
     async def check(self) -> None:

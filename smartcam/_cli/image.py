@@ -40,7 +40,7 @@ async def image(url: str, output: str, force: bool, options: Options) -> None:
 def _check_free(file: str, force: bool) -> None:
     path = Path(file)
     if path.exists() and not force:
-        raise ConfigurationError(f"{file}: the file is there already; --force takes its place")
+        raise ConfigurationError(f"{file}: the file exists already; --force replaces it")
     if not path.parent.is_dir():
         raise ConfigurationError(f"{file}: there is no folder {path.parent}")
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._inside import CameraAnswer, Trial
     from smartcam.observers import TraceEntry
 
-MAX_HEX = 128
+MAX_HEX_DIGITS = 128
 """Largest number of hex digits of a frame on a line; ``--json`` and ``--trace`` have all."""
 
 
@@ -56,11 +56,11 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
 
 def frame_text(entry: TraceEntry) -> str:
     """Return an entry as a line: message, fields, bytes; broken bytes as text, too."""
-    data = entry.hex[:MAX_HEX] + ("..." if len(entry.hex) > MAX_HEX else "")
+    data = entry.hex[:MAX_HEX_DIGITS] + ("..." if len(entry.hex) > MAX_HEX_DIGITS else "")
     if entry.direction != "!":
         fields = ", ".join(f"{name}={value}" for name, value in (entry.fields or {}).items())
         return f"{entry.direction} {entry.message}({fields})  {data}"
-    raw = bytes.fromhex(entry.hex)[: MAX_HEX // 2]
+    raw = bytes.fromhex(entry.hex)[: MAX_HEX_DIGITS // 2]
     text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in raw)
     return f"! {entry.message}" + (f"  {data}  '{text}'" if raw else "")
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PROTOCOL = "bvs"
 """The default protocol of the emulated cameras."""
 
-SHOWN = 7
+ON_PAGE = 7
 """The application that runs for a page without a scenario."""
 
 _OPTION_NAMES = {
@@ -259,8 +259,8 @@ def _plain(protocol: str, *, shown: bool) -> Scenario:
     from smartcam.emulator._inside import emulated_class
 
     camera = emulated_class(protocol)
-    running = Scenario(protocol=protocol, active=SHOWN, running=True)
-    able = shown and camera.state_options(SHOWN, running=True) and camera.mistake(running) is None
+    running = Scenario(protocol=protocol, active=ON_PAGE, running=True)
+    able = shown and camera.state_options(ON_PAGE, running=True) and camera.mistake(running) is None
     return running if able else Scenario(protocol=protocol)
 
 

@@ -47,8 +47,8 @@ LINGER: Final = 3.0
     "changes",
     multiple=True,
     metavar="TOOL.SETTING=VALUE",
-    help="Change a setting, such as 'present.region=[10, 10, 80, 60]'; VALUE is YAML, an empty one "
-    "takes the setting out. A tool that is not there is added. Repeatable.",
+    help="Change a setting, such as 'present.region=[10, 10, 80, 60]'. VALUE is YAML; an "
+    "empty VALUE removes the setting. A tool that the application lacks is added. Repeatable.",
 )
 @click.option(
     "--learn",

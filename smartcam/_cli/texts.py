@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 MAX_SIGNIFICANT_DIGITS = 6
 """Number of significant digits of the largest number in a column."""
 
-SMALLEST, LARGEST = 1e-3, 1e6
-"""Columns whose largest number lies between these have aligned decimal points."""
+MIN_ALIGNED, MAX_ALIGNED = 1e-3, 1e6
+"""Bounds of a column's largest number; beyond them decimal points are not aligned."""
 
 
 def table_text(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -44,7 +44,7 @@ def _column(values: Sequence[object]) -> list[str]:
     """Return a column's cells: floats with as many decimals as the largest needs for 6 digits."""
     floats = [value for value in values if isinstance(value, float) and math.isfinite(value)]
     largest = max(map(abs, floats), default=0.0)
-    if len(floats) < len(values) or not SMALLEST <= largest < LARGEST:
+    if len(floats) < len(values) or not MIN_ALIGNED <= largest < MAX_ALIGNED:
         return [_cell(value) for value in values]
     decimals = max(0, MAX_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest)))
     if any(0 < abs(value) < 10**-decimals for value in floats):

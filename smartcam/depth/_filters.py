@@ -46,7 +46,9 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
 
 @takes(cloud=of_class("Cloud"), low=numbers, high=numbers)
 def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud:
-    """Return the points in a box along the axes between two corners (3,), metres, both included.
+    """Return the points in a box with sides along the axes; points on a side are included.
+
+    ``low`` and ``high`` (3,) are opposite corners of the box, in metres.
 
     Raises:
         ConfigurationError: the corners are not (3,), or one is not below the other.
@@ -163,7 +165,7 @@ def _voxels(cloud: Cloud, size: float) -> NDArray[np.int64]:
     if not np.prod(spans) < 2**62 or np.abs([low, high]).max() > 2**52:
         extent = np.ptp(cloud.points, axis=0).tolist()
         raise ConfigurationError(
-            f"voxel_grid: expected voxels of which there are fewer than 2**62, got {size:g} m in a "
+            f"voxel_grid: expected fewer than 2**62 voxels, got more: voxels of {size:g} m in a "
             f"cloud of {extent} m"
         )
     numbers = np.zeros(len(cloud), np.int64)

@@ -254,13 +254,13 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
             await check.run(exam)
             if not check.in_session:
                 return not any(one.exit_code for one in exam.pending) or exam.camera is not None
-            if not exam.patient.connected and check.name != "clock":
-                await exam.patient.query_application()  # raises the reason
+            if not exam.connected_camera.connected and check.name != "clock":
+                await exam.connected_camera.query_application()  # raises the reason
     except LinkError as exc:
         await _explain_loss(exam, exc)
         return False
     except ResponseTimeoutError as exc:
-        if not exam.patient.connected:  # a missing answer ends the session
+        if not exam.connected_camera.connected:  # a missing answer ends the session
             await _explain_loss(exam, exc)
             return False
         exam.fail(

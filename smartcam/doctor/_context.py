@@ -229,7 +229,7 @@ class Examination:
         return taken
 
     @property
-    def patient(self) -> Camera:
+    def connected_camera(self) -> Camera:
         """The camera in a session.
 
         LookupError: there is no session; checks that use the camera run after the connecting one.

@@ -243,7 +243,7 @@ async def reserve(exam: Examination) -> None:
     if not exam.wants_trigger:
         return
     exam.wants_trigger = False  # until it is reserved
-    camera, limit = cast("FleetCamera[Any]", exam.patient), exam.options.step(10.0)
+    camera, limit = cast("FleetCamera[Any]", exam.connected_camera), exam.options.step(10.0)
     try:
         await exam.stack.enter_async_context(camera.reserve(limit))
     except ResponseTimeoutError as exc:

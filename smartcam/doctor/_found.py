@@ -95,7 +95,7 @@ def ports_of(
     """Return the ports to open, and the protocols that may be spoken there.
 
     Raises:
-        ConfigurationError: a name is no protocol's of TCP, a number is no port.
+        ConfigurationError: a name is not that of a protocol over TCP, or a number is no port.
     """
     known = tcp_protocols()
     chosen = [*known]
@@ -140,14 +140,14 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
             "so none is asked without consent. Say may_disturb=True (--may-disturb) when a lost "
             "session does no harm, ask other protocols only (protocols, --protocol), or ask none; "
-            "what is in leave (--leave, --fleet) is not touched"
+            "addresses in leave (--leave, --fleet) are not touched"
         )
 
 
 # ---------------------------------------------------------------------- received bytes
 
 
-def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
+def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
     """Return an open port with the protocols that fit the received bytes."""
     received = opened.received.lstrip()
     greeted = [one for one in protocols if one.greeting and received.startswith(one.greeting)]
@@ -179,8 +179,8 @@ def _may_be(protocol: Protocol, opened: Opened) -> bool:
     return opened.ended or not protocol.greeting
 
 
-def decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:
-    """Return True if further bytes cannot change how an open port is judged."""
+def is_decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:
+    """Return True if further bytes cannot change the evidence of an open port."""
     start = received.lstrip()
     if not start:
         return False

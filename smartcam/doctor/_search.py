@@ -23,8 +23,8 @@ from smartcam._arguments import (
 )
 from smartcam.doctor._found import (
     check_consent,
-    decided,
-    judged,
+    found_port,
+    is_decided,
     ports_of,
     serves_one,
     tcp_protocols,
@@ -250,7 +250,7 @@ class CameraSearch:
                 address,
                 port,
                 timeout=self._timeout,
-                enough=lambda received: decided(received, protocols),
+                enough=lambda received: is_decided(received, protocols),
             )
         finally:
             self._busy -= 1
@@ -258,7 +258,7 @@ class CameraSearch:
         self.counts[opened.outcome] += 1
         self.why = self.why or opened.why
         if opened.outcome == "open":
-            self._found[address, port] = judged(str(address), port, opened, protocols)
+            self._found[address, port] = found_port(str(address), port, opened, protocols)
 
     async def _socket(self, address: HostAddress) -> socket.socket:
         """Return a socket, as soon as the system has one."""

@@ -90,7 +90,7 @@ _STICKY = " The bit stays set until the errors are reset: await camera.reset_err
 
 async def look_at_status(exam: Examination) -> None:
     """Check ``status``: the bits that report trouble."""
-    camera = exam.patient
+    camera = exam.connected_camera
     capable = camera.capabilities
     status = await camera.query_status() if capable.get_status else camera.status
     wrong = [one for one in _CONDITIONS if one.bit in status]
@@ -107,7 +107,7 @@ async def look_at_status(exam: Examination) -> None:
 
 async def measure_round_trip(exam: Examination) -> None:
     """Check ``round trip``: the time from a Query to its answer."""
-    camera, loop = exam.patient, asyncio.get_running_loop()
+    camera, loop = exam.connected_camera, asyncio.get_running_loop()
     begin, times = loop.time(), list[float]()
     while len(times) < QUERY_COUNT and loop.time() - begin < QUERIES_WITHIN:
         sent_at = loop.time()
@@ -137,7 +137,7 @@ _RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
     ),
     Diagnosis(
         lambda seen: all(Status.BUSY in one for one in seen),
-        "the camera is BUSY, all {seconds:g} s long",
+        "the camera was BUSY for all of the {seconds:g} s",
         "It loads an application, or somebody works on its pages. If it stays so for minutes, "
         "restart it.",
         Exit.RAN_OUT,
@@ -158,7 +158,7 @@ async def watch(exam: Examination) -> None:
 
     A camera that waits for a trigger is watched only if none will be sent.
     """
-    camera, witness, seconds = exam.patient, exam.witness, exam.options.seconds
+    camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
         return  # this was reported already, and explains the rest
@@ -172,7 +172,7 @@ async def watch(exam: Examination) -> None:
         text = f"{called(application)} runs and waits for triggers{came}"
         exam.report("ok", text, **details, **_rate(witness))
     elif witness.results and not stopped:
-        _say_free(exam, details)
+        _report_free_run(exam, details)
     else:
         state = next(state for state in _RUN_STATES if state.fits(seen))
         exam.fail(
@@ -183,12 +183,14 @@ async def watch(exam: Examination) -> None:
         )
 
 
-def _say_free(exam: Examination, details: dict[str, Any]) -> None:
+def _report_free_run(exam: Examination, details: dict[str, Any]) -> None:
     witness, rate = exam.witness, _rate(exam.witness)
-    text = f"{called(exam.patient.active_application)} runs free: {witness.results} results "
+    text = (
+        f"{called(exam.connected_camera.active_application)} runs free: {witness.results} results "
+    )
     text += f"in {exam.options.seconds:g} s"
     if rate:
-        text += f", {rate['results_per_second']:.1f} a second; between two: {_intervals(witness)}"
+        text += f", {rate['results_per_second']:.1f} a second; intervals: {_intervals(witness)}"
     wanted = exam.wants_trigger
     exam.report(
         "error" if wanted else "ok",
@@ -213,9 +215,9 @@ async def _watch(exam: Examination, seconds: float) -> list[Status]:
 
     exam.witness.forget_arrivals()
     # open while watching, since results are made only if there is a subscriber
-    async with exam.patient.results(max_queue=1):
+    async with exam.connected_camera.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
-            await exam.patient.wait_status(note, timeout=seconds)
+            await exam.connected_camera.wait_status(note, timeout=seconds)
     return list(seen)
 
 
@@ -254,7 +256,7 @@ async def look_at_clock(exam: Examination) -> None:
 
     Source: BVS ID guide p. 231 (published); for the others inferred.
     """
-    camera = exam.patient
+    camera = exam.connected_camera
     if not camera.capabilities.get_clock:
         exam.report("ok", f"{camera.capabilities.dialect} has no message for a clock")
         return
@@ -267,7 +269,7 @@ async def look_at_clock(exam: Examination) -> None:
         exam.report(
             "warning",
             f"the camera does not tell its clock: {exc}",
-            "Nothing but the clock depends on it. The session was given up for it.",
+            "Nothing but the clock depends on this. The missing answer ended the session.",
         )
         return
     now = datetime.now(UTC)

@@ -26,7 +26,7 @@ async def look_at_application(exam: Examination) -> None:
 
     The protocol cannot ask whether an application exists without loading it.
     """
-    camera, wanted = exam.patient, exam.options.application
+    camera, wanted = exam.connected_camera, exam.options.application
     active = await camera.query_application()
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     if wanted is None or (wanted == active and not exam.wants_trigger):
@@ -53,7 +53,7 @@ async def look_at_application(exam: Examination) -> None:
 
 
 async def _borrow(exam: Examination, active: int, wanted: int) -> None:
-    camera = exam.patient
+    camera = exam.connected_camera
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     exam.wants_trigger = False  # until the wanted application is loaded
     try:
@@ -92,7 +92,7 @@ async def trigger(exam: Examination) -> None:
     """Check ``trigger``: send some, one by one, up to the first without a result."""
     if not (exam.wants_trigger and exam.may_trigger):
         return
-    camera, loop, options = exam.patient, asyncio.get_running_loop(), exam.options
+    camera, loop, options = exam.connected_camera, asyncio.get_running_loop(), exam.options
     times: list[float] = []
     begin = ended = loop.time()
     async with camera.results(max_queue=1):
@@ -152,7 +152,7 @@ def _say_failed(exam: Examination, error: SmartCamError, done: int) -> None:
     elif fell:
         text = f"the inspection of {which} was not done within {patience:g} s"
         cure = "Give it more time: --timeout, or trigger(timeout=...)."
-    elif not exam.patient.capabilities.status_by_itself:
+    elif not exam.connected_camera.capabilities.status_by_itself:
         text = f"{which} was taken, and no result came within {patience:g} s"
         cure = (
             'Does the application send results to the process interface ("send results", '

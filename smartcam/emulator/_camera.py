@@ -377,7 +377,7 @@ class EmulatedCamera(WireCamera):
             if isinstance(message, m.Disconnect):
                 self._collect()
                 self._active = None
-                link.unseated()
+                link.session_ended()
         self._collect()
         self.device.tell_entered()
         if faults:
@@ -426,18 +426,18 @@ class EmulatedCamera(WireCamera):
 
     # ------------------------------------------------------------------ steps
 
-    def _began(self) -> None:
+    def _after_start(self) -> None:
         self._moved_at = self.clock.now
         if self._timeline.watches:
             self.device.watch(self._entered)
 
-    def _ends(self) -> None:
+    def _before_stop(self) -> None:
         if isinstance(self._active, SecondClientSession):
             self._leave_session()
 
     def _end_device_faults(self) -> None:
         self.device.end_faults()
-        self._ends()
+        self._before_stop()
 
     def _deliver_at_once(self) -> None:
         self._send_all(self.device.take_output(), provoke=False)

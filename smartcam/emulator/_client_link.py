@@ -1,7 +1,7 @@
 """A client's link to the camera, and the path of its messages while faults act on them.
 
-Each link has a machine in the camera's role, which its owner makes. It is faulty only while wire
-faults wait or hold messages back. The camera's messages then go
+The owner of a link makes the link's protocol machine, which has the camera's role. A link is faulty
+only while wire faults wait or hold messages back. The camera's messages then go
 ``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
 ``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
@@ -45,7 +45,7 @@ Trace: TypeAlias = "Callable[[m.Sender, Frame | RemoteProtocolError], None]"
 
 
 class CameraMachine(Protocol):
-    """The methods that a link calls of its machine, which has the camera's role."""
+    """The methods that a link calls on its protocol machine, which has the camera's role."""
 
     transport: Transport
 
@@ -111,7 +111,7 @@ class LinkOwner(Protocol):
         """Forget a link that is gone; a second call does nothing."""
         ...
 
-    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+    def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         """Note that a connection has ended."""
         ...
 
@@ -130,7 +130,7 @@ class ClientLink(ABC):
     def __init__(self, owner: LinkOwner, transport: Transport, peer: str) -> None:
         self.peer = peer
         self.closed: bool = False
-        self.hearing: str | None = None
+        self.input_faults: str | None = None
         """Kinds of the faults that acted on the message that the camera is receiving."""
         self._owner = owner
         self.machine: CameraMachine = owner.make_machine(transport, self._trace)
@@ -176,8 +176,8 @@ class ClientLink(ABC):
         if self._faulty is None or not self._faulty.dead:
             self.close(reason)
 
-    def unseated(self) -> None:  # noqa: B027  only for links with an order of their own
-        """Note that the client has ended its session; it may stay."""
+    def session_ended(self) -> None:  # noqa: B027  only TCP has an order of links
+        """Note that the client has ended its session; the link may stay open."""
 
     def heard(self) -> None:
         """Write the camera's answers to the received messages."""
@@ -195,10 +195,10 @@ class ClientLink(ABC):
         """Write bytes that belong together; False if it was not possible."""
 
     @abstractmethod
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         """End the link after the bytes written so far, or by a reset."""
 
-    def hold(self, on: bool) -> None:  # noqa: B027  only where the network keeps what is not read
+    def hold(self, on: bool) -> None:  # noqa: B027  only TCP keeps unread bytes
         """Stop reading for a time, or continue."""
 
     @abstractmethod
@@ -218,7 +218,7 @@ class ClientLink(ABC):
         """Write frames as they are."""
 
     def _take(self, data: bytes) -> None:
-        """Handle received bytes: of a stream, or one datagram."""
+        """Handle received bytes: a part of a stream, or one datagram."""
         if self._faulty is None and not self._owner.queue.on_client:
             self.feed(data)
         else:
@@ -242,7 +242,7 @@ class ClientLink(ABC):
 
 @dataclass(eq=False)
 class FaultyLink:
-    """Both directions of one link."""
+    """Both directions of a link while faults act on it."""
 
     _link: ClientLink
     _owner: LinkOwner
@@ -274,7 +274,7 @@ class FaultyLink:
 
     @property
     def idle(self) -> bool:
-        """True if this link allows messages to take the short way again."""
+        """True if no fault acts on this link any more, so that messages may bypass it."""
         return (
             self.muted is None
             and not self.dead
@@ -284,7 +284,7 @@ class FaultyLink:
         )
 
     @property
-    def unheard(self) -> bool:
+    def holds_input(self) -> bool:
         """True while bytes of the client are held back."""
         return bool(self._incoming)
 
@@ -331,7 +331,7 @@ class FaultyLink:
     # ------------------------------------------------------------------ in
 
     def take(self, data: bytes) -> None:
-        """Add bytes of the client: of a stream, or one datagram."""
+        """Add bytes of the client: a part of a stream, or one datagram."""
         if self.dead:
             return
         heard = self._owner.queue.on_client
@@ -381,9 +381,9 @@ class FaultyLink:
                 self._owner.passed(self._link, m.Sender.CLIENT, message)
                 continue
             message.passed += data
-            self._link.hearing = ", ".join(message.faults) or None
+            self._link.input_faults = ", ".join(message.faults) or None
             self._link.feed(data)
-            self._link.hearing = None
+            self._link.input_faults = None
 
     def _wake_incoming(self) -> None:
         with self._owner.step():
@@ -417,7 +417,7 @@ class FaultyLink:
         if self._link.closed:
             return
         if ending.how in {"close", "reset"}:
-            self._link.part("close" if ending.how == "close" else "reset")
+            self._link.end_link("close" if ending.how == "close" else "reset")
             return
         self.muted = ending.cause
         self._outgoing.close()
@@ -435,7 +435,7 @@ class FaultyLink:
 
 @dataclass(eq=False)
 class SecondClientSession:
-    """The second client of a fault: it has the session, but is no real program."""
+    """The second client that a fault simulates: it has the session, but no connection."""
 
     _dialect: FramedDialect
     _traced: Callable[[Frame], None]  # called with all messages to it; none is on a wire

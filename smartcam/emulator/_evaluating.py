@@ -162,9 +162,9 @@ class EvaluatingCamera(LineCamera):
     def activated(self) -> None:
         """Note that an application is active, or is active again; nothing unless overridden."""
 
-    def _ends(self) -> None:
+    def _before_stop(self) -> None:
         """Forget the running evaluation, like a device that loses power."""
-        super()._ends()
+        super()._before_stop()
         self.busy, self._call, self._run = False, None, self._run + 1
 
     def begin(self, call: LineClient | None) -> None:

@@ -125,7 +125,7 @@ class LineClient:
     def end(self, reason: str) -> None:
         """Close the connection after the sent lines; nothing more is read."""
         self._link.flush()
-        self._link.part("close", reason)
+        self._link.end_link("close", reason)
 
     def begin(self, message: HeardLine) -> None:
         """Begin a line."""
@@ -436,5 +436,5 @@ class LineCamera(WireCamera):
         """Return the time of the next scheduled call, nanoseconds of the clock; None for never."""
         return self._agenda[0][0] if self._agenda else None
 
-    def _ends(self) -> None:
+    def _before_stop(self) -> None:
         self._agenda.clear()

@@ -30,12 +30,12 @@ CLOSE_TIMEOUT = 1.0
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
 FIRST_READ_BYTES = 1 << 10
-"""Largest number of bytes that the first reads of a connection take: client's messages are short,
-and hundreds of cameras may have a buffer each. It doubles after each full read, as for input data,
-and is small again after a read that was not full."""
+"""Bytes of a connection's first read buffer: messages of clients are short, and hundreds of cameras
+may have a buffer each. The buffer doubles after each full read, as input data needs, and shrinks to
+this size after a read that was not full."""
 
 MAX_READ_BYTES = 1 << 16
-"""Largest number of bytes that one read takes in the end."""
+"""Largest number of bytes of a connection's read buffer."""
 
 REFUSED = "refuse"
 """Kind of the fault that closes the port for a time."""
@@ -72,7 +72,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         if refusal:
             self.close(refusal)
             return
-        # the camera does so too (newest SC manual p. 40: published)
+        # the camera switches Nagle's algorithm off (newest SC manual p. 40: published)
         with contextlib.suppress(OSError):  # the client may be gone already
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._owner.arrived(self)
@@ -95,14 +95,14 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
 
     def eof_received(self) -> bool:
         """Note that the client has closed its side; bytes that faults hold back are read first."""
-        self._end_waits = self._faulty is not None and self._faulty.unheard
+        self._end_waits = self._faulty is not None and self._faulty.holds_input
         return self._end_waits
 
     def heard(self) -> None:
         self.flush()  # also answers before a Disconnect in the same bytes
         if self.machine.state is State.FAILED:
             self.close("a broken frame came")
-        elif self._end_waits and (self._faulty is None or not self._faulty.unheard):
+        elif self._end_waits and (self._faulty is None or not self._faulty.holds_input):
             self._transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -113,7 +113,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._listener.leave(self)
         with self._owner.step():
             self._owner.lost(self)
-        self._owner.parted(self, by_client=by_client, reset=exc is not None)
+        self._owner.connection_ended(self, by_client=by_client, reset=exc is not None)
 
     def write(self, data: bytes) -> bool:
         if self.closed:
@@ -124,8 +124,8 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._transport.write(data)
         return True
 
-    def unseated(self) -> None:
-        self._listener.unseated(self)
+    def session_ended(self) -> None:
+        self._listener.session_ended(self)
 
     def close(self, reason: str) -> None:
         self._listener.leave(self)
@@ -135,7 +135,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self._owner.lost(self)
         self._transport.abort()
 
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         if how == "reset":
             with contextlib.suppress(OSError):  # the client may be gone already
                 sock = self._transport.get_extra_info("socket")
@@ -164,7 +164,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
 
     def heal(self) -> None:
         if self._faulty is not None and self._faulty.muted is not None:
-            self.part("reset")
+            self.end_link("reset")
 
     def _write_frames(self, frames: list[bytes]) -> None:
         if frames:
@@ -251,8 +251,8 @@ class TcpListener(Listener):
         """Forget a connection that has ended; harmless when called twice."""
         self._acceptor.leave(link)
 
-    def unseated(self, link: _TcpLink) -> None:
-        """Note that a client has ended its session; it is the last to be closed for room."""
+    def session_ended(self, link: _TcpLink) -> None:
+        """Note that a client has ended its session; now it may be closed to make room."""
         self._acceptor.move_back(link)
         self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
 
@@ -280,7 +280,7 @@ class _UdpLink(ClientLink):
     def write(self, data: bytes) -> bool:
         return not data or self._listener.send(data, self._address)
 
-    def part(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         self.close(f"{why} ({how})")
 
     def stop_listening(self) -> None:
@@ -313,7 +313,7 @@ class _UdpLink(ClientLink):
 
 
 class UdpListener(Listener, asyncio.DatagramProtocol):
-    """Sorts datagrams by address."""
+    """Passes each datagram to the link of its address."""
 
     kind = socket.SOCK_DGRAM
 
@@ -342,7 +342,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             link.close("the camera is down")
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: the endpoint is there."""
+        """Limit the reads of the new endpoint."""
         read_no_more_than_needed(transport)
 
     def _close_socket(self) -> None:
@@ -351,7 +351,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             transport.abort()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Pass a datagram to its address' link; of too many links drop the longest silent one."""
+        """Pass a datagram to its address' link; of too many links, drop the longest silent one."""
         if self._transport is None:
             return  # the port is shut; this datagram was read before
         now = asyncio.get_running_loop().time()
@@ -377,7 +377,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         _log.debug("! datagram not delivered: %s", exc)
 
     def send(self, frame: bytes, address: Any) -> bool:
-        """Send one datagram; False if it is lost here."""
+        """Send one datagram; return False if it was dropped."""
         if self._transport is None:
             return False
         # the abstract class lacks it, every transport of asyncio has it

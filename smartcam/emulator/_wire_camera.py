@@ -380,7 +380,7 @@ class WireCamera(Server):
         self._started = True
         self._down = False
         self._timeline = self._make_timeline()
-        self._began()
+        self._after_start()
         with self.step():
             self._act_at_once()
             self._timeline.start()
@@ -398,7 +398,7 @@ class WireCamera(Server):
             self._timer.set(None)
             self._timeline.stop()
             self._end_refusal()
-            self._ends()
+            self._before_stop()
             self._port.shut()
             await self._port.wait_closed()
 
@@ -511,7 +511,7 @@ class WireCamera(Server):
     def arrived(self, link: ClientLink) -> None:
         """Note that a connection was made."""
 
-    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+    def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         """Note that a connection has ended."""
         by: Literal["client", "camera"] = "client" if by_client else "camera"
         self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
@@ -522,11 +522,11 @@ class WireCamera(Server):
         if now is None:
             now = self.clock.now
         if isinstance(what, Frame):
-            traffic.entries.keep(now, link.peer, sender, what, link.hearing)
+            traffic.entries.keep(now, link.peer, sender, what, link.input_faults)
             if sender is _CLIENT:
                 traffic.count(what)
         else:
-            traffic.add(now, link.peer, sender, what, link.hearing)
+            traffic.add(now, link.peer, sender, what, link.input_faults)
         if self._shows:
             self._show_last()
 
@@ -595,10 +595,10 @@ class WireCamera(Server):
     def _deliver_at_once(self) -> None:
         """Send the messages that a fault made the device send; they trigger no other fault."""
 
-    def _began(self) -> None:
+    def _after_start(self) -> None:
         """Called after the start, before the first step."""
 
-    def _ends(self) -> None:
+    def _before_stop(self) -> None:
         """Called before the stop, while links are still there."""
 
     def _end_device_faults(self) -> None:

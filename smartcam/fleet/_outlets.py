@@ -214,8 +214,8 @@ class _OutletObserver(Observer):
             )
             at = result.received_at
             camera, number = result.camera, result.number
-            done = read(container, endian, camera=camera, number=number, at=at)
-            return done.value, done.sequence
+            made, sequence, _ = read(container, endian, camera=camera, number=number, at=at)
+            return made, sequence
 
         self._owner.outlets.offer_result(result, value)
 

@@ -31,13 +31,12 @@ OWN_PARAMETERS = ("fps", "name", "timeout")
 class InSightDriver(FrameDriver):
     """A source that polls the last picture of a smart camera: ``insight://admin@HOST?fps=2``.
 
-    Other parameters of the query are the camera's, as in :func:`smartcam.connect`. The session with
+    Further parameters are those of the camera's URL in :func:`smartcam.connect`. The session with
     the camera exists only while there are readers.
 
-    ============ ============================================================================
-    ``fps``      how often it is asked, times per second; usual 2 ``timeout``  seconds for
-    connecting, and for a picture; usual 10 ``name``     of the camera ============
-    ============================================================================
+    - ``fps``: requests per second; by default 2.
+    - ``timeout``: seconds for connecting, and for a picture; by default 10.
+    - ``name``: name of the source; by default host and port.
 
     The camera does not report when a picture was taken, or whether it is new. A picture with the
     same bytes as the last is not returned again: if the camera may not be triggered for long, use

@@ -10,10 +10,10 @@ from smartcam._accepting import Acceptor, Places, listening
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.gateway._account import GatewayAccount
-from smartcam.gateway._desk import SharedDesk
 from smartcam.gateway._lines import AnswerWriter
 from smartcam.gateway._link import RobotLink
 from smartcam.gateway._parts import Parts
+from smartcam.gateway._requests import GatewayCamera
 from smartcam.gateway._settings import GatewaySettings
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Gateway(Server):
         self.settings: GatewaySettings = settings or GatewaySettings()
         parts = Parts(self.settings, camera.settings.interpret_as)
         self._account = GatewayAccount()
-        self._shared = SharedDesk(camera, self.settings, parts, self._account)
+        self._shared = GatewayCamera(camera, self.settings, parts, self._account)
         self._writer = AnswerWriter(self.settings.style, parts.names)
         places: Places[RobotLink] = Places(
             self.settings.clients, within=self.settings.idle, what="no request", own="a robot"

@@ -9,13 +9,13 @@ import socket
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
-from smartcam.gateway._desk import ASKING_FOR_PARTS, Desk
 from smartcam.gateway._lines import AnswerCode, NotWritableError, RequestReader, RobotAnswer
+from smartcam.gateway._requests import ASKING_FOR_PARTS, RobotRequests
 
 if TYPE_CHECKING:
     from smartcam._accepting import Acceptor
-    from smartcam.gateway._desk import SharedDesk
     from smartcam.gateway._lines import AnswerWriter, RobotRequest
+    from smartcam.gateway._requests import GatewayCamera
 
 MAX_WAITING_REQUESTS: Final = 8
 """Largest number of requests with a number that wait while another one is being answered."""
@@ -45,12 +45,12 @@ class RobotLink(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(
-        self, shared: SharedDesk, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
+        self, shared: GatewayCamera, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
     ) -> None:
         self.settled: bool = False
         self._shared, self._writer, self._acceptor = shared, writer, acceptor
         self._account = shared.account
-        self._desk = Desk(shared)
+        self._robot = RobotRequests(shared)
         self._requests = RequestReader(shared.settings.style.form)
         self._waiting: deque[tuple[RobotRequest, float]] = deque()
         self._task: asyncio.Task[None] | None = None
@@ -126,7 +126,7 @@ class RobotLink(asyncio.Protocol):
     async def _serve(self, request: RobotRequest, deadline: float) -> None:
         """Answer a request, and the requests that came meanwhile."""
         while True:
-            answer = await self._desk.answer(request, deadline)
+            answer = await self._robot.answer(request, deadline)
             self._account.open -= 1
             if self._write(answer, request.tag):
                 self._account.errors += 1
@@ -145,10 +145,10 @@ class RobotLink(asyncio.Protocol):
         try:
             data = self._writer.write(answer, tag)
         except NotWritableError as exc:
-            answer = self._desk.failed(str(exc))
+            answer = self._robot.failed(str(exc))
             data = self._writer.write(answer, tag)
         self._transport.write(data)
-        self._desk.sent()
+        self._robot.sent()
         if answer.code.is_error:
             _log.warning("%s: %s: %s", self._peer, answer.code.name, answer.words)
         return answer.code.is_error
@@ -186,7 +186,7 @@ class RobotLink(asyncio.Protocol):
             abandoned += 1
         self._account.open -= abandoned
         self._account.abandoned += abandoned
-        self._desk.forget()
+        self._robot.forget()
         if abort:
             self._transport.abort()
         else:

@@ -37,8 +37,8 @@ OUTLIER_SPREADS: Final = 5.0
 """Distance from the median, in standard deviations, of an outlier in a large sample."""
 
 SMALL_SAMPLE: Final = 8.0
-"""Sample size at which this distance doubles, since the spread of few values is less certain. In
-simulations with 5 to 200 good parts, at most 2 % of the samples lose a good value."""
+"""Sample size at which ``OUTLIER_SPREADS`` doubles, since the spread of few values is less certain.
+In simulations with 5 to 200 good parts, at most 2 % of the samples lose a good value."""
 
 MAX_PICTURES_IN_REMARK: Final = 5
 """Largest number of pictures that a remark names; others are counted."""
@@ -94,7 +94,7 @@ def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspectio
     return Lesson(found, remarks)
 
 
-def _of_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
+def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     findings = [*seen.values()]
     counts = [int(one.values.get("count", 0)) for one in findings]
     found: dict[str, Any] = {"count": [min(counts), max(counts)]}
@@ -106,22 +106,22 @@ def _of_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
         least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
         found["area"] = [max(1, math.floor(least)), math.ceil(most)]
         remark += (
-            f", of {min(areas):.0f} to {max(areas):.0f} pixels; area has {AREA_MARGIN:.0%} more "
-            "to both sides"
+            f", of {min(areas):.0f} to {max(areas):.0f} pixels; area allows {AREA_MARGIN:.0%} less "
+            "and more"
         )
     elif any(counts):  # the area of spots outside of the result is unknown
-        remark += "; area stays as it is, as the result does not have all of them (most)"
+        remark += "; area stays as it is, since `most` leaves some of them out of the result"
     return _Learned(found, f"{remark}.")
 
 
-def _of_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
+def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     most = max(int(one.values.get("differing", 0)) for one in seen.values())
     allowed = math.ceil(DIFFERENCE_MARGIN * most)
     remark = f"at most {most} pixels differ in {_pictures(len(seen))}; {allowed} are allowed."
     return _Learned({"allowed": allowed}, remark)
 
 
-def _of_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
+def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     texts = {
         str(one["text"])
         for found in seen.values()
@@ -137,7 +137,7 @@ def _of_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Lear
 # ---------------------------------------------------------------------- measured values
 
 
-def _of_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
+def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
     """Return the tolerance of measured values, in the form and unit of the old tolerance."""
     measured = {name: one.details for name, one in seen.items() if _is_number(one.details)}
     left_out = {
@@ -169,9 +169,9 @@ def _of_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Le
     text = _text(values, max(spread, noise), guard, old, unit)
     remark = (
         f"tolerance {text}, from {_pictures(len(values))}: mean {mean:.6g} {unit}, standard "
-        f"deviation {spread:.2g} {unit}, of which measuring makes "
-        f"{noise:.2g} {unit}. It has {TOLERANCE_COVERAGE:.1%} of all such "
-        f"parts in it, as far as so few pictures tell.{_left_out(left_out)}"
+        f"deviation {spread:.2g} {unit}, of which the measurement causes "
+        f"{noise:.2g} {unit}. The tolerance contains {TOLERANCE_COVERAGE:.1%} of all such "
+        f"parts, with a confidence of {CONFIDENCE:.0%}.{_left_out(left_out)}"
     )
     return _Learned({"tolerance": text}, remark)
 
@@ -237,12 +237,13 @@ def _tolerance_factor(number: int, *, sided: bool) -> float:
     special = load("scipy.special", "teaching measure needs")
     degrees = number - 1
     if sided:
-        share, sure = (float(special.ndtri(one)) for one in (TOLERANCE_COVERAGE, CONFIDENCE))
-        a, b = 1 - sure**2 / (2 * degrees), share**2 - sure**2 / number
-        return (share + math.sqrt(share**2 - a * b)) / a
-    share = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
+        # quantiles of the normal distribution
+        z_part, z_sure = (float(special.ndtri(one)) for one in (TOLERANCE_COVERAGE, CONFIDENCE))
+        a, b = 1 - z_sure**2 / (2 * degrees), z_part**2 - z_sure**2 / number
+        return (z_part + math.sqrt(z_part**2 - a * b)) / a
+    z_part = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
     least = float(special.chdtri(degrees, CONFIDENCE))  # lower quantile of chi squared
-    return share * math.sqrt(degrees * (1 + 1 / number) / least)
+    return z_part * math.sqrt(degrees * (1 + 1 / number) / least)
 
 
 def _left_out(left_out: Mapping[str, str]) -> str:
@@ -263,8 +264,8 @@ def _pictures(number: int) -> str:
 
 
 _LEARNERS: Final[dict[str, Callable[[Mapping[str, Finding], Mapping[str, Any]], _Learned]]] = {
-    "compare": _of_compare,
-    "measure": _of_measure,
-    "present": _of_present,
-    "read": _of_read,
+    "compare": _learn_compare,
+    "measure": _learn_measure,
+    "present": _learn_present,
+    "read": _learn_read,
 }

@@ -44,7 +44,7 @@ class PresentSettings(ToolSettings):
     """Colours and sizes of the wanted spots, and the expected number."""
 
     grey: Annotated[tuple[Level, Level], AfterValidator(_rising)] | None = Field(
-        None, description="grey levels of a spot, from and to, 0 to 255"
+        None, description="smallest and largest grey level of a spot, 0 to 255"
     )
     colour: ColourRange | None = Field(
         None,
@@ -55,7 +55,7 @@ class PresentSettings(ToolSettings):
         (20, MAX_AREA_PX), description="least and largest area of a spot, pixels"
     )
     count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number = Field(
-        (1, MAX_SPOTS), description="expected number of spots: a number, or from and to"
+        (1, MAX_SPOTS), description="expected number of spots, or its two limits"
     )
     most: int = Field(1, ge=1, le=MAX_SPOTS, description="largest number of spots in the result")
 

@@ -31,7 +31,7 @@ class OutletEntry(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Id of the entry, by which the far end knows a repetition: ``CAMERA/EPOCH/NUMBER``."""
+        """Id of the entry, by which the far end detects a repetition: ``CAMERA/EPOCH/NUMBER``."""
         gap = "/gap" if self.kind == "gap" else ""
         return f"{self.camera}/{self.epoch}/{self.number}{gap}"
 

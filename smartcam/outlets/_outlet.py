@@ -58,7 +58,7 @@ class Outlet(ABC, Generic[SettingsT]):
     Args:
         name: name of the outlet.
         settings: settings of the outlet.
-        folder: folder of relative paths.
+        folder: folder to which relative paths refer.
         desk: functions of the process that has the cameras.
 
     Attributes:

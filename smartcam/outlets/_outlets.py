@@ -35,7 +35,7 @@ MAX_TURN_SECONDS = 0.0005
 would wait that long if its result comes while a spool is written."""
 
 RESULT_BYTES = 600
-"""Bytes that a result takes in memory besides its container, about."""
+"""Approximate number of bytes that a result takes in memory besides its container."""
 
 
 class OutletState(NamedTuple):
@@ -55,7 +55,7 @@ class Outlets(Server):
 
     Args:
         section: settings by the outlet's name.
-        folder: folder of relative paths: of spools, secrets, stores.
+        folder: folder to which relative paths refer, those of spools, secrets and stores.
         columns: function that returns names, types and units of an application's values, by its
             layout.
         command: function that carries out a command from an outlet.

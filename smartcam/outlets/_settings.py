@@ -35,7 +35,9 @@ class Secret(_OutletFields):
 
     file: str | None = Field(None, min_length=1, description="path of a file with only the secret")
     variable: str | None = Field(
-        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable with it"
+        None,
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
+        description="environment variable with the value",
     )
 
     @model_validator(mode="before")
@@ -53,7 +55,7 @@ class Secret(_OutletFields):
         """Return the secret.
 
         Args:
-            folder: folder of a relative path.
+            folder: folder to which a relative path refers.
 
         Raises:
             ConfigurationError: the secret does not exist; the text names its place.
@@ -88,7 +90,7 @@ class OutletSettings(_OutletFields):
     size: Size = Field(1e9, description="largest size of the waiting entries, such as 1 GB")
     full: Policy = Field(
         "drop_oldest",
-        description="beyond the size, drop_oldest: drop the oldest; drop_newest: refuse the "
+        description="what a full spool does; drop_oldest: drop the oldest; drop_newest: refuse the "
         "newest. Both are counted, and the gap is delivered",
     )
     durable: bool = Field(
@@ -112,7 +114,7 @@ Section = dict[str, dict[str, Any]]
 class OutletsFile(_OutletFields):
     """Outlets of one camera in a file of their own."""
 
-    outlets: Section = Field(description="by name; without kind: the name is the kind")
+    outlets: Section = Field(description="by name, which is also the kind unless it is given")
 
     @classmethod
     def load(cls, path: str | Path) -> OutletsFile:
@@ -156,7 +158,7 @@ def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:
             if "kind" in given:
                 yield ("outlets", name, "kind"), str(exc)
             else:
-                yield ("outlets", name), f"{exc}; an outlet of another name says its `kind:`"
+                yield ("outlets", name), f"{exc}; an outlet with another name needs a `kind:`"
         except ValidationError as exc:
             for item in exc.errors(include_url=False, include_input=False):
                 text = item["msg"].removeprefix("Value error, ")

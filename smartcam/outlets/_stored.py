@@ -36,7 +36,7 @@ class StoreQuestion(NamedTuple):
         since: earliest time; None for all rows.
         failed: whether only errors, gaps and results that did not pass are shown.
         camera: name or pattern of the cameras; ``**`` for all.
-        most: largest number of rows, the newest of all.
+        most: largest number of rows; the newest rows are returned.
     """
 
     since: datetime | None = None

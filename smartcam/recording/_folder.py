@@ -67,7 +67,7 @@ class FileName(NamedTuple):
 
 @dataclass(order=True)
 class KnownFile:
-    """A file of the folder; the oldest is the least.
+    """A file of the folder; files sort by age, the oldest first.
 
     Attributes:
         at: time of the file's beginning.

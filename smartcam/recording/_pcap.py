@@ -100,7 +100,7 @@ def write_pcap(
         stream = path.open("wb" if overwrite else "xb")
     except FileExistsError as exc:
         raise ConfigurationError(
-            f"pcap {path}: the file is there already; overwrite (--force) takes its place"
+            f"pcap {path}: the file exists already; overwrite (--force) replaces it"
         ) from exc
     except (OSError, ValueError) as exc:
         reason = exc.strerror if isinstance(exc, OSError) else exc

@@ -212,8 +212,7 @@ class Recorder(Observer):
             return opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
-                f"recording {self.path}: the file is there already; overwrite (--force) takes its "
-                "place"
+                f"recording {self.path}: the file exists already; overwrite (--force) replaces it"
             ) from exc
         except ConfigurationError:
             raise

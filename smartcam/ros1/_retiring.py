@@ -1,9 +1,9 @@
-"""Withdraw services from a bridge, those of an earlier link or at the end of a link.
+"""Withdraw services from a bridge, before they are advertised and at the end of a link.
 
 A bridge keeps the services of a lost link, and lets their callers wait forever. If a service is
 advertised again, the bridge counts its calls from one again, while old calls wait for the same
-numbers: a call might get the answer to another. So services are withdrawn before they are
-advertised, and at the end. That takes the bridge a second for each, so other links are used.
+numbers: a call might get the answer to another. The bridge takes a second to withdraw a service and
+handles nothing else on that link, so links of their own are used.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 LINK_COUNT = 8
 """Largest number of links for the services of a node at a time."""
-PER_SERVICE = 2.0
-"""Seconds of the timeout for each service, of which the bridge takes one."""
+SECONDS_PER_SERVICE = 2.0
+"""Seconds of the timeout for each service; the bridge takes one second to withdraw it."""
 SPARE_SECONDS = 5.0
-"""Further seconds of the timeout, for the link and for a busy bridge."""
-KNOWN = "/rosout/get_loggers"
+"""Seconds that the timeout allows for making the links, and for a busy bridge."""
+PROBED_SERVICE = "/rosout/get_loggers"
 """A service that every roscore has; its answer comes after the bridge has handled earlier calls."""
 
 
@@ -44,7 +44,7 @@ async def retire(url: str, services: Sequence[str]) -> None:
     shares = [share for start in range(LINK_COUNT) if (share := services[start::LINK_COUNT])]
     try:
         async with (
-            asyncio.timeout(SPARE_SECONDS + PER_SERVICE * max(map(len, shares), default=0)),
+            asyncio.timeout(SPARE_SECONDS + SECONDS_PER_SERVICE * max(map(len, shares), default=0)),
             asyncio.TaskGroup() as group,
         ):
             for share in shares:
@@ -69,7 +69,7 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
     Raises:
         ConnectionError: the bridge closed the link.
     """
-    asked = question(KNOWN, {})
+    asked = question(PROBED_SERVICE, {})
     await web.send_json(asked)
     async for message in web:
         try:

@@ -14,7 +14,7 @@ from smartcam.ros1._json_messages import encoded
 from smartcam.ros1._link import BridgeLink
 from smartcam.ros1._outbox import Outbox
 from smartcam.ros1._publishing import RosbridgePublisher
-from smartcam.ros1._retiring import KNOWN, question, retire
+from smartcam.ros1._retiring import PROBED_SERVICE, question, retire
 from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
 from smartcam.ros1._subscribers import listen_for_subscribers
 from smartcam.ros1._subscribing import RosbridgeSubscription
@@ -349,7 +349,7 @@ class RosbridgeNode(NamedNode):
         await asyncio.gather(*(one.still() for one in leaving))
         await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
         if leaving:  # first handle calls that the bridge has aborted
-            await self.ask(KNOWN, {})
+            await self.ask(PROBED_SERVICE, {})
         self._leaving = self._leaving[len(leaving) :]
         for service in new:
             service.advertise()

@@ -252,7 +252,7 @@ def _stop(site: EmulatorSite, call: CallRequest) -> object:
     "POST", f"{_CAMERA}/application", body=_ApplicationBody, sample='{"id": 7, "running": true}'
 )
 def _application(site: EmulatorSite, call: CallRequest) -> object:
-    """Load another application, like an operator; 409 while one is loaded."""
+    """Load another application, like an operator; 409 while another is being loaded."""
     switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
     if wanted.id not in emulator.application_ids:
@@ -323,7 +323,7 @@ def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/commands/{{command}}")
 def _command(site: EmulatorSite, call: CallRequest) -> object:
-    """Run that row of the scenario's timeline."""
+    """Give the command to the cues of the scenario's timeline."""
     emulator, name = _emulator(site, call), call.path["command"]
     if name not in emulator.commands:
         known = ", ".join(emulator.commands) or "none: its scenario's timeline has no command"
@@ -345,7 +345,7 @@ def _scene(site: EmulatorSite, call: CallRequest) -> object:
     sample='{"x": 0.2, "y": 0.1, "theta": 0.0}',
 )
 def _put_part(site: EmulatorSite, call: CallRequest) -> object:
-    """Put a part there, or move it: metres and radians."""
+    """Add a part to the table, or move it: metres and radians."""
     pieces, name = _table(site, call).pieces, call.path["part"]
     if not (name.isascii() and name.isprintable() and len(name) <= 50):
         raise RefusedError(

@@ -1,4 +1,4 @@
-"""Find news of a camera for one event stream, from the emulator's log."""
+"""Find the changes of an emulated camera, and new entries of its log, for one event stream."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MAX_FAULTS_TOLD = 100
 """Largest number of faults that one event reports."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
-"""Looks between two reports of the clock: one a second. A report also detects a closed reader."""
+"""Looks between two reports of the clock, one a second; a report also detects a closed reader."""
 
 
 class Watcher:
     """The state of a camera as one reader knows it.
 
-    ``since`` is the serial of the first log entry that is wanted; None: only new entries.
+    ``since`` is the serial of the first log entry to send; None: only new entries.
     """
 
     def __init__(self, name: str, emulator: WireCamera, since: int | None = None) -> None:

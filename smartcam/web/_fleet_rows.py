@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from smartcam.streams import BatchSubscription, Subscription
 
 MAX_QUEUE: Final = 64
-"""Largest number of results of a camera that may wait for a look; further ones are only counted."""
+"""Largest number of a camera's results that wait for the next update; others are only counted."""
 
 MAX_QUEUE_BYTES: Final = 1 << 18
-"""Largest number of bytes of these results."""
+"""Largest number of bytes of the waiting results of a camera."""
 
 MAX_KEPT_BYTES: Final = 1 << 16
 """Largest number of bytes of a result that is kept for its picture; of a longer result only the
@@ -44,7 +44,7 @@ MAX_TEXT_CHARACTERS: Final = 160
 RATE_SECONDS: Final = 5
 """Seconds over which a rate is counted."""
 
-BAD_SECONDS: Final = 60.0
+ERROR_MARK_SECONDS: Final = 60.0
 """Seconds for which a camera keeps the mark of an error."""
 
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
@@ -57,7 +57,7 @@ never connected.
 """
 
 SI: Final = ShownUnits()
-"""Units of the values."""
+"""Units for texts in SI."""
 
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
 
@@ -70,7 +70,7 @@ class RowState(NamedTuple):
     status: Status
     application: int | None
     reason: str  # reason why it is not connected
-    error: str  # last result
+    error: str  # text of the last error
     agents: tuple[str, ...]
 
 
@@ -82,7 +82,7 @@ class FleetRow:
 
     Args:
         name: name of the camera.
-        ring: function that is called with the row when it may have changed.
+        ring: function that is called with the row when the row may have changed.
         units: units that the page can show instead of SI.
 
     Attributes:
@@ -95,12 +95,12 @@ class FleetRow:
         rate: results per second.
         errors: number of results that could not be read or did not come, and of lost connections.
         error: text of the last error, for as long as it is marked.
-        stirred: True if the camera may have changed since the last look.
+        may_have_changed: True if the camera may have changed since the last update.
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
         changed_at: time at which the camera was last connected or lost, seconds since 1970.
-        changed_seen: False if that happened before the camera was followed; the time is then that
-            of the first look.
+        changed_seen: False if ``changed_at`` is only the time of the first update, since the change
+            came earlier.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.
     """
 
@@ -117,7 +117,7 @@ class FleetRow:
         self.text: str = name
         self.error: str = ""
         self.error_at: float | None = None
-        self.stirred: bool = False
+        self.may_have_changed: bool = False
         self.history: ShiftHistory = ShiftHistory()
         self.changed_at: float = time.time()
         self.changed_seen: bool = False
@@ -127,7 +127,7 @@ class FleetRow:
         self._counted = (0, 0)  # numbers of missed and dropped results
         self._last: Result[Any] | None = None
         self._layout: Layout | None = None  # layout of the last result
-        self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
+        self._counts_by_second: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: RowState = UNKNOWN
         self._connected = False
         self._results: BatchSubscription[Result[Any]] | None = None
@@ -149,12 +149,12 @@ class FleetRow:
         self._events = camera.events(max_queue=1)
         # every new result or event rings, so nothing needs to wait for them
         self._results.share(_RowBell(ring))
-        self._events.share(_RowBell(self.stir))
-        self.stir()
+        self._events.share(_RowBell(self.note_change))
+        self.note_change()
 
-    def stir(self) -> None:
+    def note_change(self) -> None:
         """Note that the row may have changed."""
-        self.stirred = True
+        self.may_have_changed = True
         self._ring(self)
 
     def leave(self) -> None:
@@ -168,7 +168,7 @@ class FleetRow:
     # ------------------------------------------------------------------ updates
 
     async def take(self, now: float) -> collections.Counter[str]:
-        """Count the new results; return their outcomes. It does not wait."""
+        """Count the new results and return their outcomes; never wait."""
         outcomes: collections.Counter[str] = collections.Counter()
         stream, full = self._results, False
         while stream is not None and stream.waiting:
@@ -199,7 +199,7 @@ class FleetRow:
         self._counted = (account.missed, account.dropped)
         missed, dropped = account.missed - before[0], account.dropped - before[1]
         if missed:
-            text = f"{missed} results did not come: cut off from the agent for too long"
+            text = f"{missed} results did not come: the agent was out of reach for too long"
             self._note(text, now)
             self.history.add_missed(missed, text)
             outcomes["errors"] += missed
@@ -218,7 +218,7 @@ class FleetRow:
         lost = self._connected and not connected
         if connected != self._connected:
             self.changed_at, self.changed_seen = time.time(), self._state is not UNKNOWN
-        self._connected, self.stirred = connected, False
+        self._connected, self.may_have_changed = connected, False
         status, application, reason, over = Status(0), None, "", False
         if camera is not None:
             over = camera.ended
@@ -231,7 +231,7 @@ class FleetRow:
             self._note(reason or "lost", now)
             self.history.add_loss(reason or "no agent shares the camera")
             self.errors += 1
-        elif self.error_at is not None and now - self.error_at >= BAD_SECONDS:
+        elif self.error_at is not None and now - self.error_at >= ERROR_MARK_SECONDS:
             self.error, self.error_at = "", None
         state = RowState(
             connected, over, status, application, reason, self.error, tuple(sorted(self.agents))
@@ -262,15 +262,15 @@ class FleetRow:
             return "busy"
         return "running" if state.status & Status.RUNNING else "stopped"
 
-    def mark(self) -> bool:
+    def update_rate(self) -> bool:
         """Compute the rate once per second; return whether it will change by itself."""
-        self._marks.append(self.count)
-        self.rate = (self.count - self._marks[0]) / (len(self._marks) - 1)
-        return self._marks[0] != self.count
+        self._counts_by_second.append(self.count)
+        self.rate = (self.count - self._counts_by_second[0]) / (len(self._counts_by_second) - 1)
+        return self._counts_by_second[0] != self.count
 
     @property
     def failure(self) -> int:
-        """Number of the newest result as a failure; 0 if it is no failure."""
+        """Serial number of the failure that is the newest result; 0 if that is no failure."""
         behind = self._results is None or self._results.waiting
         return 0 if behind else self.history.last_failure
 
@@ -317,7 +317,7 @@ class FleetRow:
     def _pictured(self, result: Result[Any]) -> dict[str, Any]:
         """Return a result as a row shows it: lines of text, or parts to be drawn.
 
-        ``text`` is in SI; ``practical`` is the same in the units of the page's switch.
+        ``text`` is in SI, ``practical`` in the units that the page can show instead.
         """
         fields: dict[str, Any] = {
             "at": round(result.received_at.timestamp(), 2),

@@ -114,7 +114,7 @@ class FleetView:
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
-        self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
+        self._totals: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._count = self._errors = 0
         self._orders: collections.OrderedDict[RowQuery, RowOrder] = collections.OrderedDict()
         self._events: Subscription[FleetEvent] | None = None
@@ -175,7 +175,7 @@ class FleetView:
         await self._take(stream, stream.statistics().queued)
         for name, agents in before.items():
             if agents != self.rows[name].agents:
-                self.rows[name].stir()
+                self.rows[name].note_change()
         await self._look()
 
     async def _receive_events(self) -> None:
@@ -209,7 +209,7 @@ class FleetView:
                 row = self.rows.get(event.camera)
                 if row is not None:
                     row.agents.discard(event.agent)
-                    row.stir()
+                    row.note_change()
             case _:
                 pass
 
@@ -221,7 +221,7 @@ class FleetView:
         self.agents.add(agent)
         row.agents.add(agent)
         row.follow(self.fleet[name])
-        row.stir()
+        row.note_change()
 
     def _ring(self, row: FleetRow) -> None:
         self._rang[row] = None
@@ -237,10 +237,10 @@ class FleetView:
                 continue  # the row was forgotten
             before, now = row.count, loop.time()
             outcomes = await row.take(now)
-            if row.stirred:
+            if row.may_have_changed:
                 row.account(outcomes, now)
             came = self._count_in(row, outcomes, row.count - before)
-            if row.stirred or outcomes["errors"]:
+            if row.may_have_changed or outcomes["errors"]:
                 self._refresh(row, now)
             if row.history.wants_picture:
                 self.failing[row] = None
@@ -304,14 +304,14 @@ class FleetView:
             outcomes: collections.Counter[str] = collections.Counter()
             row.account(outcomes, now)
             self._count_in(row, outcomes, row.count - before)
-            if row.mark() or row.error_at is not None:
+            if row.update_rate() or row.error_at is not None:
                 self._aging.add(row)
             if row.rate != rate:
                 self._change(row)
             self._refresh(row, now)
             if number % AT_ONCE == AT_ONCE - 1:
                 await asyncio.sleep(0)
-        self._marks.append(self._count)
+        self._totals.append(self._count)
         bar = int(wall) // BUCKET * BUCKET
         if bar != self._bar_at:
             if self._bar.total() and self._bar_at:
@@ -324,7 +324,7 @@ class FleetView:
 
     def totals(self) -> dict[str, Any]:
         """Return the totals of all cameras, as values for JSON."""
-        rate = (self._marks[-1] - self._marks[0]) / max(1, len(self._marks) - 1)
+        rate = (self._totals[-1] - self._totals[0]) / max(1, len(self._totals) - 1)
         counts = {name: self._flags[name] for name in ("connected", "errors", "busy", "stopped")}
         return {
             "cameras": len(self.rows),

@@ -43,7 +43,7 @@ KINDS: Final = ("passed", "failed", "other", "errors")
 
 @dataclass(slots=True)
 class Failure:
-    """Equal failures in a row: bad results, unreadable ones, or a lost connection.
+    """Equal failures in a row: failed or unreadable results, or a lost connection.
 
     Attributes:
         serial: number of the failure, from 1.

@@ -144,7 +144,7 @@ class LiveView:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def follow(self, camera: Camera[Any], loss: str) -> None:
-        """Show this unopened camera instead; ``loss``: reason why the one before is not connected.
+        """Show this unopened camera instead; ``loss``: reason why the old one is not connected.
 
         Cancellation: leaves the view stopped.
         """

@@ -16,7 +16,7 @@ class Page(NamedTuple):
             its own.
         styles: names of the style sheets before its own.
         beside: contents beside the title, as HTML.
-        does: verb for the page's calls: it ``does`` or ``shows`` things by them.
+        does: verb in the sentence about the page's calls, ``does`` or ``shows``.
     """
 
     title: str

@@ -29,7 +29,7 @@ API = "/api"
 """Prefix of the paths of all calls."""
 
 FINISH_TIMEOUT = 0.2
-"""Seconds that an unfinished answer gets when the site stops, twice."""
+"""Seconds that unfinished answers have to end when the site stops, and again after a cancel."""
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 _ANY = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  names, nothing is bound here
@@ -169,7 +169,7 @@ class OpenPort:
 
 
 class _Calm(logging.LoggerAdapter[logging.Logger]):
-    """Takes aiohttp's log, which is about bad requests: no errors with tracebacks."""
+    """Lowers aiohttp's log entries, which are about bad requests, to INFO."""
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
         """Log a message at INFO at most."""

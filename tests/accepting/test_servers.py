@@ -136,7 +136,7 @@ def descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir())) if sys.platform == "linux" else 0
 
 
-@pytest.mark.sampled(every=4)
+@pytest.mark.sampled(every=8)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SERVERS)
 async def test_strangers_lock_nobody_out_and_are_sent_away(name: str, kind: str) -> None:
@@ -169,7 +169,7 @@ async def test_strangers_lock_nobody_out_and_are_sent_away(name: str, kind: str)
         assert descriptors() <= open_before
 
 
-@pytest.mark.sampled(every=3)
+@pytest.mark.sampled(every=6)
 @pytest.mark.parametrize("name", SERVERS)
 async def test_what_strangers_say_takes_little_memory(name: str) -> None:
     row = SERVERS[name]

@@ -48,25 +48,15 @@ FUZZED = {
 
 each_parser = pytest.mark.parametrize("parser", PARSERS.values(), ids=list(PARSERS))
 
-KIN = (", thesis", ", b16", ", bid")
-"""Dialects in whose frames the short run does not count what it counts in the handbook's."""
-
 # what reads YAML needs larger inputs; in the short run the row of YAML stands for all
 each_parser_in_turn = pytest.mark.parametrize(
     "parser",
     [
-        pytest.param(
-            one,
-            marks=[pytest.mark.long, pytest.mark.widest]
-            if one.short == PAST_LOOKAHEAD
-            else [pytest.mark.long]
-            if one.name.endswith(KIN)
-            else [],
-        )
+        pytest.param(one, marks=[pytest.mark.long, pytest.mark.widest] if large else [])
         for one in PARSERS.values()
         if one.name != "YAML"
-    ]
-    + [PARSERS["YAML"]],
+        for large in [one.short == PAST_LOOKAHEAD]
+    ],
     ids=lambda one: one.name,
 )
 
@@ -76,10 +66,19 @@ def needed(parser: Parser) -> None:
         pytest.skip(f"{', '.join(parser.missing)}: not installed")
 
 
+@pytest.mark.sampled(every=3)
 @each_parser_in_turn
 def test_parser_twice_the_input_takes_twice_the_steps_at_most(parser: Parser) -> None:
+    grows_no_faster(parser, 1)
+
+
+def test_yaml_twice_the_input_takes_twice_the_steps_at_most() -> None:
+    grows_no_faster(PARSERS["YAML"], 3)
+
+
+def grows_no_faster(parser: Parser, every: int) -> None:
     needed(parser)
-    for kind, make in list(parser.inputs.items())[:: 3 if parser.name == "YAML" else 1]:
+    for kind, make in list(parser.inputs.items())[::every]:
         if kind in parser.refused_from or kind.startswith("YAML: "):
             continue  # such inputs are large, or the row of YAML has them: the long run counts them
         grown = counting.grow(parser, make, counting.steps, min(parser.size, parser.short))
@@ -184,6 +183,7 @@ REVIEWED = {
 """By module: why a pattern that repeats what repeats takes no long time."""
 
 
+@pytest.mark.long
 def test_no_pattern_repeats_what_repeats() -> None:
     # where both may take the same character, there are ways without number to fail
     found = {name for name, pattern in _patterns() if _nested(_parsed(pattern), 0)}

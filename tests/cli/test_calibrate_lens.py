@@ -93,7 +93,7 @@ def test_lens_of_files_has_its_views_in_json(tmp_path: Path, target: str) -> Non
     assert "lacking: views at the left and right" in out
     assert len(IntrinsicCalibration.load(output).views) == 5
     done = calibrating(target, *files, "-o", str(output))
-    done.failed(2, "lens.json: the file is there already; --force takes its place")
+    done.failed(2, "lens.json: the file exists already; --force replaces it")
     calibrating(target, *files, "-o", str(output), "--force").done()
 
 

@@ -143,6 +143,7 @@ def test_demo_with_pick_is_a_command(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- a plain camera
 
 
+@pytest.mark.long
 @NEEDS_INSPECTION
 async def test_every_part_is_put_onto_its_place_and_errors_are_as_predicted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

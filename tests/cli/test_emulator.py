@@ -38,6 +38,7 @@ def test_emulator_with_a_client_ends_well() -> None:
             client.wait().failed(3, "the link is gone")
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_emulator_in_a_background_that_ignores_sigint_ends_well(number: int) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

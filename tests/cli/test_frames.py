@@ -133,14 +133,14 @@ def test_list_of_nothing_says_what_was_looked_for(shelf: Puts) -> None:
 
 def test_list_of_what_is_not_looked_for_reports_it() -> None:
     done = run("frames", "list", "--scheme", "synthetic").done()
-    assert done.out == "synthetic:// is not looked for: its sources are opened by their URLs\n"
+    assert done.out == "synthetic:// has no search: open its sources by their URLs\n"
     assert "synthetic" not in run("frames", "list").done().out
 
 
 def test_list_goes_on_after_a_driver_that_fails(shelf: Puts) -> None:
     shelf(fails=RuntimeError("broken"))
     done = run("frames", "list").done()
-    assert "shelf: cannot be looked for: RuntimeError('broken')\n" in done.out
+    assert "shelf: the search failed: RuntimeError('broken')\n" in done.out
     told = [one for one in run("frames", "list", "--json").done().lines if "error" in one]
     assert {"scheme": "shelf", "error": "RuntimeError('broken')"} in told
 
@@ -239,7 +239,9 @@ def test_grab_numbers_several_and_says_what_it_missed(shelf: Puts, tmp_path: Pat
     numbers = [one["sequence"] for one in done.lines]
     assert numbers == sorted(set(numbers))
     assert re.fullmatch(r"note: \d+ skipped, \d+ lost\n", done.err)
-    grab("-o", str(tmp_path / "x.png"), "--count", "9").failed(2, "x-0001.png: the file is there")
+    grab("-o", str(tmp_path / "x.png"), "--count", "9").failed(
+        2, "x-0001.png: the file exists already"
+    )
 
 
 def test_grab_after_now_waits_past_what_was_on_its_way(shelf: Puts, tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_frames_record_over_a_file_needs_force(tmp_path: Path) -> None:
     path.write_text("precious")
     refused = record("synthetic://", "-o", str(path), "--count", "1")
     assert (refused.code, path.read_text()) == (2, "precious")
-    assert "the file is there already" in refused.err
+    assert "the file exists already" in refused.err
     record("synthetic://", "-o", str(path), "--count", "1", "--force").done()
     assert load_recording(path).counts.pictures == 1
 

@@ -106,7 +106,7 @@ def test_image_is_written_as_the_camera_sends_it(online: str, tmp_path: Path) ->
     data = file.read_bytes()
     assert data.startswith(b"BM")
     assert (line["file"], line["size"]) == (str(file), len(data))
-    run("image", online, "-o", str(file)).failed(2, "is there already; --force takes its place")
+    run("image", online, "-o", str(file)).failed(2, "exists already; --force replaces it")
     assert f"{len(data):,} bytes" in run("image", online, "-o", str(file), "--force").done().out
     run("image", online, "-o", str(tmp_path / "none" / "seen.bmp")).failed(2, "none")
 

@@ -121,7 +121,7 @@ def test_record_over_a_file_needs_force(url: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     command = ["record", url, "-o", str(path), "--seconds", "0.1"]
-    run(*command).failed(2, "run.mcap: the file is there already")
+    run(*command).failed(2, "run.mcap: the file exists already")
     assert path.read_text() == "precious"
     run(*command, "--force").done()
     assert load_recording(path).remark == ""
@@ -245,7 +245,7 @@ def test_pcap_is_read_by_tshark(url: str, tmp_path: Path) -> None:
         [TSHARK, "-r", str(packets)], capture_output=True, text=True, check=True, timeout=300
     )
     assert done.lines == [{"file": str(packets), "packets": len(shown.stdout.splitlines())}]
-    run("pcap", str(path), "-o", str(packets)).failed(2, "run.pcap: the file is there already")
+    run("pcap", str(path), "-o", str(packets)).failed(2, "run.pcap: the file exists already")
     assert run("pcap", str(path), "-o", str(packets), "--force").done().out == (
         f"{packets}: {done.lines[0]['packets']} packets\n"
     )

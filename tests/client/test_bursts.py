@@ -640,10 +640,10 @@ async def test_bursts_of_many_reads_all_come_in_order() -> None:
             camera.results(max_queue=50_000),
             camera.results(max_queue=50_000, batch=True),
         )
-        await say(camera, box, b"".join(numbered(box, 30_000)), together=True)
-        assert [one.value.n for one in await queued(batch)] == [*range(30_000)]
-        assert [one.number for one in await queued(results)] == [*range(1, 30_001)]
-        assert fates(camera) == {"streamed": 30_000}
+        await say(camera, box, b"".join(numbered(box, 10_000)), together=True)
+        assert [one.value.n for one in await queued(batch)] == [*range(10_000)]
+        assert [one.number for one in await queued(results)] == [*range(1, 10_001)]
+        assert fates(camera) == {"streamed": 10_000}
         assert max(sizes) <= LARGEST_CHUNK
 
 

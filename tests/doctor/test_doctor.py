@@ -295,7 +295,7 @@ async def test_camera_busy_for_long_is_an_error() -> None:
     async with camera(faults=[faults.BusyForEver()]) as emulator:
         findings = await examined(emulator.url, trigger=True)
     assert errors(findings) == [("run state", Exit.RAN_OUT)]
-    assert of(findings, "run state").text == f"the camera is BUSY, all {WATCH:g} s long"
+    assert of(findings, "run state").text == f"the camera was BUSY for all of the {WATCH:g} s"
 
 
 async def test_waiting_camera_is_reported() -> None:
@@ -496,7 +496,7 @@ async def test_session_lost_if_nobody_waits_is_noticed(monkeypatch: pytest.Monke
 
         async def lose(exam: Examination) -> None:
             emulator.inject(faults.SecondClient())
-            await until(lambda: not exam.patient.connected)
+            await until(lambda: not exam.connected_camera.connected)
 
         idle = doctor._DoctorCheck("idle", lose, lambda options: 5.0)
         name, session, *_ = doctor._CHECKS

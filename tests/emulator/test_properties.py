@@ -235,7 +235,7 @@ class Owner:
     def serves(self, link: ClientLink) -> bool:
         return True
 
-    def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
+    def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         pass
 
     def lost(self, link: ClientLink) -> None:

@@ -518,7 +518,7 @@ async def judge_frames(way: Face) -> None:
     assert "'moon'" in answer["error"]
 
 
-@pytest.mark.sampled(every=3)
+@pytest.mark.long
 @WITH_TF
 async def test_a_camera_on_a_robot_is_calibrated_from_a_topic(face: Any, tmp_path: Path) -> None:
     async with asyncio.timeout(PATIENCE), face(tmp_path) as way:
@@ -566,6 +566,7 @@ async def test_one_wizard_has_many_faces(tmp_path: Path) -> None:
             assert (await way.step(abort=True))["header_text"] == "Aborted"
 
 
+@pytest.mark.sampled(every=3)
 @ALL
 @pytest.mark.parametrize(
     ("frames", "error"),

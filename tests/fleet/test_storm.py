@@ -15,7 +15,7 @@ def check(figures: Figures, calls: int) -> None:
 
 
 async def test_each_gets_its_own_result_inside_a_process() -> None:
-    check(await storm_in_process(600, 1), 600)
+    check(await storm_in_process(300, 1), 300)
 
 
 @pytest.mark.long

@@ -597,7 +597,7 @@ print("ended")
 
 
 @pytest.mark.parametrize(
-    "steps", [range(1, 10, 4), pytest.param(range(10), marks=pytest.mark.long)]
+    "steps", [range(1, 10, 8), pytest.param(range(10), marks=pytest.mark.long)]
 )
 async def test_program_that_ends_while_its_bus_opens_is_not_aborted(steps: range) -> None:
     """The engine's session comes when nobody wants it; its close once ran into Python's end."""

@@ -442,7 +442,7 @@ def test_results_are_localizations(tmp_path: Path) -> None:
     assert sigma.correlation_yt == pytest.approx(record.correlation_yt)
     nothing = program.inspect(drawn())
     assert not nothing.ok
-    assert nothing.reason == "0 found, expected 1 or more; nothing is like it"
+    assert nothing.reason == "0 found, expected 1 or more; nothing in the picture resembles it"
     assert reader.read(nothing.payload(), Context(camera="cam", number=2)) == []
 
 

@@ -121,7 +121,7 @@ def test_learned_tolerance_contains_good_values_with_guard_and_is_explained() ->
     (remark,) = found.remarks
     assert remark.startswith(f"measure: tolerance {limits.text}, from 20 pictures: mean 92.")
     assert "standard deviation 0.0" in remark
-    assert "of which measuring makes 0.01 px" in remark
+    assert "of which the measurement causes 0.01 px" in remark
     assert "Not learned from" not in remark
 
 
@@ -198,8 +198,8 @@ def test_a_tool_that_was_not_asked_teaches_nothing() -> None:
     found = learned({"present": {}}, good)
     assert found.tools == {"present": {"count": [2, 2]}}
     assert found.remarks == [
-        "present: 2 spots in 1 picture; area stays as it is, as the result does not have all of "
-        "them (most). Not learned from: a.png (outside)."
+        "present: 2 spots in 1 picture; area stays as it is, since `most` leaves some of them "
+        "out of the result. Not learned from: a.png (outside)."
     ]
     del good["b.png"]
     assert learned({"present": {"count": 3}}, good).tools == {"present": {"count": 3}}

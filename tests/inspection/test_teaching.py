@@ -141,7 +141,7 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
     program = teaching.program(tools)
     found, remarks = learned(tools, {str(n): program.inspect(one) for n, one in enumerate(good)})
     assert remarks == [
-        "present: 2 spots in 3 pictures, of 81 to 121 pixels; area has 20% more to both sides."
+        "present: 2 spots in 3 pictures, of 81 to 121 pixels; area allows 20% less and more."
     ]
     assert found["present"]["count"] == [2, 2]
     assert found["present"]["area"] == [64, 146]

@@ -848,7 +848,7 @@ def error_of(call: Callable[..., object], *args: object) -> Exception | None:
     return None
 
 
-MANY = settings(max_examples=10 * settings().max_examples, deadline=None)
+MANY = settings(max_examples=5 * settings().max_examples, deadline=None)
 
 
 @MANY

@@ -99,7 +99,7 @@ async def storm(camera: smartcam.Camera[Any], emulator: Any, chance: random.Rand
     return came
 
 
-@pytest.mark.sampled(every=3)
+@pytest.mark.sampled(every=6)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", CAMERAS)
 @pytest.mark.asyncio

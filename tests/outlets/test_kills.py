@@ -39,11 +39,12 @@ def rows(folder: Path, query: str) -> list[tuple[object, ...]]:
         return database.execute(query).fetchall()
 
 
+@pytest.mark.parametrize("kills", [2, pytest.param(6, marks=pytest.mark.long)])
 async def test_a_process_that_is_killed_at_any_moment_writes_each_spooled_result_once(
-    tmp_path: Path,
+    tmp_path: Path, kills: int
 ) -> None:
     dice = random.Random(1)  # noqa: S311
-    for _ in range(4):
+    for _ in range(kills):
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-c", PROGRAM, str(tmp_path), stdout=asyncio.subprocess.PIPE
         )

@@ -138,6 +138,7 @@ async def test_clients_without_structures_and_clients_that_only_call_do_the_same
         assert error == -7
 
 
+@pytest.mark.long
 async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path: Path) -> None:
     own = {"free": 3, "housing": 3, "lid": 1}  # of the camera: the settings' names win
     async with ready(tmp_path, names=own, recipes={"housing": 1}) as (there, client):

@@ -79,8 +79,9 @@ def halves(count: int) -> Iterator[tuple[list[int], list[int]]]:
 
 
 def check(warnings: Iterable[Remark]) -> None:
-    """See that nothing is taken for flipped, and no lens for another one."""
-    assert {Code.MIRRORED, Code.WRONG_LENS}.isdisjoint(one.code for one in warnings)
+    """See that nothing is taken for flipped, no lens for another one, no pair for moved."""
+    suspicions = {Code.MIRRORED, Code.WRONG_LENS, Code.NOT_SIMULTANEOUS}
+    assert suspicions.isdisjoint(one.code for one in warnings)
 
 
 def check_z(name: str, found: list[float]) -> None:

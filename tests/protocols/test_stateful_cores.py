@@ -557,7 +557,7 @@ class UdpCores(Cores):
                 self.deliver(line, way, 0)
 
 
-@pytest.mark.sampled(every=2)
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("run", range(RUNS))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("family", FAMILIES)

@@ -595,7 +595,7 @@ def test_bag_place_that_cannot_be_is_refused_before_anything_is_written(tmp_path
     (other / "precious.mcap").write_text("mine")
     file.write_text("mine")
     for path, overwrite, text in [
-        (there, False, "it is there already; overwrite"),
+        (there, False, "it exists already; overwrite"),
         (other, True, "the folder holds 'precious.mcap', which is no part of a bag"),
         (file, True, "this is no folder"),
         (tmp_path / "none" / "bag", True, "No such file or directory"),

@@ -107,7 +107,7 @@ def test_bag_command_with_a_calibration_wants_what_it_was_made_with(
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
-        (["{run}", "-o", "{here}"], 2, "it is there already; overwrite (--force)"),
+        (["{run}", "-o", "{here}"], 2, "it exists already; overwrite (--force)"),
         (["{run}", "-o", "{here}", "--force"], 2, "which is no part of a bag"),
         (["{run}", "-o", "{here}/none/bag"], 2, "No such file or directory"),
         (["{here}/none.mcap", "-o", "{here}/bag"], 2, "No such file or directory"),
@@ -170,7 +170,7 @@ def test_record_bag_killed_has_what_was_written(url: str, tmp_path: Path) -> Non
     assert found == list(range(found[0], found[0] + len(found)))
     assert not (tmp_path / "bag/metadata.yaml").exists()
     done = run("record", url, "--bag", str(tmp_path / "bag"), "--seconds", "0.1")
-    done.failed(2, "it is there already")
+    done.failed(2, "it exists already")
 
 
 def numbers(path: Path) -> list[int]:

@@ -37,7 +37,7 @@ from smartcam.models import (
 from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, INSIGHT, Frame
 from smartcam.protocols.messages import Sender
-from smartcam.recording._mcap.json import MAX_FRAMES_ALIKE, FrameTexts, body_of, frame_text
+from smartcam.recording._mcap.json import MAX_CACHED_FRAME_TEXTS, FrameTexts, body_of, frame_text
 from tests.recording.inside import KINDS, message_fields, message_of, nanoseconds
 from tests.recording.recordingkit import at
 
@@ -267,7 +267,7 @@ def test_data_of_a_frame_is_written_once_and_read_again(
 def test_data_of_a_frame_begins_within_it(data_from: int) -> None:
     entry = TraceEntry(at(0), "left", "<", 32, "ResultContainer", None, "aabb")
     fields = {**message_fields(message_of("frames", entry)), "data_from": data_from}
-    with pytest.raises(ValueError, match=r"data_from: .* expected a byte of 2"):
+    with pytest.raises(ValueError, match=r"data_from: .* expected an offset below 2"):
         KINDS["frames"].from_json(fields)
 
 
@@ -317,4 +317,4 @@ def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
         raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
         entry = raw.entry()
         assert texts.text(raw) == (frame_text(entry), body_of(entry))
-        assert 0 < len(texts._known) <= MAX_FRAMES_ALIKE
+        assert 0 < len(texts._known) <= MAX_CACHED_FRAME_TEXTS

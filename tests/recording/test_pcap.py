@@ -166,7 +166,7 @@ def test_pcap_file_that_is_there_is_refused(tmp_path: Path) -> None:
     recording = write(tmp_path / "run.mcap", [status(0)])
     path = tmp_path / "run.pcap"
     path.write_text("precious")
-    with pytest.raises(ConfigurationError, match=r"run\.pcap: the file is there already"):
+    with pytest.raises(ConfigurationError, match=r"run\.pcap: the file exists already"):
         write_pcap(recording, path)
     assert path.read_text() == "precious"
     assert write_pcap(recording, path, overwrite=True) == 8

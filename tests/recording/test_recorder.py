@@ -195,9 +195,7 @@ def test_recorder_writes_while_it_records(tmp_path: Path) -> None:
 def test_recorder_file_that_is_there_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    with pytest.raises(
-        ConfigurationError, match=r"run\.mcap: the file is there already; overwrite"
-    ):
+    with pytest.raises(ConfigurationError, match=r"run\.mcap: the file exists already; overwrite"):
         Recorder(path).open()
     assert path.read_text() == "precious"
     with Recorder(path, overwrite=True):

@@ -18,9 +18,9 @@ from smartcam.web import EmulatorSite
 from tests import ROOT
 from tests.web.inside import (
     ALIVE_INTERVAL,
-    BAD_SECONDS,
     BAR_SECONDS,
     BUCKET,
+    ERROR_MARK_SECONDS,
     LINGER,
     MAX_BARS,
     MAX_CAMERAS,
@@ -72,7 +72,7 @@ def test_live_page_has_its_numbers() -> None:
 def test_fleet_page_has_its_numbers() -> None:
     assert (PERIOD, SERIES, BUCKET, ALIVE_INTERVAL) == (0.2, 600, 5, 5.0)  # which it has as words
     said = {
-        f"for {BAD_SECONDS:g} s after a loss",
+        f"for {ERROR_MARK_SECONDS:g} s after a loss",
         f"that it shows, {MAX_ROWS} at most",
         f"shows nothing for {streams.SHOW_TIMEOUT:g} s",
         f"may be {MAX_FLEET_VIEWERS} browsers at a time, and {MAX_CAMERAS} cameras",

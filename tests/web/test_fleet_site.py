@@ -20,9 +20,9 @@ from smartcam.web import FleetSite
 from tests.handmade import until
 from tests.web.inside import (
     ALIVE_INTERVAL,
-    BAD_SECONDS,
     BUCKET,
     CALLS,
+    ERROR_MARK_SECONDS,
     MAX_KEPT_BYTES,
     MAX_QUEUE,
     MAX_ROWS,
@@ -231,7 +231,7 @@ async def test_filters_and_their_numbers() -> None:
         }
         totals = world.site.view.totals()
         assert {one: totals[one] for one in found} == {k: len(v) for k, v in found.items()}
-        await asyncio.sleep(BAD_SECONDS + 2)
+        await asyncio.sleep(ERROR_MARK_SECONDS + 2)
         assert [int(name[-3:]) for name in await world.shown(filter="errors")] == [1, 4]
 
 

@@ -30,12 +30,13 @@ from smartcam.calibration._hand_eye.closed_forms import (
     second_turns,
 )
 from smartcam.calibration._hand_eye.equations import (
+    BENDS,
     PixelObservations,
     PoseObservations,
     RobotPoses,
     RobotSigmas,
     is_in_hand,
-    pull_of_lens,
+    pull,
 )
 from smartcam.calibration._hand_eye.model_selection import (
     MAX_FOLDS,
@@ -53,7 +54,8 @@ from smartcam.calibration._hand_eye.validation import (
     poor_fit,
     seen_poses,
 )
-from smartcam.calibration._jackknife import jackknife
+from smartcam.calibration._jackknife import jackknife, weighed_jackknife
+from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import CAMERA, TARGET, half_turn, half_turned, locate
 from smartcam.calibration._lens.projection import excess, whitening
@@ -159,9 +161,9 @@ def calibrate_hand_eye(
             beside the robot (``eye-to-hand``, with the target on the hand).
         camera: the camera's lens, which the expected errors assume to be exact; None: it is
             calibrated from the same views, which should then show the target tilted, and from the
-            robot's motions, and the expected errors include those of the lens. Where ``adjust``
-            keeps the lens, or the views deny that the target is as described, the views alone tell
-            it, with the target's points adjusted.
+            robot's motions, together with bends of the target, and the expected errors include
+            those of the lens. Where ``adjust`` keeps the lens, the views alone tell it, with the
+            target's points adjusted.
         method: ``auto`` chooses the one of ``robot`` and ``reprojection`` that predicts left-out
             poses better; or one of these two, or one of OpenCV's closed forms, see
             :data:`~smartcam.calibration._hand_eye.model_selection.METHODS`.
@@ -225,12 +227,13 @@ def calibrate_hand_eye(
     )
     named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
     kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    if own is not None:  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
+        kept += [5 + len(lens.distortion) + i for i in range(BENDS)]
     free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
     free["scale and camera"] = (0, *free["camera"])
-    if own is not None and adjust == "auto" and own.sheet is None:
+    if own is not None and adjust == "auto":
         # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
-        # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated). Where it is bent once and
-        # for all, its points as they were meant would bend the lens.
+        # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
         del free[NOTHING], free["scale"]
     asked = _Asked(_allowed(free, adjust), method, drop_bad)
     result = _without_bad(problem, asked, named, [transforms[i] for i in order], ordered)
@@ -606,17 +609,21 @@ def _covariance(chosen: Candidate) -> Array:
         return np.full((12, 12), np.nan)
     cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
+    whole, left = solution.information, others.information
+    if whole is None or left is None:  # solved without a part of the poses, not without each
+        return jackknife(steps[:MAX_FOLDS])
     places = of_one_place(chosen.problem.robot.poses)
-    if chosen.method in LINEAR:  # solved without a part of the poses, not without each
-        steps = steps[:MAX_FOLDS]
-    elif len(first := np.unique(places)) > 1:  # without all of a place: to first order, the sum
-        steps = np.array([steps[places == one].sum(axis=0) for one in first])
-    scatter = jackknife(steps)
+    alike = [places == one for one in np.unique(places)]  # poses of one place are left out together
+    steps = np.array([steps[one].sum(axis=0) for one in alike])  # to first order
+    left = np.array([whole - (whole - left[one]).sum(axis=0) for one in alike])
+    spreads = np.array([inverse_scaled(one)[:12, :12] for one in left])
+    scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole)[:12, :12])
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
         return scatter
-    pull = pull_of_lens(chosen.problem.robot, seen, solution)
-    joint: Array = scatter + pull @ lens @ pull.T
+    numbers = tuple(range(1, 5 + len(seen.model.distortion)))
+    slopes = pull(chosen.problem.robot, seen, solution, numbers)
+    joint: Array = scatter + slopes @ lens @ slopes.T
     return joint
 
 

@@ -57,6 +57,9 @@ FIRST_DAMPING = 1e-6
 """Part of the diagonal that is added at first: closed forms are so near that hardly any damping is
 needed."""
 
+BENDS = 3
+"""Bends of a target that may be adjusted: heights that grow with x^2, x y and y^2."""
+
 ROUNDING_COST = 100.0
 """Squared standard deviations that are added to the cost with which a gain is compared, for
 rounding errors."""
@@ -150,7 +153,7 @@ class Observations(ABC):
 
     whitening: Array  # matrices that make the errors independent, with a variance of 1
     # numbers of the parameters that are adjusted beside the poses, ascending: 0 is the target's
-    # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the distortion
+    # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the K of the distortion, from 5 + K on three bends
     free: tuple[int, ...] = field(default=(), kw_only=True)
 
     @property
@@ -209,14 +212,14 @@ class PixelObservations(Observations):
 
     def settled(self, change: Array) -> PixelObservations:
         """Return the observations with a change (extra,) of the other parameters made and fixed."""
-        points = self.scale(change) * self.points
+        points = self.scale(change) * self._bent(self._full(change))
         return dataclasses.replace(self, model=self.camera(change), points=points, free=())
 
     def camera(self, change: Array) -> CameraModel:
         """Return the camera with some of its parameters changed, (extra,)."""
         if not any(self.free):
             return self.model
-        return with_lens(self.model, lens_values(self.model) + self._full(change)[1:])
+        return with_lens(self.model, lens_values(self.model) + self._full(change)[1:-BENDS])
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra).
@@ -230,22 +233,39 @@ class PixelObservations(Observations):
             nothing = np.full((views, 2 * count), np.nan)
             return nothing, np.full((*nothing.shape, 6 + self.extra), np.nan)
         # A point of a target of size s is at p = s R m + t: dp/ds = R m. Poses move p as
-        # pose_changes has it, lenses move the pixel as the projection says.
-        nominal = self.points @ np.swapaxes(seen.rotation, 1, 2)
+        # pose_changes has it, lenses move the pixel as the projection says, and a bend b moves m by
+        # b h along the target's normal n: dp/db = s h R n.
+        nominal = self._bent(full) @ np.swapaxes(seen.rotation, 1, 2)
         near = self.scale(change) * nominal
         there = linearize((near + seen.translation[:, None]).reshape(-1, 3), self.camera(change))
         moved = pose_changes(there.by_point, near.reshape(-1, 3))
         grown = there.by_point @ nominal.reshape(-1, 3, 1)
-        beside = np.concatenate([grown, there.by_lens], axis=2)[:, :, list(self.free)]
+        risen = self.scale(change) * seen.rotation[:, None, :, 2:] * self._heights()[:, :, None]
+        bent = there.by_point @ risen.reshape(-1, 3, BENDS)
+        beside = np.concatenate([grown, there.by_lens, bent], axis=2)[:, :, list(self.free)]
         slopes = np.concatenate([moved, beside], axis=2).reshape(views, count, 2, -1)
         off = (there.pixels.reshape(views, count, 2) - self.pixels)[..., None]
         off, slopes = self.whitening @ off, self.whitening @ slopes
         return off.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
 
     def _full(self, change: Array) -> Array:
-        full = np.zeros(5 + len(self.model.distortion))
+        full = np.zeros(5 + len(self.model.distortion) + BENDS)
         full[list(self.free)] = change
         return full
+
+    def _heights(self) -> Array:
+        """Return each point's height per metre of each bend, (V, N, BENDS): 0 in the mean."""
+        given = self.whitening.any(axis=(2, 3))
+        seen = self.points[given][:, :2]
+        x, y = np.moveaxis((self.points[..., :2] - seen.mean(axis=0)) / np.ptp(seen, axis=0), 2, 0)
+        heights = np.stack([x * x, x * y, y * y], axis=2)
+        return np.asarray(heights - heights[given].mean(axis=0), dtype=np.float64)
+
+    def _bent(self, full: Array) -> Array:
+        """Return the target's points with the bends of ``full`` made, (V, N, 3)."""
+        points = self.points.copy()
+        points[..., 2] += self._heights() @ full[-BENDS:]
+        return points
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +319,7 @@ class Solution:
     # points lie behind the camera
     cost: float = math.inf
     # (12 + extra, 12 + extra), information of ``X``, ``Z`` and the other parameters after
-    # eliminating the robot's corrections; None for closed forms
+    # eliminating the robot's corrections, one for each solution; None for closed forms
     information: Array | None = None
     # noise of the adjustment; None if the robot's poses were taken as exact
     noise: RobotNoise | None = None
@@ -427,29 +447,29 @@ def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solu
     both = np.concatenate([matrix[:, own, rest], right[:, own, None]], axis=2)
     solved = mixed @ np.linalg.solve(matrix[:, own, own], both)
     matrices, rights = matrix[:, rest, rest] - solved[..., :-1], right[:, rest] - solved[..., -1]
-    left = zip(matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights, strict=True)
-    steps = np.stack([solve_scaled(*one) for one in left])
+    left, rights = matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights
+    steps = np.stack([solve_scaled(*one) for one in zip(left, rights, strict=True)])
     return Solution(
         whole.camera.turned_before(steps[:, :6]),
         whole.target.turned_before(steps[:, 6:12]),
         whole.change + steps[:, 12:],
+        information=left,
     )
 
 
-def pull_of_lens(robot: RobotPoses, seen: PixelObservations, at: Solution) -> Array:
-    """Return the derivatives of ``X`` and ``Z`` by the lens' values, (12, 4 + K)."""
-    # The gradient g(x, l) of a least-squares solution is 0 for any lens l: dx/dl = -(dg/dx)^-1
-    # dg/dl.
-    lens = tuple(range(1, 5 + len(seen.model.distortion)))
-    freed = dataclasses.replace(seen, free=(*seen.free, *lens))
+def pull(robot: RobotPoses, seen: Observations, at: Solution, numbers: tuple[int, ...]) -> Array:
+    """Return the derivatives of ``X`` and ``Z`` by other parameters that were not adjusted."""
+    # The gradient g(x, l) of a least-squares solution is 0 for any l, such as a lens:
+    # dx/dl = -(dg/dx)^-1 dg/dl.
+    freed = dataclasses.replace(seen, free=(*seen.free, *numbers))
     change, none = np.zeros(freed.extra), np.zeros((robot.poses.size, 6))
     change[: seen.extra] = at.change
     spread = freed if at.noise is None else freed.spread(at.noise.shared)
     corrections = at.corrections if at.corrections.size else none
     there = dataclasses.replace(at, change=change, corrections=corrections)
     whole, fitted = _normal(robot, spread, there).reduced()[0], 12 + seen.extra
-    pull: Array = -solve_scaled(whole[:fitted, :fitted], whole[:fitted, fitted:])[:12]
-    return pull
+    slopes: Array = -solve_scaled(whole[:fitted, :fitted], whole[:fitted, fitted:])[:12]
+    return slopes
 
 
 def information(robot: RobotPoses, seen: Observations, truth: Solution) -> Array:

@@ -33,6 +33,7 @@ from smartcam.calibration._hand_eye.equations import (
     Solution,
     adjust,
     carried,
+    pull,
     without_each,
 )
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
@@ -279,9 +280,17 @@ def _reprojection_beside(robot: Candidate) -> Candidate | None:
     found = _reprojection(robot.besides, known, start)
     if found is None or not len(change):
         return found
+    slopes = pull(known.robot, known.seen, found.solution, freed.seen.free)
     found.problem, found.solution = freed, dataclasses.replace(found.solution, change=change)
     if found.others is not None and robot.others is not None:
-        found.others = dataclasses.replace(found.others, change=robot.others.change)
+        # without a view these values differ, too, and pull camera and target with them
+        steps = (robot.others.change - change) @ slopes.T
+        found.others = dataclasses.replace(
+            found.others,
+            camera=found.others.camera.turned_before(steps[:, :6]),
+            target=found.others.target.turned_before(steps[:, 6:]),
+            change=robot.others.change,
+        )
         found.off = freed.off(found.others)
     return found
 

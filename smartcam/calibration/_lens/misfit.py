@@ -1,4 +1,4 @@
-"""Explain views that fit a lens worse than noise would: flipped pictures, a zoom, or others.
+"""Explain views that fit worse than noise would: flipped pictures, a changed camera, or others.
 
 The likeliest explanation is not proven. So it is given as a warning, which names the other
 explanations: sheets that bend anew, a rolling shutter, a lens of another model. The pose of each
@@ -24,9 +24,10 @@ from smartcam.calibration._lens.projection import (
     whitening,
 )
 from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import COEFFICIENTS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,22 +40,34 @@ if TYPE_CHECKING:
 FLIPS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
 """Ways to flip a picture, each with the axes of the image whose direction changes."""
 
-DEFORMATIONS: Final = 5
-"""Number of ways in which a sheet deforms: stretching along x, shearing, and three ways to bend."""
+_LENS_VALUES: Final = 4 + max(COEFFICIENTS.values())
+_ENDS: Final = np.cumsum([0, _LENS_VALUES, _LENS_VALUES, 6, 5, 2, SMOOTH, SMOOTH]).tolist()
+LENS, RIGHT_LENS, RIG, SHEET, SHUTTER, IMAGE, RIGHT_IMAGE = (
+    range(first, last) for first, last in itertools.pairwise(_ENDS)
+)
+"""Places of the shared unknowns: values of the lens, or of a pair's both; the place of a pair's
+cameras; five ways in which a sheet deforms (stretching along x, shearing, and three ways to bend);
+two in which a rolling shutter deforms a picture (leaning, and stretching from row to row); smooth
+changes of the image."""
 
-SHUTTER: Final = 2
-"""Number of ways in which a rolling shutter deforms a picture: leaning and stretching from row to
-row."""
+COUNT: Final = _ENDS[-1]
+"""Number of the shared unknowns."""
 
-FURTHER_VALUES: Final = DEFORMATIONS + SHUTTER + SMOOTH
-"""Number of values, beyond those of the lens, that may explain its misfit."""
+LENSES: Final = np.arange(COUNT) < RIG.start
+"""Mask of the lenses' values among them."""
 
 MIN_VIEWS_TO_EXPLAIN: Final = 4
 """The misfit of fewer views than this is not explained."""
 
-ZOOM_COST_RATIO: Final = 1.5
-"""A zoom is reported if two focal lengths reduce the squares by this factor: recorded views reach
-1.08, a rolling shutter 1.32, a zoom of 3 % 1.87 (measured)."""
+CHANGE_COST_RATIO: Final = 1.3
+"""A change is reported if other values from one view on reduce the squares by this factor: parts of
+nine recorded sets reach 1.18, pictures that are resized by 2 % 1.4 to 2, a zoom of 3 % 1.87
+(measured). A rolling shutter reaches 1.32, but explains more itself."""
+
+APART_COST_RATIO: Final = 4.0
+"""The views of pairs are reported as of different moments if another place of the cameras for each
+pair reduces the squares by this factor: OpenCV's recorded pairs reach 1.6, two recorded sets of a
+board in the hand 8 to 19, a board that moves by 0.2 mm in between 8 (measured)."""
 
 FITTED_COST_RATIO: Final = 1.2
 """A known lens is wrong if one fitted to the views reduces the squares by this factor: lenses from
@@ -75,6 +88,8 @@ class Fitted(NamedTuple):
     camera: CameraModel
     pose: Rigid  # ``T_camera_target``
     points: Array  # (T, 3), points of the target, metres
+    # of a pair's right camera: ``T_right_left``; the pose that is eliminated is in the left camera
+    rig: Rigid | None = None
 
     def equations(self, more: float) -> Equations:
         """Return the view's equations; ``more``: variance added to the points' own, pixels^2."""
@@ -82,21 +97,29 @@ class Fitted(NamedTuple):
         turned = flat @ self.pose.rotation.T
         seen = linearize(turned + self.pose.translation, self.camera)
         white = whitening(self.view.covariance, more)
-        by_sheet = seen.by_point @ self.pose.rotation @ _deformations(flat)
-        rows = seen.pixels[:, 1, None, None] / self.camera.size[1]
-        further = by_sheet, rows * np.eye(2), smooth_changes(seen.pixels, self.camera.size)
+        by_pose, lens, image = pose_changes(seen.by_point, turned), LENS, IMAGE
+        shared = np.zeros((*seen.pixels.shape, COUNT))
+        if self.rig is not None:
+            lens, image = RIGHT_LENS, RIGHT_IMAGE
+            away = turned + self.pose.translation - self.rig.translation
+            shared[..., RIG] = pose_changes(seen.by_point, away)
+            by_pose = pose_changes(seen.by_point @ self.rig.rotation, turned @ self.rig.rotation)
+        shared[..., lens[: seen.by_lens.shape[2]]] = seen.by_lens
+        shared[..., SHEET] = seen.by_point @ self.pose.rotation @ _deformations(flat)
+        shared[..., SHUTTER] = seen.pixels[:, 1, None, None] / self.camera.size[1] * np.eye(2)
+        shared[..., image] = smooth_changes(seen.pixels, self.camera.size)
         return Equations(
-            white @ pose_changes(seen.by_point, turned),
-            white @ np.concatenate([seen.by_lens, *further], axis=2),
+            white @ by_pose,
+            white @ shared,
             (white @ (self.view.points - seen.pixels)[..., None])[..., 0],
             np.sqrt(more + self.view.sigmas**2),
         )
 
 
 def _deformations(flat: Array) -> Array:
-    """Return the moves of points (N, 3) as the sheet stretches, shears and bends, (N, 3, D)."""
+    """Return the moves of points (N, 3) as the sheet stretches, shears and bends, (N, 3, 5)."""
     x, y = (flat[:, :2] / np.ptp(flat, axis=0).max()).T
-    moves = np.zeros((len(flat), 3, DEFORMATIONS))
+    moves = np.zeros((len(flat), 3, len(SHEET)))
     moves[:, 0, 0], moves[:, 0, 1] = x, y
     moves[:, 2, 2], moves[:, 2, 3], moves[:, 2, 4] = x**2, x * y, y**2
     return moves
@@ -106,18 +129,9 @@ class Equations(NamedTuple):
     """The linear equations of one view, in standard deviations."""
 
     by_pose: Array  # (N, 2, 6), derivatives by the pose
-    # (N, 2, ...), derivatives by the lens' values, deformations of the sheet, a rolling shutter,
-    # and smooth changes of the image
-    by_shared: Array
+    by_shared: Array  # (N, 2, COUNT), derivatives by the shared unknowns
     residuals: Array  # (N, 2), seen minus projected
     deviations: Array  # (N,), standard deviation of each point, pixels
-
-
-def lens_alone(equations: Equations) -> Mask:
-    """Return a mask of the shared unknowns that are values of the lens."""
-    count = equations.by_shared.shape[2]
-    of_lens: Mask = np.arange(count) < count - FURTHER_VALUES
-    return of_lens
 
 
 class Reduced(NamedTuple):
@@ -175,7 +189,8 @@ class _FlippedLens(NamedTuple):
     @classmethod
     def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
         """Return the effect of flipping pictures along some axes."""
-        values = np.concatenate([lens_values(camera), np.zeros(FURTHER_VALUES)])
+        values = np.zeros(COUNT)
+        values[: 4 + len(camera.distortion)] = lens_values(camera)
         mirror, goal = np.ones(len(values)), values.copy()
         for axis in axes:
             mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
@@ -205,77 +220,132 @@ class _FlippedLens(NamedTuple):
         return flipped, float(np.minimum(as_is, mirrored).sum())
 
 
+class _Misfit:
+    """The misfit of views, and how far the causes that are no blunder explain it."""
+
+    def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
+        """``free`` (COUNT,): mask of the values that were fitted."""
+        self.reduced = Reduced.of(equations)
+        self._count, views = sum(one.residuals.size for one in equations), len(equations)
+        there = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
+        self.usual, bends = free & there, there.copy()
+        self.usual[SHEET], bends[: IMAGE.start] = True, False
+        best = self.reduced.best
+        explained = {
+            "sheets that bend anew in each view": (best(self.usual, SHEET)[1], views * len(SHEET)),
+            "a shutter that rolls": (best(self.usual, SHUTTER)[1], views * len(SHUTTER)),
+            "a lens of another model": (best(self.usual | bends)[1], float(bends.sum())),
+        }
+        self._before = best(self.usual)[1]
+        self._best = min(self.score(*one) for one in [(self._before, 0), *explained.values()])
+        self._others = ", ".join(
+            f"{what} {self._before / max(after, 1e-300):.3g}"
+            for what, (after, _) in explained.items()
+        )
+
+    def score(self, squares: float, unknowns: float) -> float:
+        """Return how badly a cause explains the views that leaves these squares."""
+        # Schwarz, Estimating the Dimension of a Model (1978)
+        return self._count * math.log(max(squares, 1e-300)) + unknowns * math.log(self._count)
+
+    def offer(self, squares: float, unknowns: float, ratio: float) -> bool:
+        """Offer a further cause; return whether it explains the views best so far, and enough.
+
+        ``ratio``: least factor by which it must reduce the squares.
+        """
+        better = self.score(squares, unknowns) < self._best
+        self._best = min(self._best, self.score(squares, unknowns))
+        return better and self._before > ratio * squares
+
+    def compared(self, after: float) -> str:
+        """Return a sentence that compares a cause that leaves these squares with the others."""
+        return (
+            f"The squares of all are {self._before / max(after, 1e-300):.3g} times smaller so; "
+            f"what else was tried explains less for what it takes: {self._others}"
+        )
+
+    def changed(
+        self, changes: Mapping[str, Sequence[int]], names: Sequence[str]
+    ) -> Iterator[Remark]:
+        """Yield a remark if other values from one view on explain the views best.
+
+        ``changes``: what may have changed, with the indices of its values.
+        """
+        tried = list[tuple[float, int, str]]()
+        for first in range(2, len(names) - 1):
+            parts = [slice(None, first), slice(first, None)]
+            sums = Reduced(
+                *(np.array([part[some].sum(axis=0) for some in parts]) for part in self.reduced)
+            )
+            tried += [(sums.best(self.usual, some)[1], first, how) for how, some in changes.items()]
+        after, first, best = min(tried)
+        if not self.offer(after, len(changes[best]) + 1, CHANGE_COST_RATIO):
+            return
+        least = CHANGE_COST_RATIO * after
+        alike = [how for some, one, how in sorted(tried) if one == first and some < least]
+        code = Code.POOR_FIT if alike == [MOVED] else Code.WRONG_LENS
+        yield code.remark(
+            f"views of two settings: those from {names[first]} on do not fit those before: "
+            f"{', or '.join(alike)}? {self.compared(after)}"
+        )
+
+
+ZOOMED: Final = "was the zoom or the focus moved, or were pictures resized or cut"
+MOVED: Final = "did the cameras move against each other"
+
+
 def misfit_remarks(
-    fitted: Sequence[Fitted], more: float, free: Mask, names: Sequence[str]
+    fitted: Sequence[Sequence[Fitted]], more: float, free: Mask, names: Sequence[str]
 ) -> Iterator[Remark]:
-    """Yield a remark if flipped pictures, or a zoom, explain the views better than all else.
+    """Yield a remark if a blunder explains the views better than all else.
 
-    In a flipped picture a board is found as well if it looks the same in a mirror; its points are
-    then those of a camera with a mirrored lens. But such a large misfit may have other causes: each
-    cause is fitted, and the best one counts.
+    Blunders are a change of the camera from one view on and flipped pictures; of a pair also
+    cameras that move against each other, and views of different moments. In a flipped picture a
+    board is found as well if it looks the same in a mirror; its points are then those of a camera
+    with a mirrored lens. But such a large misfit may have other causes: each cause is fitted, and
+    the best one counts.
 
-    ``more``: variance in addition to the points' own, pixels^2. ``free`` (4 + K,): mask of the
-    lens' values that were fitted. ``names``: names of the views.
+    ``fitted``: the view, or the left and the right one of a pair, at each moment. ``more``:
+    variance in addition to the points' own, pixels^2. ``free`` (COUNT,): mask of the values that
+    were fitted. ``names``: names of the views.
     """
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
-    equations = [one.equations(more) for one in fitted]
-    reduced, count = Reduced.of(equations), sum(one.residuals.size for one in equations)
-    lens, views = len(free), len(fitted)
-    places = np.split(lens + np.arange(FURTHER_VALUES), np.cumsum([DEFORMATIONS, SHUTTER]))
-    sheet, shutter, smooth = (one.tolist() for one in places)
-    usual = np.zeros(lens + FURTHER_VALUES, dtype=np.bool_)
-    usual[:lens], usual[sheet] = free, True
-    other = usual.copy()
-    other[smooth] = True
-
-    def score(squares: float, unknowns: float) -> float:
-        # Schwarz, Estimating the Dimension of a Model (1978)
-        return count * math.log(max(squares, 1e-300)) + unknowns * math.log(count)
-
-    before = reduced.best(usual)[1]
-    explained = {
-        "sheets that bend anew in each view": (reduced.best(usual, sheet)[1], views * len(sheet)),
-        "a shutter that rolls": (reduced.best(usual, shutter)[1], views * len(shutter)),
-        "a lens of another model": (reduced.best(other)[1], len(smooth)),
-    }
-    best = min(score(before, 0), *(score(*one) for one in explained.values()))
-    others = ", ".join(
-        f"{what} {before / max(after, 1e-300):.3g}" for what, (after, _) in explained.items()
-    )
-    rest = f"times smaller so; what else was tried explains less for what it takes: {others}"
-    changed, after = _zoomed(reduced, usual)
-    if before > ZOOM_COST_RATIO * after and score(after, 3) < best:
-        yield Code.WRONG_LENS.remark(
-            f"views of two focal lengths: those from {names[changed]} on are of another one than "
-            f"those before, was the zoom or the focus moved? The squares of all are "
-            f"{before / max(after, 1e-300):.3g} {rest}"
+    equations = [[one.equations(more) for one in views] for views in fitted]
+    joined = [Equations(*map(np.concatenate, zip(*one, strict=True))) for one in equations]
+    misfit, apart = _Misfit(joined, free), False
+    reduced, usual, changes = misfit.reduced, misfit.usual, {ZOOMED: LENS[:4]}
+    if len(fitted[0]) > 1:
+        sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
+        changes = {f"{one} camera: {ZOOMED}": some for one, some in sides.items() if usual[some[0]]}
+        changes[MOVED] = RIG
+        after = reduced.best(usual, RIG)[1]
+        apart = misfit.offer(after, len(RIG) * len(fitted), APART_COST_RATIO)
+    if found := list(misfit.changed(changes, names)):
+        yield from found
+    elif apart:
+        yield Code.NOT_SIMULTANEOUS.remark(
+            "the views of each pair do not belong together: did the target move between the two, "
+            f"or one camera against the other? {misfit.compared(after)}"
         )
-        return
-    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in FLIPS.values()]
+    elif len(fitted[0]) == 1:
+        yield from _flipped(misfit, fitted[0][0].camera, names)
+
+
+def _flipped(misfit: _Misfit, camera: CameraModel, names: Sequence[str]) -> Iterator[Remark]:
     tried = [
-        (how, *min((flip.best(reduced, usual, one) for one in guesses), key=lambda one: one[1]))
-        for (how, axes), flip in zip(FLIPS.items(), flips, strict=True)
-        for guesses in [list(_guesses(reduced, [2 + axis for axis in axes]))]
+        (*_FlippedLens.of(camera, axes).best(misfit.reduced, misfit.usual, guess), how)
+        for how, axes in FLIPS.items()
+        for guess in _guesses(misfit.reduced, [2 + axis for axis in axes])
     ]
-    how, flipped, after = min(tried, key=lambda one: one[2])
-    if flipped.any() and not flipped.all() and score(after, views) < best:
+    flipped, after, how = min(tried, key=lambda one: one[1])
+    if flipped.any() and not flipped.all() and misfit.offer(after, len(names), 1.0):
         fewer = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
         which = ", ".join(itertools.compress(names, fewer.tolist()))
         yield Code.MIRRORED.remark(
             f"pictures that look flipped {how} against the others, or those of another camera: "
-            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {rest}"
+            f"{which}. {misfit.compared(after)}"
         )
-
-
-def _zoomed(reduced: Reduced, free: Mask) -> tuple[int, float]:
-    """Return the view from which on other focal lengths explain most, and the squares with them."""
-    found = []
-    for first in range(2, len(reduced.squares) - 1):
-        parts = [slice(None, first), slice(first, None)]
-        sums = Reduced(*(np.array([part[some].sum(axis=0) for some in parts]) for part in reduced))
-        found.append((first, sums.best(free, [0, 1])[1]))
-    return min(found, key=lambda one: one[1])
 
 
 def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
@@ -298,7 +368,7 @@ def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[R
         return
     equations = [one.equations(more) for one in fitted]
     reduced = Reduced.of(equations)
-    before, after = float(reduced.squares.sum()), reduced.best(lens_alone(equations[0]))[1]
+    before, after = float(reduced.squares.sum()), reduced.best(LENSES)[1]
     if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(
             f"the {what} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "

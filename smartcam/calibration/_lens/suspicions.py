@@ -15,10 +15,11 @@ import numpy as np
 
 from smartcam.calibration._least_squares import solve_scaled
 from smartcam.calibration._lens.misfit import (
+    COUNT,
+    LENSES,
     Equations,
     Fitted,
     Reduced,
-    lens_alone,
     lens_remarks,
     misfit_remarks,
 )
@@ -112,7 +113,7 @@ def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> li
     some = [
         Equations(*(part[rows] for part in one)) for one, rows in zip(equations, kept, strict=True)
     ]
-    change = Reduced.of(some).best(lens_alone(equations[0]))[0]
+    change = Reduced.of(some).best(LENSES)[0]
     left = []
     for one, rows in zip(equations, kept, strict=True):
         residuals = one.residuals - one.by_shared @ change
@@ -236,12 +237,10 @@ def examined(
     names = [label(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", found.rms, views)
     of_fit = [*view_remarks(views, names), *_remarks_on_middle(found)]
-    of_fit += misfit_remarks(
-        list(itertools.compress(fitted, used)),
-        found.sigma**2,
-        np.diag(found.covariance) > 0,
-        list(itertools.compress(names, used)),
-    )
+    free = np.zeros(COUNT, dtype=np.bool_)
+    free[: len(found.covariance)] = np.diag(found.covariance) > 0
+    of_used = [[one] for one in itertools.compress(fitted, used)], found.sigma**2, free
+    of_fit += misfit_remarks(*of_used, list(itertools.compress(names, used)))
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
         found, of_fit = again(without(views, off)), []  # remarked on by check_rms

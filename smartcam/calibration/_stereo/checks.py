@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._lens.misfit import Fitted, lens_remarks
+from smartcam.calibration._lens.misfit import (
+    COUNT,
+    LENS,
+    RIG,
+    RIGHT_LENS,
+    Fitted,
+    lens_remarks,
+    misfit_remarks,
+)
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._lens.suspicions import (
     most_rms,
@@ -135,6 +144,17 @@ def examined(
         if known[side] is not None:
             own = [one.fitted for one in seen if one.used and one.side == side]
             of_fit += lens_remarks(own, f"{name} lens", found.sigma**2)
+    pairs = [list(some) for _, some in itertools.groupby(seen, key=lambda one: one.pair)]
+    both = [some for some in pairs if len(some) == 2 and all(one.used for one in some)]
+    free = np.zeros(COUNT, dtype=np.bool_)
+    free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
+    free[RIG] = True
+    of_fit += misfit_remarks(
+        [(left.fitted, right.fitted._replace(rig=found.transform.rigid)) for left, right in both],
+        found.sigma**2,
+        free,
+        [label(one.fitted.view, one.pair) for one, _ in both],
+    )
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
         for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):

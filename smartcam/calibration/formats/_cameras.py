@@ -13,6 +13,7 @@ of the lens decides how many coefficients are written and read.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
@@ -22,6 +23,7 @@ import numpy as np
 from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats import _foreign as foreign
+from smartcam.calibration.formats._file_format import MAX_FILE_BYTES as MAX_MRCAL_BYTES
 from smartcam.calibration.formats._file_format import Format, Measured
 from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix
 from smartcam.calibration.formats._plain import (
@@ -366,7 +368,7 @@ def parse_opencv(
     data = _normal(load_storage(text))
     if extrinsics:
         data = {**_normal(load_storage(extrinsics)), **data}
-    sides = next((ends for ends in _ENDS if _has(data, _MATRIX, ends[0])), None)
+    sides = next((ends for ends in _ENDS if _first(data, _MATRIX, ends[0])), None)
     stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
     whole = _first(data, ("imagesize", "size"), "", [])
     size = _size(stated or sequence(whole, "image_size"), size)
@@ -407,10 +409,6 @@ def _normal(data: Plain) -> dict[str, Plain]:
     return found
 
 
-def _has(data: dict[str, Plain], names: Sequence[str], end: str) -> bool:
-    return any(f"{name}{end}" in data for name in names)
-
-
 def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain = None) -> Plain:
     """Return the value of the first name that is there."""
     return next((data[f"{name}{end}"] for name in names if f"{name}{end}" in data), other)
@@ -418,7 +416,7 @@ def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain 
 
 def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
     for names in (_MATRIX, _BENT):
-        if not _has(data, names, end):
+        if _first(data, names, end) is None:
             expected = f"{names[0]}{end} (or {', '.join(f'{one}{end}' for one in names[1:])})"
             raise malformed("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
@@ -475,7 +473,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
     "opencv": _form("opencv", parse_opencv, compose_opencv),
     "ros_ini": _foreign("ros_ini", foreign.parse_ros_ini),
     "euroc": _foreign("euroc", foreign.parse_euroc),
-    "mrcal": _foreign("mrcal", foreign.parse_mrcal),
+    "mrcal": dataclasses.replace(_foreign("mrcal", foreign.parse_mrcal), most=MAX_MRCAL_BYTES),
     "colmap": _foreign("colmap", foreign.parse_colmap),
     "basalt": _foreign("basalt", foreign.parse_basalt),
     "multical": _foreign("multical", foreign.parse_multical),

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration.formats._file_format import Measured
+from smartcam.calibration.formats._file_format import MAX_YAML_BYTES, Measured
 from smartcam.calibration.formats._plain import (
     POSE,
     Plain,
@@ -67,6 +67,12 @@ _RADTAN: Final = "k1 k2 p1 p2"
 _EIGHT: Final = "k1 k2 p1 p2 k3 k4 k5 k6"
 _FOUR: Final = "k1 k2 k3 k4"
 
+_OF_KALIBR: Final = {
+    "radtan": _LensParameters(_FXFY, coefficients=_RADTAN),
+    "equidistant": _LensParameters(_FXFY, "equidistant", _FOUR),
+    "none": _LensParameters(_FXFY),
+}
+
 MODELS: Final[Mapping[str, Mapping[str, _LensParameters]]] = {
     "colmap": {
         "SIMPLE_PINHOLE": _LensParameters(_F),
@@ -85,20 +91,15 @@ MODELS: Final[Mapping[str, Mapping[str, _LensParameters]]] = {
         "LENSMODEL_OPENCV5": _LensParameters(_FXFY, coefficients=f"{_RADTAN} k3"),
         "LENSMODEL_OPENCV8": _LensParameters(_FXFY, "rational_polynomial", _EIGHT),
     },
-    "kalibr": {
-        "radtan": _LensParameters(_FXFY, coefficients=_RADTAN),
-        "equidistant": _LensParameters(_FXFY, "equidistant", _FOUR),
-    },
+    "kalibr": _OF_KALIBR,
     "basalt": {
         "pinhole": _LensParameters(_FXFY),
         "pinhole-radtan8": _LensParameters(_FXFY, "rational_polynomial", _EIGHT),
         "kb4": _LensParameters(_FXFY, "equidistant", _FOUR),
     },
     "euroc": {
+        **_OF_KALIBR,
         "radial-tangential": _LensParameters(_FXFY, coefficients=_RADTAN),
-        "radtan": _LensParameters(_FXFY, coefficients=_RADTAN),
-        "equidistant": _LensParameters(_FXFY, "equidistant", _FOUR),
-        "none": _LensParameters(_FXFY),
     },
     "multical": {
         "standard": _LensParameters(_FXFY, coefficients=f"{_RADTAN} k3"),
@@ -196,7 +197,13 @@ def parse_colmap(text: str) -> Found:
 
 
 def parse_mrcal(text: str) -> Found:
-    """Return the lens of a ``.cameramodel``: a Python dictionary, which is also YAML."""
+    """Return the lens of a ``.cameramodel``: a Python dictionary, which is also YAML.
+
+    Only the line with the inputs of mrcal's solver, bytes to the base 85, is no YAML.
+    """
+    text = re.sub(r"^ *'optimization_inputs': b'.*$", "", text, flags=re.MULTILINE)
+    if len(text) > MAX_YAML_BYTES:
+        raise malformed("file", f"{MAX_YAML_BYTES} bytes at most beside the solver's inputs")
     data = mapping(load_yaml(text), "file", ["lensmodel", "intrinsics", "imagersize"])
     values = reals(data["intrinsics"], "intrinsics")
     size = sequence(data["imagersize"], "imagersize", 2)
@@ -259,13 +266,13 @@ def parse_basalt(text: str) -> Found:
         size = sequence(sizes[place], f"{where}: resolution", 2) if sizes else None
         lenses.append(_lens("basalt", part["camera_type"], values, where, size))
     if len(lenses) < 2:
-        return lenses, [], "m"
+        return lenses, [], BY_FORMAT
     poses = sequence(mapping(data, "value0", ["T_imu_cam"])["T_imu_cam"], "T_imu_cam", len(lenses))
     in_imu = [
         placed("imu", lens.name, numbers(pose, f"T_imu_{lens.name}", ["px", "py", "pz", *POSE[3:]]))
         for lens, pose in zip(lenses, poses, strict=True)
     ]
-    return lenses, [b.inverse() @ a for a, b in itertools.pairwise(in_imu)], "m"
+    return lenses, [b.inverse() @ a for a, b in itertools.pairwise(in_imu)], BY_FORMAT
 
 
 def parse_multical(text: str) -> Found:
@@ -311,25 +318,22 @@ def _flat(value: Plain) -> list[Plain]:
 
 
 def parse_bare(text: str, target: str, source: str) -> Measured[Transform]:
-    """Read a (4, 4) matrix: JSON, or four lines of four numbers between spaces or commas."""
-    if text.lstrip().startswith("["):
-        rows = sequence(load_json(text), "matrix", 4)
-    else:
-        lines = [line.partition("#")[0].replace(",", " ").split() for line in text.splitlines()]
-        rows = [line for line in lines if line]
-    return Measured(_bare(rows, target, source))
+    """Read the 16 numbers of a matrix, row by row; between them are spaces, commas or brackets."""
+    lines = [line.partition("#")[0] for line in text.splitlines()]
+    words = re.sub(r"[\[\],;]", " ", " ".join(lines)).split()
+    if len(words) != 16:
+        raise malformed("matrix", "16 numbers: four rows of four", f"{len(words)}")
+    values = np.reshape([number(word, "matrix") for word in words], (4, 4))
+    return Measured(rigid(target, source, values, "matrix"))
 
 
 def parse_zivid(text: str, target: str, source: str) -> Measured[Transform]:
     """Return Zivid's matrix, whose lengths are millimetres."""
-    data = mapping(load_yaml(text), "file", ["FloatMatrix"])
-    return Measured(
-        _bare(mapping(data["FloatMatrix"], "FloatMatrix", ["Data"])["Data"], target, source), "mm"
+    data = mapping(
+        mapping(load_yaml(text), "file", ["FloatMatrix"])["FloatMatrix"], "Data", ["Data"]
     )
-
-
-def _bare(rows: Plain, target: str, source: str) -> Transform:
-    return rigid(target, source, matrix_of(rows, "matrix", (4, 4)), "matrix")
+    rows = matrix_of(data["Data"], "matrix", (4, 4))
+    return Measured(rigid(target, source, rows, "matrix"), "mm")
 
 
 def parse_sensor(text: str, target: str, source: str) -> Transform:

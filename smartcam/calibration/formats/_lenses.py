@@ -35,7 +35,7 @@ FORMAT_PATTERNS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
     "multical": re.compile(rb'\A\s*{\s*"cameras"'),
     "colmap": re.compile(rb"^\d+ [A-Z_]+ \d+ \d+ [\d.]", re.MULTILINE),
     "ros_ini": re.compile(rb"^camera matrix\s*$", re.MULTILINE),
-    "opencv": re.compile(rb"\A\s*(?:%YAML|<\?xml|<opencv_storage)"),
+    "opencv": re.compile(rb'\A\s*(?:%YAML|<\?xml|<opencv_storage)|"opencv-matrix"'),
     "camera_info": re.compile(rb"^camera_matrix\s*:", re.MULTILINE),
 }
 """Patterns by which the formats of other programs are recognized."""

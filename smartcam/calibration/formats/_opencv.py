@@ -41,8 +41,8 @@ def load_storage(text: str) -> Plain:
     if not text.lstrip().startswith("<"):
         return load_yaml(text)
     root = load_xml(text.strip())
-    if root.kind != "opencv_storage":
-        raise malformed("file", "<opencv_storage>", f"<{root.kind}>")
+    if root.tag != "opencv_storage":
+        raise malformed("file", "<opencv_storage>", f"<{root.tag}>")
     return storage_data(root)
 
 

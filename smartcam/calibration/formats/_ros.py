@@ -81,7 +81,7 @@ def _from_words(words: list[str]) -> Transform:
 
 def _from_launch(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
-    nodes = [one.attributes for one in load_xml(text.strip()).all("node")]
+    nodes = [one.attrib for one in load_xml(text.strip()).iter("node")]
     found = [
         one["args"]
         for one in nodes
@@ -125,12 +125,8 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
     If there are several joints, the one from ``target`` to ``source`` is taken.
     """
     joints = {}
-    for joint in load_xml(text.strip()).all("joint"):
-        ends = [
-            one.attributes.get("link", "")
-            for kind in ("parent", "child")
-            for one in joint.all(kind)
-        ]
+    for joint in load_xml(text.strip()).iter("joint"):
+        ends = [one.get("link", "") for kind in ("parent", "child") for one in joint.iter(kind)]
         if len(ends) == 2:
             joints[ends[0], ends[1]] = joint
     names = (target, source)
@@ -139,7 +135,7 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
     if names not in joints:
         there = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
         raise malformed("file", f"a joint of parent {target} and child {source}", there)
-    given = next((one.attributes for one in joints[names].all("origin")), {})
+    given = next((one.attrib for one in joints[names].iter("origin")), {})
     place, turn = (
         reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
     )

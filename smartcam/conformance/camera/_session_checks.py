@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
     from smartcam.conformance.camera._wire import Heard
 
-ON_THE_WAY = 0.02
-"""Least number of seconds that messages before a Disconnect may be on their way."""
+TRANSIT_TIME = 0.02
+"""Seconds, at least, that messages which were sent before a Disconnect may take to arrive."""
 
-
-BETWEEN_PIECES = 0.005
+PIECE_INTERVAL = 0.005
 """Seconds between the bytes of a message that is sent in pieces, so that each has a segment."""
 
 _NARROWED = "the bodies of the dialects with 32 bits narrowed, inferred"
@@ -150,7 +149,7 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
         client.send(m.Trigger())
         ended_at = client.send(m.Disconnect())
         came = client.listen(takes + camera.options.quiet)
-        grace = max(ON_THE_WAY, 2 * camera.measured.get("query", 0.0))
+        grace = max(TRANSIT_TIME, 2 * camera.measured.get("query", 0.0))
         results = of_kind(came, MessageId.RESULT_CONTAINER)
         if any(one.at - ended_at > grace for one in results):
             raise Differs("no result after Disconnect", client.words(mark))
@@ -212,7 +211,7 @@ def a_message_may_come_in_pieces(camera: CameraUnderTest) -> None:
         mark = len(client.received)
         for byte in camera.wire.request(m.Query()):
             client.write(bytes([byte]))
-            client.listen(BETWEEN_PIECES)
+            client.listen(PIECE_INTERVAL)
         client.until(
             MessageId.QUERY_APPLICATION,
             camera.options.timeout,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 CLIENT_END_TIMEOUT = 0.3
-"""Seconds that the camera waits for the end of a client that has ended: loopback is faster."""
+"""Seconds that the camera waits for the last messages of a client that has ended."""
 
 MAX_LINES = 40
 """Largest number of lines of the wire that a finding shows: the last ones."""

@@ -40,7 +40,7 @@ SHOWN_LENGTH = 2000
 """Largest number of characters of a command's output that a report shows."""
 
 END_TIMEOUT = 2.0
-"""Seconds that a client has for its end, after the request to end."""
+"""Seconds that a client has to end after it was cancelled or killed."""
 
 Verb = Literal["trigger", "switch", "watch"]
 

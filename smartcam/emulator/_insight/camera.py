@@ -234,7 +234,7 @@ class EmulatedInSight(LineCamera):
     # ------------------------------------------------------------------ the operator
 
     def set_online(self, online: bool) -> None:
-        """Go online, or be held offline by hand or an input: then ``SO1`` is answered with -5."""
+        """Go online, or hold the camera offline, as by hand or an input; ``SO1`` then gets -5."""
         self.device.set_online(check_flag(online, "online", "emulator"))
 
     def set_image(self, image: NDArray[np.uint8]) -> None:
@@ -381,7 +381,7 @@ class EmulatedInSight(LineCamera):
         clients = [one for one in self._clients.values() if isinstance(one, TelnetClient)]
         return sorted(clients, key=lambda one: one.number)
 
-    def _began(self) -> None:
+    def _after_start(self) -> None:
         self._offset = nanoseconds(self.clock.now) - self.device.now
 
     def _move(self, now: float) -> None:

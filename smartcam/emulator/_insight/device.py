@@ -186,7 +186,7 @@ class InSightDevice:
     # ------------------------------------------------------------------ the operator
 
     def set_online(self, online: bool) -> None:
-        """Go online, or be held offline by hand or an input: ``SO1`` alone does not undo that."""
+        """Go online, or hold the camera offline, as by hand or an input: then ``SO1`` fails."""
         with self.around():
             self._switch(wanted=self._wanted_online or online, allowed=online)
 
@@ -195,7 +195,7 @@ class InSightDevice:
         self.set_online(True)
 
     def stop(self) -> None:
-        """Be held offline by hand."""
+        """Hold the camera offline, as by hand."""
         self.set_online(False)
 
     def trigger(self) -> bool:
@@ -228,7 +228,7 @@ class InSightDevice:
                 self._break_run()
 
     def switch_application(self, application: int, *, running: bool = False) -> bool:
-        """Load the job of an id by hand, and go online or not; False while one is loaded.
+        """Load the job with an id by hand, then go online or offline; False during another load.
 
         Raises:
             ConfigurationError: there is no such job.
@@ -250,7 +250,7 @@ class InSightDevice:
         return StatusCode.STILL_OFFLINE if online and not self.online else StatusCode.DONE
 
     def request_job(self, job: str | int, on_code: OnCode) -> None:
-        """Load a job for a client (``LF``, ``SJ``); ``on_code`` gets the code at the end or now."""
+        """Load a job for a client (``LF``, ``SJ``); ``on_code`` gets the code when that is done."""
         try:
             found = self.find(job)
         except ConfigurationError:
@@ -383,7 +383,7 @@ class InSightDevice:
                 return
             if not isinstance(job, InspectedJob):
                 self._finish_acquisition(job)
-            elif not (self.busy or self._blind):  # unless the last run is late, or blind
+            elif not (self.busy or self._blind):  # skip the run if the last one still runs
                 run = self._run = _PendingEvent(None)
                 self._inspect(job, run, at_image=False)
             self.after(period, turn)

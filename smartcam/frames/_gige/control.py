@@ -79,7 +79,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                 )
         except OSError as exc:  # TimeoutError is one
             raise FrameSourceError(
-                f"{source}: no way to {host}:{port}: {exc or 'the name has no answer'}",
+                f"{source}: {host}:{port} cannot be reached: {exc or 'no name server answers'}",
                 source=source,
             ) from exc
         return channel
@@ -184,19 +184,19 @@ class ControlChannel(asyncio.DatagramProtocol):
             try:
                 self._expected = request_id
                 for _ in range(MAX_ATTEMPTS):
-                    ack = await self._tried(datagram, command, what)
+                    ack = await self._send_once(datagram, command, what)
                     if ack is not None:
-                        return self._checked(ack, command, least, what)
+                        return self._checked_payload(ack, command, least, what)
             finally:
                 self._expected = 0
-                self._emptied()
+                self._drop_answers()
         raise FrameTimeoutError(
             f"{self.source}: no answer to {command.name} {what} in "
             f"{MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s",
             source=self.source,
         )
 
-    async def _tried(self, datagram: bytes, command: GvcpCommand, what: str) -> Ack | None:
+    async def _send_once(self, datagram: bytes, command: GvcpCommand, what: str) -> Ack | None:
         """Send a request; return its answer, or None if none comes in time."""
         if self._transport is None or self._transport.is_closing():
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
@@ -220,7 +220,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         except TimeoutError:
             return None
 
-    def _checked(self, ack: Ack, command: GvcpCommand, least: int, what: str) -> bytes:
+    def _checked_payload(self, ack: Ack, command: GvcpCommand, least: int, what: str) -> bytes:
         if ack.status != GvcpStatus.SUCCESS:
             raise RequestRefusedError(
                 f"{self.source}: {command.name} {what}: the camera answers "
@@ -240,7 +240,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         self._id = self._id % 0xFFFF + 1
         return self._id
 
-    def _emptied(self) -> None:
+    def _drop_answers(self) -> None:
         while not self._answers.empty():
             self._answers.get_nowait()
 

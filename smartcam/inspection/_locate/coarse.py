@@ -1,9 +1,9 @@
 """Find places where a part may be, by the directions of gradients, from coarse to fine.
 
-Each pixel of a small picture of the pyramid has a direction, one of sixteen. A map for each of the
-directions says how well the pixels around a place agree with it. A part's points are looked up in
-these maps, for all places at once, one turn of the part after the other. The best places are
-followed down the pyramid.
+The gradient of a pixel of a pyramid level has one of sixteen directions. A map for each direction
+gives the agreement of the pixels around a place with it. The agreement of a part's points is read
+from these maps, for all places at once, one rotation of the part after the other. The best places
+are refined at the larger levels of the pyramid.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
 """Agreement of two directions by the steps between them; 0 for more steps."""
 
 MAX_TOP_POINTS: Final = 44
-"""Largest number of points of a part that are looked up everywhere: with 4 of agreement each, their
-sum is a byte."""
+"""Largest number of points of a part that are compared at all places: each adds 4 at most to the
+agreement, so that the sum fits into a byte."""
 
 MAX_POINTS: Final = 150
-"""Largest number of points of a part that are looked up at the places that are followed."""
+"""Largest number of points of a part that are compared at the places that are refined."""
 
 MIN_RADIUS_PX: Final = 8.0
 """Least distance, pixels, from the reference to the farthest point at the smallest level."""
@@ -44,26 +44,26 @@ MAX_LEVELS: Final = 6
 """Largest number of levels of the pyramid."""
 
 MAX_STACK_BYTES: Final = 1 << 26
-"""Largest number of bytes of agreement that are kept at once, of all places and turns at the
-smallest level."""
+"""Largest number of bytes of the agreement of all places and rotations at the smallest level that
+is kept at a time."""
 
 MAX_CANDIDATES: Final = 100
-"""Largest number of places of a part that are followed down the pyramid, of each scale."""
+"""Largest number of places of a part, for each scale, that are refined down the pyramid."""
 
 TOP_STEP_PX: Final = 1.6
-"""Pixels that the farthest point moves by between two turns at the smallest level."""
+"""Motion of the farthest point, pixels, between two rotations at the smallest level."""
 
 LOWER_STEP_PX: Final = 1.0
-"""Pixels that the farthest point moves by between two turns at other levels."""
+"""Motion of the farthest point, pixels, between two rotations at other levels."""
 
 TOP_SHARE, LOWER_SHARE = 0.8, 0.85
-"""Part of the least score that a place has at the smallest level, and at others, to be followed."""
+"""Shares of the least score from which places are refined, at the smallest and at other levels."""
 
 EDGE_RESPONSE: Final = 2.2
-"""Response of Sobel's operator to an edge of one grey level in the pyramid."""
+"""Response of Sobel's operator to an edge of one grey level in a pyramid level."""
 
 NOISE_RESPONSE: Final = 12.0
-"""Standard deviations of the noise in Sobel's response, above which it has a direction."""
+"""Sobel's response, in standard deviations of its noise, above which a pixel has a direction."""
 
 
 class RoughPlace(NamedTuple):
@@ -81,7 +81,8 @@ class CoarseModel:
     """The points of a part at the levels of a pyramid.
 
     Attributes:
-        points: places from the reference, (N, 2), pixels of the taught picture, by level from 0.
+        points: places relative to the reference, (N, 2), pixels of the taught picture, by level
+            from 0.
         normals: directions to the brighter side, (N, 2), by level.
     """
 
@@ -94,21 +95,21 @@ class CoarseModel:
         return len(self.points) - 1
 
     def radius(self, level: int) -> float:
-        """Return the distance of the farthest point at a level, in its pixels."""
+        """Return the distance of the farthest point at a level, in the level's pixels."""
         return float(np.linalg.norm(self.points[level], axis=1).max()) / float(1 << level)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranges:
-    """The poses that are looked for.
+    """The poses that are searched.
 
     Attributes:
-        angles: from and to, radians; a span of the period is all of them.
-        scales: from and to.
+        angles: first and last angle, radians; a range of the period includes all angles.
+        scales: smallest and largest scale.
         period: angle after which the part looks like itself, radians.
         any_polarity: whether dark and bright may be exchanged.
-        contrast: grey levels of 255 from the darker to the brighter side at least.
-        least_score: least score of what is found.
+        contrast: least difference of the grey levels, of 255, on both sides of an edge.
+        least_score: least score of a found place.
     """
 
     angles: tuple[float, float]
@@ -120,11 +121,11 @@ class Ranges:
 
     @property
     def is_round(self) -> bool:
-        """True if all angles are looked for."""
+        """True if all angles are searched."""
         return self.angles[1] - self.angles[0] >= self.period - 1e-9
 
     def turns(self, step: float) -> tuple[Array, bool]:
-        """Return angles that are a step apart at most, and whether they close a circle."""
+        """Return angles with distances of a step at most, and whether they close a circle."""
         start, span = self.angles[0], min(self.angles[1] - self.angles[0], self.period)
         if self.is_round:
             count = max(math.ceil(span / step), 1)
@@ -132,7 +133,7 @@ class Ranges:
         return np.linspace(start, start + span, max(math.ceil(span / step), 0) + 1), False
 
     def sizes(self, step: float) -> Array:
-        """Return scales that are a step apart at most."""
+        """Return scales with distances of a step at most."""
         low, high = self.scales
         count = math.ceil(math.log(high / low) / step) + 1 if high > low else 1
         return np.geomspace(low, high, count)
@@ -230,9 +231,9 @@ class PicturePyramid:
 def find_candidates(
     pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges, most: int
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
-    """Return the places where a part may be, the best first, and the best of those refused.
+    """Return the places where a part may be, the best first, and the best refused place.
 
-    Each is right to about a pixel.
+    The error of a place is about a pixel.
     """
     top = model.top
     found = list(_everywhere(pyramid, model, ranges))
@@ -345,7 +346,7 @@ def _followed(
     level: int,
     places: list[RoughPlace],
 ) -> list[RoughPlace]:
-    """Return the best poses about places of the level above, at a level."""
+    """Return the best pose at a level near each place that was found at the next smaller level."""
     nx, ny = pyramid.units(level, ranges.contrast)
     points, normals = _thinned(model.points[level], model.normals[level], MAX_POINTS)
     points = points / 2**level
@@ -378,7 +379,7 @@ def _followed(
 
 
 OFFSETS: Final = np.array([(x, y) for y in range(-2, 3) for x in range(-2, 3)])
-"""Pixels about a place of the level above at which it is looked for."""
+"""Offsets, pixels, of the search around a place that was found at the next smaller level."""
 
 
 def _scores(
@@ -389,7 +390,7 @@ def _scores(
     at: NDArray[Any],
     any_polarity: bool,
 ) -> Array:
-    """Return the mean agreement of the directions (M, 25) at poses (M,) about places (M, 2)."""
+    """Return the mean agreement of the directions (M, 25) at poses (M,) around places (M, 2)."""
     height, width = units[0].shape
     cos, sin = np.cos(poses[0])[:, None], np.sin(poses[0])[:, None]
     x, y = points.T
@@ -418,7 +419,7 @@ def _best(
     most: int,
     refused: RoughPlace | None,
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
-    """Return the best places, each once, and the best of those that are too bad."""
+    """Return the best places without duplicates, and the best place with too low a score."""
     kept: list[RoughPlace] = []
     for one in sorted(places, key=lambda one: -one.score):
         if one.score < least:

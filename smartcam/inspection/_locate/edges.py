@@ -1,4 +1,4 @@
-"""Find the edges of a picture as segments, for teaching: where, in which direction, how strong."""
+"""Find the edges of a taught picture as segments, with their place, direction and height."""
 
 from __future__ import annotations
 
@@ -32,43 +32,43 @@ HALF_LENGTH_PX: Final = 4.0
 """Largest half length of a segment, pixels."""
 
 BESIDE_PX: Final = 1.0
-"""Pixels beside a straight line through a segment's middle that its points are at most."""
+"""Largest distance of a segment's points from a straight line through its middle, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle, radians, between the directions of a segment's points and that of its middle."""
+"""Largest angle, radians, between the direction of a segment's point and that of its middle."""
 
 MIN_POINTS: Final = 4
 """Least number of points of a segment."""
 
 MAX_SEGMENTS: Final = 3000
-"""Largest number of segments that are made of a picture."""
+"""Largest number of segments of a picture."""
 
 FITS: Final = 8
-"""Steps in which segments are fitted to the picture's pixels."""
+"""Number of iterations of the fit of segments to the picture's pixels."""
 
 BLURRED_FITS: Final = 3
-"""Steps in which segments are fitted to their blurred picture."""
+"""Number of iterations of the fit of segments to a blurred picture."""
 
 MAX_SHIFT_PX: Final = 1.5
-"""Pixels that a fit may move a segment by; more of them, and it is another edge."""
+"""Largest distance, pixels, by which a fit may move a segment; farther off is another edge."""
 
 MAX_BLUR_PX: Final = 3.0
 """Largest blur of an edge whose place is measured, in pixels."""
 
 MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
-"""Rms of a band's pixels about its step in parts of the noise, and of the edge's height, up to
-which the edge is a step whose place can be measured to a fraction of a pixel."""
+"""Largest RMS residual of a band, as a multiple of the noise, and as a share of the edge's height,
+up to which the edge is a step whose place can be measured to a fraction of a pixel."""
 
 MAX_SIGMA_PX: Final = 0.3
 """Largest standard deviation of the place of a taught edge, pixels."""
 
 STEP_SLOPE: Final = 8 / (math.sqrt(2 * math.pi) * 1.5)
-"""Response of Sobel's operator to an edge of one grey level behind the blur of picture and
-Gaussian, 1.5 pixels together."""
+"""Response of Sobel's operator to an edge of one grey level with a blur of 1.5 pixels, that of the
+picture and the Gaussian together."""
 
 
 class EdgePoints(NamedTuple):
-    """Edge pixels with their place to a fraction of a pixel."""
+    """Edge pixels with their subpixel places."""
 
     points: Array  # (N, 2), pixels
     normals: Array  # (N, 2), of length 1, to the brighter side
@@ -84,7 +84,7 @@ class TaughtEdges(NamedTuple):
 
 
 def edge_points(grey: NDArray[np.uint8], contrast: float) -> EdgePoints:
-    """Return the edge pixels of a picture (H, W), of a contrast in grey levels."""
+    """Return the edge pixels of a picture (H, W) with at least a contrast in grey levels."""
     cv2 = load("cv2", "inspection needs")
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTH_PX)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
@@ -104,7 +104,7 @@ def edge_points(grey: NDArray[np.uint8], contrast: float) -> EdgePoints:
 
 
 def _sampled(image: NDArray[Any], at: Array) -> Array:
-    """Return values of an image (H, W) at points (N, 2), between pixels by interpolation."""
+    """Return values of an image (H, W) at points (N, 2), interpolated between pixels."""
     cv2 = load("cv2", "inspection needs")
     x, y = at.astype(np.float32).T
     # cv2.remap takes fewer than 32768 columns: the points are laid out in rows
@@ -117,7 +117,7 @@ def _sampled(image: NDArray[Any], at: Array) -> Array:
 
 
 def segments_of(found: EdgePoints) -> Segments:
-    """Return segments that edge pixels are divided into, the strongest first."""
+    """Divide edge pixels into segments, the strongest first."""
     points, normals = found.points, found.normals
     if not len(points):
         return _no_segments()
@@ -160,7 +160,7 @@ def _segment(points: Array, normals: Array) -> tuple[Array, Array, float, float]
     middle = points.mean(axis=0) + tangent * (along.max() + along.min()) / 2
     along = (points - middle) @ tangent
     columns = np.column_stack([np.ones(len(along)), along, 0.5 * along**2])
-    # the change of the normals along the segment says its bend better than the points do
+    # the change of the normals along the segment determines its bend better than the points do
     turning = np.column_stack([np.zeros(len(along)), -np.ones(len(along)), -along])
     rows = np.vstack([columns, 4.0 * turning])
     values = np.concatenate([(points - middle) @ normal, 4.0 * (normals @ tangent)])
@@ -174,7 +174,7 @@ def _segment(points: Array, normals: Array) -> tuple[Array, Array, float, float]
 def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: float) -> TaughtEdges:
     """Return segments, fitted to the pixels of their picture.
 
-    ``top`` is the largest grey level of the picture; heights are returned in parts of 255.
+    ``top`` is the largest grey level of the picture; heights are returned in levels of 255.
     """
     count = len(rough.halves)
     shifted, good = rough, np.ones(count, dtype=np.bool_)
@@ -193,9 +193,9 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
 
 
 def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Array:
-    """Return the shifts of segments across by blurs, (N, K), by blurring their picture.
+    """Return the shifts of segments, (N, K), across their edges, that each of K blurs causes.
 
-    Beside a corner, a bent edge or another edge, a blurred edge is no step at the same place.
+    The picture is blurred for this. Beside a corner, a bend or another edge, blur moves an edge.
     """
     cv2 = load("cv2", "inspection needs")
     bands = make_bands(segments, points)
@@ -218,10 +218,10 @@ def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Ar
 def _fitted(
     pixels: BandPixels, segments: Segments
 ) -> tuple[Segments, Array, NDArray[np.bool_], Array]:
-    """Return segments after one step of a fit of place, tilt, blur and levels.
+    """Return segments after one iteration of a fit of place, tilt, blur and levels.
 
-    Besides, the rms of the pixels about the steps, which of them could be fitted, and the standard
-    deviation of their places for noise of one grey level.
+    Also return the RMS residuals of the pixels, a mask of the segments that could be fitted, and
+    the standard deviations of the places for noise of one grey level.
     """
     count = len(segments.halves)
     across, along = segments.places(pixels.points, pixels.owners)

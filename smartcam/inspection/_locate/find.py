@@ -1,4 +1,4 @@
-"""Find taught parts in a picture: places where they may be, fitted one by one and judged."""
+"""Find taught parts in a picture: find candidate places, fit a pose at each, and judge it."""
 
 from __future__ import annotations
 
@@ -28,43 +28,43 @@ if TYPE_CHECKING:
     from smartcam.inspection._picture import Picture
 
 CONTRAST_SHARE: Final = 0.12
-"""Part of its taught contrast that a found edge has at least, where nothing else is set."""
+"""Least contrast of a found edge, as a share of its taught contrast, unless another one is set."""
 
 MIN_CONTRAST: Final = 8.0
 """Least contrast of a found edge, grey levels of 255, unless another one is set."""
 
 MAX_FITS: Final = 12
-"""Largest number of places that are fitted, besides four for each part that is looked for."""
+"""Largest number of places that are fitted, in addition to four for each wanted part."""
 
 SCORE_MARGIN: Final = 0.1
-"""Score by which a fit may raise the coarse one: what is below that of the parts that were found by
-more is not fitted."""
+"""Score by which a fit may raise the coarse score: once enough parts are found, a place is not
+fitted if its coarse score is lower than theirs by more."""
 
 SAME_SCORE: Final = 0.02
-"""Difference of two scores that says nothing."""
+"""Largest difference of two scores that count as equal."""
 
 RANGE_MARGIN: Final = math.radians(1.0)
-"""Angle, and part of the scale, by which a fitted pose may lie beside what was asked for."""
+"""Margin, in radians and as a share of the scale, by which a fitted pose may exceed the ranges."""
 
 
 SIZE_MARGIN: Final = 0.03
-"""Part of the size by which a part may be larger or smaller than the one size that was asked for:
-its pose says its own size, so that it is right."""
+"""Share of the size by which a part may be larger or smaller if only one size is wanted; its pose
+has its true size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PartSearch:
-    """The poses that are looked for, and what counts as found.
+    """The poses that are searched, and the conditions for a found part.
 
     Attributes:
-        angles: from and to, radians, from the taught picture.
-        scales: from and to.
-        most: parts that are found at most, of each model.
-        least_score: part of the edges that has to be seen.
-        overlap: part of a part's area that another one may cover.
+        angles: smallest and largest rotation since the taught picture, radians.
+        scales: smallest and largest scale.
+        most: largest number of found parts of each model.
+        least_score: least share of the edges that must be visible.
+        overlap: largest share of a part's area that another part may cover.
         any_polarity: whether dark and bright may be exchanged.
-        contrast: grey levels of 255 of an edge at least; None: a part of the taught one.
-        seconds: seconds after which no further place is looked at.
+        contrast: least contrast of an edge, grey levels of 255; None: a share of the taught one.
+        seconds: seconds after which no further place is fitted.
     """
 
     angles: tuple[float, float] = (-math.pi, math.pi)
@@ -79,24 +79,24 @@ class PartSearch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocatedPart:
-    """A part that was found, or that was refused.
+    """A part that was found, or a candidate that was refused.
 
     Attributes:
         name: name of the model.
-        pose: place of the model's reference in the picture, and how the part is turned and scaled
-            since it was taught.
+        pose: place of the model's reference in the picture, and rotation and scale relative to the
+            taught part.
         covariance: (4, 4), of x and y (pixels), the angle (radians) and the scale.
-        score: part of its edges that was seen, 0 to 1.
-        edges: places of the edges that the pose follows from, (N, 2), pixels.
-        missing: places where edges were not seen, (M, 2), pixels.
+        score: share of its edges that is visible, 0 to 1.
+        edges: places of the edges that determine the pose, (N, 2), pixels.
+        missing: places of edges that are not visible, (M, 2), pixels.
         noise: standard deviation of the picture's noise, grey levels.
         blur: standard deviation of the edges' blur, pixels.
-        chi_square: squared residuals of the edges in parts of what the noise explains.
-        refusal: why the part counts as not found; "" for one that was found.
-        doubt: why it may be turned otherwise; mostly "".
+        chi_square: ratio of the edges' squared residuals to those that the noise explains.
+        refusal: why the part counts as not found; "" for a found part.
+        doubt: why the rotation may be another one; mostly "".
         hull: convex hull of the part, (K, 2), pixels of the picture.
-        contours: polygons (K, 2) along its edges, pixels of the picture, for people; none of a part
-            that was refused.
+        contours: polygons (K, 2) along its edges, pixels of the picture, to be drawn; empty for a
+            refused part.
     """
 
     name: str
@@ -126,7 +126,7 @@ class Located:
 
     Attributes:
         parts: found parts, the best first.
-        nearest: best one of those that were refused; None: nothing was near.
+        nearest: best refused part; None: there was no candidate.
     """
 
     parts: tuple[LocatedPart, ...]
@@ -143,18 +143,18 @@ def locate(
 ) -> Located:
     """Return the parts in a picture.
 
-    ``box`` (left, top, right, below): where their references are; ``allowed``: whether a reference
-    may be at a place of it.
+    ``box`` (left, top, right, below): area of their references; ``allowed``: function that returns
+    whether a reference may be at a place in the area.
     """
     end = time.monotonic() + search.seconds
-    looks: dict[tuple[int, int, int, int], _SearchedPicture] = {}
+    searched: dict[tuple[int, int, int, int], _SearchedPicture] = {}
     parts: list[LocatedPart] = []
     refused: list[LocatedPart] = []
     for model in models:
         area = _area(picture, box, model.radius * search.scales[1])
-        if area not in looks:
-            looks[area] = _SearchedPicture(picture, area)
-        found, bad = looks[area].find(model, search, end, allowed)
+        if area not in searched:
+            searched[area] = _SearchedPicture(picture, area)
+        found, bad = searched[area].find(model, search, end, allowed)
         parts += found
         refused += bad
     kept = _apart(parts, search.overlap)
@@ -165,7 +165,7 @@ def locate(
 def _area(
     picture: Picture, box: tuple[int, int, int, int] | None, radius: float
 ) -> tuple[int, int, int, int]:
-    """Return the part of the picture that is looked at for references in a box."""
+    """Return the area of the picture that parts with references in a box may cover."""
     width, height = picture.size
     if box is None:
         return 0, 0, width, height
@@ -180,7 +180,7 @@ def _area(
 
 
 class _SearchedPicture:
-    """One look at a part of a picture, for any number of models."""
+    """An area of a picture with its pyramid, in which any number of models is searched."""
 
     def __init__(self, picture: Picture, area: tuple[int, int, int, int]) -> None:
         left, top, right, below = area
@@ -198,7 +198,7 @@ class _SearchedPicture:
         end: float,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> tuple[list[LocatedPart], list[LocatedPart]]:
-        """Return the parts of one model, and those that were refused."""
+        """Return the found parts of one model, and the refused ones."""
         ranges = ranges_of(model, search)
         candidates, refused = find_candidates(self._pyramid, model.coarse, ranges, search.most)
         bad = [] if refused is None else [_unfitted(model, self._moved(refused), search, "")]
@@ -240,7 +240,7 @@ class _SearchedPicture:
         search: PartSearch,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
-        """Return the part at a place, or why there is none."""
+        """Return the part at a place, with a refusal if it does not count as found."""
         start = PixelPose(one.x, one.y, one.angle, one.scale)
         fine = self._fit(model, start, search)
         if fine is None:
@@ -267,7 +267,7 @@ class _SearchedPicture:
     def _without_doubt(
         self, model: PartModel, part: LocatedPart, search: PartSearch
     ) -> LocatedPart:
-        """Return a part with the doubt whether it is turned otherwise."""
+        """Return a part, with a doubt if another rotation fits as well."""
         for angle, share in model.symmetry.alike:
             if part.score >= share + SAME_SCORE:
                 continue
@@ -295,7 +295,7 @@ def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
 
 
 def contrasts_of(model: PartModel, search: PartSearch) -> Array:
-    """Return the grey levels of 255 that each edge of a part has at least, (N,)."""
+    """Return the least contrast of each edge of a part, (N,), grey levels of 255."""
     heights = model.segments.heights
     if search.contrast is not None:
         return np.full(len(heights), search.contrast)
@@ -325,7 +325,7 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
 
 
 def _turned(pose: PixelPose, about: tuple[float, float], angle: float) -> PixelPose:
-    """Return a pose of a part that is turned about a place of it."""
+    """Return the pose of a part after a rotation about one of its points."""
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = about
     place = pose.to_picture((x - cos * x + sin * y, y - sin * x - cos * y))
@@ -354,7 +354,7 @@ def _unfitted(model: PartModel, one: RoughPlace, search: PartSearch, why: str) -
 
 
 def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool:
-    """Return True if a pose is turned by one of the angles that are looked for."""
+    """Return True if a pose's angle is in the wanted range."""
     low, high = search.angles
     if not model.symmetry.fold or high - low >= model.symmetry.period - 1e-9:
         return True
@@ -363,26 +363,26 @@ def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool
 
 
 def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
-    """Return True if a pose has one of the sizes that are looked for."""
+    """Return True if a pose's scale is in the wanted range."""
     least, most = search.scales
     margin = SIZE_MARGIN if least == most else RANGE_MARGIN
     return least * (1 - margin) <= pose.scale <= most * (1 + margin)
 
 
 def _is_enough(found: Sequence[LocatedPart], one: RoughPlace, search: PartSearch) -> bool:
-    """Return True if a place cannot be better than the parts that were found already."""
+    """Return True if a place cannot be better than the parts found so far."""
     best = sorted(part.score for part in found)[-search.most :]
     return len(best) == search.most and one.score < best[0] - SCORE_MARGIN
 
 
 def _is_near(one: RoughPlace, other: LocatedPart) -> bool:
-    """Return True if a candidate is a part that was found already."""
+    """Return True if a candidate is the place of a part that was already found."""
     turned = abs(math.remainder(one.angle - other.pose.angle, 2 * math.pi))
     return math.hypot(one.x - other.pose.x, one.y - other.pose.y) < 4 and turned < 0.1
 
 
 def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
-    """Return the best parts that do not cover more of each other than is allowed."""
+    """Return the best parts whose overlaps are at most as large as allowed."""
     kept: list[LocatedPart] = []
     for one in sorted(parts, key=lambda one: (-one.score, one.chi_square)):
         if all(_covered(one.hull, other.hull) <= overlap for other in kept):
@@ -391,7 +391,7 @@ def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
 
 
 def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:
-    """Return the common area of two convex hulls in parts of the smaller one."""
+    """Return the common area of two convex hulls, as a share of the smaller one."""
     cv2 = load("cv2", "inspection needs")
     hulls = [np.asarray(hull - one[0], np.float32) for hull in (one, other)]
     common, _ = cv2.intersectConvexConvex(*hulls)

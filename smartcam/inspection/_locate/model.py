@@ -61,11 +61,10 @@ MAX_FILE_BYTES: Final = 1 << 21
 """Largest number of bytes of a model's file."""
 
 MAX_SEGMENTS: Final = 400
-"""Largest number of segments of a model, evenly chosen; more of them cost time and tell little
-more."""
+"""Largest number of segments of a model, evenly chosen; more cost time and hardly improve poses."""
 
 MAX_REGION_PX: Final = 25_000_000
-"""Pixels of a region that is taught, at most."""
+"""Largest number of pixels of a taught region."""
 
 MIN_SEGMENTS: Final = 12
 """Least number of a part's segments whose place can be measured to a fraction of a pixel."""
@@ -74,38 +73,39 @@ MIN_TOP_POINTS: Final = 16
 """Least number of points of a part at the smallest level of the pyramid."""
 
 BORDER_PX: Final = 3.0
-"""Pixels from the region's border within which an edge is left out."""
+"""Distance from the region's border, pixels, within which an edge is left out."""
 
 MAX_BORDER_SHARE: Final = 0.1
-"""Part of the edges that may lie at the region's border."""
+"""Largest share of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
-"""Least part of the edges, by their directions, that must determine a place along the others."""
+"""Least share of the edges across the main direction: they determine the place along it."""
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
-"""Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
+"""Cosine of the largest angle between a level's gradient and a visible segment's normal."""
 
 ROUND_TURNS: Final = 8
-"""Turns at which a round part is located in its own picture."""
+"""Number of rotations at which a round part is located in its own picture."""
 
 MIN_SELF_CONTRAST: Final = 1.0
-"""Grey levels of an edge of a part that is located in its own picture, at least."""
+"""Least contrast, grey levels, of an edge of a part that is located in its own picture."""
 
 LEVEL_RESPONSE: Final = 0.8
 """Least response of Sobel's operator, at a level, to a part's edge of one grey level."""
 
-NOISES: Final = 6.0
-"""Standard deviations of the noise that a taught edge's contrast has at least."""
+MIN_CONTRAST_NOISES: Final = 6.0
+"""Least contrast of a taught edge, in standard deviations of the noise."""
 
 MAX_BAND_STEP: Final = 4
-"""Largest number of steps of the square root of two by which the bands of a smaller part are
-wider."""
+"""Largest number of steps, each a factor of the square root of two, by which the bands of a smaller
+part are widened."""
 
 MAX_CONTOURS, MAX_CONTOUR_CORNERS, MIN_CONTOUR_PX = 12, 150, 8
-"""Contours of a part that are shown at most, their corners at most, and their pixels at least."""
+"""Largest number of drawn contours of a part, largest number of a contour's corners, and least
+length of a contour in pixels."""
 
 MAX_LEVEL: Final = 255.0
-"""Contrast or noise that may be given at most, grey levels of 255."""
+"""Largest contrast or noise that a caller may give, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
 """Least contrast of a taught edge, grey levels of 255, unless another one is set."""
@@ -113,7 +113,7 @@ DEFAULT_CONTRAST: Final = 12.0
 
 @dataclass(frozen=True, kw_only=True)
 class PartModel:
-    """A taught part: its edges, with their places to a fraction of a pixel.
+    """A taught part: its edges with their subpixel places.
 
     ::
 
@@ -123,13 +123,13 @@ class PartModel:
 
     Attributes:
         name: name of the part, the ``feature_id`` of its localizations.
-        segments: pieces of its edges that poses follow from; places from the reference.
-        outline: places of all of its edges, (M, 2), pixels from the reference.
-        levels: indices of the segments that can be seen at each level of the pyramid.
-        symmetry: turns at which it looks like itself.
-        reference: place of the reference in the picture that was taught, pixels.
-        border: part of the edges that was left out at the region's border.
-        noise: standard deviation of the noise of the picture that was taught, levels of 255.
+        segments: pieces of its edges that determine poses; places relative to the reference.
+        outline: places of all its edges, (M, 2), pixels relative to the reference.
+        levels: indices of the segments that are visible at each level of the pyramid.
+        symmetry: rotations after which it looks like itself.
+        reference: place of the reference in the taught picture, pixels.
+        border: share of the edges that was left out at the region's border.
+        noise: standard deviation of the noise of the taught picture, grey levels of 255.
     """
 
     name: str
@@ -153,14 +153,15 @@ class PartModel:
         """Return the model of a part in a picture.
 
         Args:
-            picture: the picture, with the part as it shall be found: sharp, without shadows.
+            picture: the picture, with a sharp view of the part, without shadows.
             region: region with the part and nothing else, or a mask (H, W) of its pixels; None:
                 the whole picture.
             name: name of the part.
-            contrast: grey levels of 255 of an edge at least; None: what stands out from the noise.
+            contrast: least contrast of an edge, grey levels of 255; None: a contrast well above
+                the noise.
 
         Raises:
-            TeachingError: the part cannot be taught; its ``why`` says the reason.
+            TeachingError: the part cannot be taught; its ``why`` is the reason.
             FrameFormatError: the image is no picture.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
@@ -180,23 +181,23 @@ class PartModel:
         unit: Unit | None = None,
         layers: Sequence[str] = (),
     ) -> PartModel:
-        """Return the model of a part whose outline is in a file of DXF or SVG.
+        """Return the model of a part whose outline is in a DXF or SVG file.
 
-        Edges are those of a flat part of one grey level. The ``reference`` of the model is in the
-        file's coordinates then: pixels from the drawing's origin, y down.
+        The part counts as flat and of one grey level. The ``reference`` of the model is in the
+        file's coordinates: pixels from the drawing's origin, y down.
 
         Args:
-            path: file with the ending ``.dxf`` or ``.svg``; its lines make closed outlines. An
-                outline in another one is a hole.
-            pixels_per_mm: pixels of the picture for a millimetre of the part.
+            path: file with the suffix ``.dxf`` or ``.svg``, whose lines form closed outlines. An
+                outline inside another one is a hole.
+            pixels_per_mm: pixels of the picture per millimetre of the part.
             name: name of the part.
-            bright: whether the part is brighter than what is behind it.
-            unit: unit of the file's coordinates; None: the one that the file says.
-            layers: names of the layers, in SVG ids or labels of the groups, with the outline;
-                none: all.
+            bright: whether the part is brighter than its background.
+            unit: unit of the file's coordinates; None: the unit that the file names.
+            layers: names of the layers with the outline, in SVG ids or labels of groups; empty: all
+                layers.
 
         Raises:
-            TeachingError: the part cannot be taught; its ``why`` says the reason.
+            TeachingError: the part cannot be taught; its ``why`` is the reason.
             ConfigurationError: an argument is wrong.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
@@ -241,7 +242,7 @@ class PartModel:
             ) from exc
 
     def write(self, path: str | Path) -> None:
-        """Write the model into a file; one that is there is replaced.
+        """Write the model into a file; an existing file is replaced.
 
         Raises:
             ConfigurationError: the file cannot be written.
@@ -258,15 +259,15 @@ class PartModel:
         return float(np.linalg.norm(self.outline, axis=1).max())
 
     def predicted_sigma(self, noise: float | None = None) -> tuple[float, float]:
-        """Return the error that a pose has in a picture like the taught one.
+        """Return the expected error of a pose in a picture like the taught one.
 
         Args:
-            noise: standard deviation of the picture's noise, grey levels of 255; None: as in the
-                picture that was taught.
+            noise: standard deviation of the picture's noise, grey levels of 255; None: that of the
+                taught picture.
 
         Returns:
-            Standard deviations of the place along its worst direction, pixels, and of the angle,
-            radians.
+            Standard deviations of the place along its least certain direction, pixels, and of the
+            angle, radians.
         """
         if noise is not None:
             noise = check_number(noise, "noise", 0, MAX_LEVEL, "PartModel.predicted_sigma")
@@ -282,12 +283,12 @@ class PartModel:
 
     @cached_property
     def coarse(self) -> CoarseModel:
-        """The points that are looked for first."""
+        """The points for the coarse search."""
         some = [self.segments.some(one) for one in self.levels]
         return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
 
     def bands_at(self, scale: float) -> Bands:
-        """Return the pixels beside the segments: about as far in the picture of a smaller part."""
+        """Return the bands of the segments, wider for a smaller part, so that pixels suffice."""
         step = min(max(round(-2 * math.log2(scale)), 0), MAX_BAND_STEP)
         if step not in self._bands:
             self._bands[step] = make_bands(self.segments, self.outline, BAND_PX * 2 ** (step / 2))
@@ -306,7 +307,7 @@ class PartModel:
 
     @cached_property
     def contours(self) -> tuple[Array, ...]:
-        """Polygons (K, 2) along the edges, the longest first, for people; a pixel off at most."""
+        """Polygons (K, 2) along the edges, the longest first, to be drawn; a pixel off at most."""
         cv2 = load("cv2", "inspection needs")
         low = np.floor(self.outline.min(axis=0)).astype(int) - 3
         at = np.rint(self.outline - low).astype(int)
@@ -346,7 +347,7 @@ def _taught(
     grey, levels = picture.grey[rows, columns], picture.levels[rows, columns]
     top = float(2**picture.depth - 1)
     noise = noise_of(levels) * 255 / top
-    least = max(DEFAULT_CONTRAST, NOISES * noise) if contrast is None else contrast
+    least = max(DEFAULT_CONTRAST, MIN_CONTRAST_NOISES * noise) if contrast is None else contrast
     found = edge_points(grey, least)
     kept, border = _inside(found.points, mask)
     found = type(found)(*(one[kept] for one in found))
@@ -390,10 +391,10 @@ def _taught(
 def _off_middle(
     segments: Segments, outline: Array, fold: int, taught: tuple[NDArray[Any], Array, float]
 ) -> Array:
-    """Return the place that a part turns about exactly, (2,), from the reference.
+    """Return the centre of a part's symmetry, (2,), relative to the reference.
 
     ``taught``: the picture, the reference in it, and its noise. The part is located in its own
-    picture at each of the turns; where it lies then tells its middle.
+    picture at each of the rotations; the mean of the found places is the centre.
     """
     levels, (x, y), noise = taught
     turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
@@ -411,7 +412,7 @@ def _off_middle(
 def _mask(
     region: Region | NDArray[np.bool_] | None, picture: Picture
 ) -> tuple[NDArray[np.bool_], tuple[int, int]]:
-    """Return the pixels that are taught, as a mask (H, W), and its corner in the picture."""
+    """Return the mask (H, W) of the taught pixels, and the mask's corner in the picture."""
     if isinstance(region, np.ndarray):
         if region.dtype != np.bool_ or region.shape != picture.size[::-1]:
             raise wrong_argument(
@@ -433,13 +434,13 @@ def _mask(
     if mask.size > MAX_REGION_PX:
         raise TeachingError(
             TeachingTrouble.TOO_LARGE,
-            f"the region has {mask.size} pixels, {MAX_REGION_PX} can be taught",
+            f"the region has {mask.size} pixels, expected {MAX_REGION_PX} at most",
         )
     return mask, corner
 
 
 def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
-    """Return a mask of the edges that are taught, and the part of them that lies at the border."""
+    """Return a mask of the taught edges, and the share of edges at the region's border."""
     cv2 = load("cv2", "inspection needs")
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -452,7 +453,7 @@ def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
 
 
 def _ordered(segments: Segments) -> Segments:
-    """Return segments around the reference, some of them if there are too many."""
+    """Return segments in their order around the reference, evenly thinned if they are too many."""
     order = np.argsort(np.arctan2(segments.middles[:, 1], segments.middles[:, 0]), kind="stable")
     if len(order) > MAX_SEGMENTS:
         order = order[np.linspace(0, len(order) - 1, MAX_SEGMENTS).round().astype(int)]
@@ -460,13 +461,13 @@ def _ordered(segments: Segments) -> Segments:
 
 
 def _check_directions(segments: Segments) -> None:
-    """Raise if the edges' directions leave a place open."""
+    """Raise if the edges' directions do not determine a place."""
     weights = segments.halves / segments.halves.sum()
     square = (segments.normals * weights[:, None]).T @ segments.normals
     if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:
         raise TeachingError(
             TeachingTrouble.OPEN,
-            "all edges run in one direction, so nothing tells the place along them: expected a "
+            "all edges run in one direction, and do not determine the place along it: expected a "
             "region with edges of other directions, too",
         )
 
@@ -474,7 +475,7 @@ def _check_directions(segments: Segments) -> None:
 def _levels(
     segments: Segments, grey: NDArray[np.uint8], centre: Array
 ) -> tuple[NDArray[np.intp], ...]:
-    """Return the segments that can be seen at each level of the pyramid, from 0."""
+    """Return the segments that are visible at each level of the pyramid, from level 0."""
     cv2 = load("cv2", "inspection needs")
     found = [np.arange(len(segments.halves))]
     radius = float(np.linalg.norm(segments.middles, axis=1).max())
@@ -490,7 +491,7 @@ def _levels(
 def _seen_at(
     segments: Segments, grey: NDArray[np.uint8], centre: Array, level: int
 ) -> NDArray[np.intp]:
-    """Return the segments whose direction a level shows, one for each of its pixels."""
+    """Return the segments whose direction is visible at a level, at most one for each pixel."""
     cv2 = load("cv2", "inspection needs")
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
     exact = (segments.middles + centre) / 2**level

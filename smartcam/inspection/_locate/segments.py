@@ -1,11 +1,11 @@
 """Segments: short straight or bent pieces of a part's edges, and their fit to a picture's pixels.
 
 A segment has a middle, a normal that points to its brighter side, a bend, and a length. Its *band*
-is made of the pixels beside it: each pixel of a picture is in the band of one segment at most. So
-the noise of segments is independent, and the error of a pose follows from theirs.
+consists of the pixels beside it: each pixel of a picture is in the band of one segment at most. So
+the errors of segments are independent, and the error of a pose follows from them.
 
-A fit puts a blurred step into each band: two levels, and the place across the edge. Pixels are
-taken as they are, without interpolation.
+A blurred step is fitted to the pixels of each band: two levels, and the place across the edge.
+Pixels are used without interpolation.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 BAND_PX: Final = 4.0
-"""Pixels of a band to each side of its segment, in the picture that was taught, of a part that is
-about as large as there or larger."""
+"""Width of a band to each side of its segment, pixels of the taught picture, unless the part is
+smaller in the searched picture."""
 
 MIN_BLUR_PX: Final = 0.35
-"""Least standard deviation of an edge's blur, in pixels, with the pixels' own area in it."""
+"""Least standard deviation of an edge's blur, pixels, which includes the area of a pixel."""
 
 BLURS_PX2: Final = (0.5, 1.0, 2.0, 4.0, 6.0, 9.0)
-"""Variances of a blur beyond the taught one of which it is known how far they move edges, in pixels
-of the picture that was taught."""
+"""Variances of additional blur, pixels^2 of the taught picture, for which a model has the shifts of
+its edges."""
 
 MIN_BAND_PIXELS: Final = 12
-"""Pixels that a band has at least; a fit of fewer says too little about its noise."""
+"""Least number of pixels of a band; a fit to fewer does not determine their noise."""
 
 
 class Segments(NamedTuple):
-    """N segments; lengths in pixels of the picture that was taught, places from its reference."""
+    """N segments; lengths in pixels of the taught picture, places relative to the reference."""
 
     middles: Array  # (N, 2)
     normals: Array  # (N, 2), of length 1, to the brighter side
@@ -48,7 +48,7 @@ class Segments(NamedTuple):
     heights: Array  # (N,), grey levels of 255 from the darker to the brighter side
     blurs: Array  # (N,), standard deviation of the step's blur
     sigmas: Array  # (N,), standard deviation of the place across the edge
-    moves: Array  # (N, K), how far each of BLURS_PX2 moves the edge across, as a step is fitted
+    moves: Array  # (N, K), shift of the fitted step across the edge by each of BLURS_PX2
 
     def some(self, which: NDArray[Any]) -> Segments:
         """Return some of the segments."""
@@ -56,7 +56,7 @@ class Segments(NamedTuple):
 
     @property
     def tangents(self) -> Array:
-        """(N, 2), of length 1: the normals, turned by a quarter from x to y."""
+        """Unit tangents (N, 2): the normals, rotated by 90 degrees from x to y."""
         return self.normals[:, ::-1] * [-1.0, 1.0]
 
     def curve(self, step: float = 0.5) -> tuple[Array, NDArray[np.intp]]:
@@ -71,8 +71,8 @@ class Segments(NamedTuple):
         return points + bend[:, None] * self.normals[owners], owners
 
     def moved_by(self, variance: float) -> Array:
-        """Return the shift of each edge across by a blur beyond the taught one, (N,)."""
-        if variance < 0:  # what is sharper moves edges the other way
+        """Return the shift (N,) across each edge that additional blur of a variance causes."""
+        if variance < 0:  # in a sharper picture edges move the other way
             first: Array = self.moves[:, 0] * max(variance / BLURS_PX2[0], -1.0)
             return first
         at = min(variance, BLURS_PX2[-1])
@@ -84,7 +84,7 @@ class Segments(NamedTuple):
         return found
 
     def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Return the places of points (P, 2) of these segments: across and along the edge."""
+        """Return the coordinates of points (P, 2) in their segments: across and along the edge."""
         off = points - self.middles[owners]
         nx, ny = self.normals[owners].T
         along = nx * off[:, 1] - ny * off[:, 0]
@@ -94,14 +94,14 @@ class Segments(NamedTuple):
 class Bands(NamedTuple):
     """The bands of segments as a map of labels."""
 
-    labels: NDArray[np.int16]  # (H, W), index of the segment; -1: of none
-    corner: tuple[int, int]  # place of the first label, pixels from the reference
+    labels: NDArray[np.int16]  # (H, W), index of the segment; -1: in no band
+    corner: tuple[int, int]  # place of the first label, pixels relative to the reference
 
 
 def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Bands:
-    """Return the bands of segments; ``others`` (M, 2) are edges beside them, which end bands.
+    """Return the bands of segments; ``others`` (M, 2) are edges beside them, at which bands end.
 
-    ``reach``: pixels of a band to each side of its segment.
+    ``reach``: width of a band to each side of its segment, pixels.
     """
     cv2 = load("cv2", "inspection needs")
     points, owners = segments.curve()
@@ -136,13 +136,13 @@ class BandPixels(NamedTuple):
 
     points: Array  # (P, 2), pixels of the picture
     levels: Array  # (P,), grey levels
-    owners: NDArray[np.intp]  # (P,), the segments
+    owners: NDArray[np.intp]  # (P,), index of the segment
 
 
 def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
     """Return the pixels of a picture (H, W) that lie in bands.
 
-    ``matrix`` (2, 3) leads from the segments' places to pixels of the picture.
+    ``matrix`` (2, 3) maps the segments' places to pixels of the picture.
     """
     cv2 = load("cv2", "inspection needs")
     height, width = bands.labels.shape
@@ -170,21 +170,21 @@ def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
 
 
 class StepFit(NamedTuple):
-    """The blurred step in each of N bands; where there is none, sigma is infinite."""
+    """The blurred step in each of N bands; the sigma of a band without a step is infinite."""
 
-    shifts: Array  # (N,), where the edge lies across the segment, towards the brighter side
+    shifts: Array  # (N,), distance from the segment to the edge, towards the brighter side
     sigmas: Array  # (N,), of the shifts, for noise of one grey level
     heights: Array  # (N,), grey levels; negative: the bright side is the other one
-    height_sigmas: Array  # (N,), for noise of one grey level
+    height_sigmas: Array  # (N,), of the heights, for noise of one grey level
     variances: Array  # (N,), of the pixels about the step
-    freedoms: Array  # (N,), pixels less fitted values
-    widening: float  # relative growth that the common blur needs
+    freedoms: Array  # (N,), degrees of freedom: pixels less fitted values
+    widening: float  # relative correction of the common blur
 
 
 def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> StepFit:
-    """Return the steps of ``count`` bands, linear about the places and blurs as they are.
+    """Return the steps of ``count`` bands by a fit that is linear about the given places and blurs.
 
-    ``across`` (P,) and ``blurs`` (P,): place of each pixel across its edge, and the step's blur,
+    ``across`` (P,) and ``blurs`` (P,): distance of each pixel from its edge, and the step's blur,
     both in pixels of the picture.
     """
     part = across / blurs
@@ -195,7 +195,7 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     safe = np.maximum(number, 1.0)
 
     def centred(values: Array) -> Array:
-        """Return values about the mean of their band: what its unknown level leaves."""
+        """Subtract the mean of each band, which eliminates the band's unknown level."""
         about: Array = values - (np.bincount(owners, values, count) / safe)[owners]
         return about
 
@@ -215,7 +215,7 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     variances = np.maximum(left / freedoms, ROUNDING**2)
     tall = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
     infinite = np.where(good, 0.0, np.inf)
-    # what heights and shifts leave of the change by a wider blur, and of the pixels
+    # the effect of a wider blur, and the pixels, after elimination of heights and shifts
     wr, ws = sums(widen, rise), sums(widen, slope)
     square = sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / det
     grown = sums(widen, levels) - heights * wr - moved * ws

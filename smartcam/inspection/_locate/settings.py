@@ -14,10 +14,10 @@ MAX_PARTS: Final = 200
 """Largest number of parts in one result."""
 
 MAX_MODELS: Final = 50
-"""Largest number of models that are looked for at once."""
+"""Largest number of models that one tool searches."""
 
 MAX_SECONDS: Final = 30.0
-"""Seconds that a search may take, if the settings allow for so many."""
+"""Largest time limit of a search, seconds."""
 
 
 def _rising(given: tuple[float, float]) -> tuple[float, float]:
@@ -33,7 +33,7 @@ File = Annotated[str, Field(min_length=1)]
 
 
 class LocateSettings(ToolSettings):
-    """The models that are looked for, and the poses that they may have."""
+    """The models that are searched, and the poses that they may have."""
 
     model: File | Annotated[list[File], Field(min_length=1, max_length=MAX_MODELS)] | None = Field(
         None,
@@ -56,33 +56,33 @@ class LocateSettings(ToolSettings):
         None,
         gt=0,
         le=10_000,
-        description="with an outline: pixels of the picture for a millimetre of the part",
+        description="with an outline: pixels of the picture per millimetre of the part",
     )
     unit: Literal["mm", "cm", "m", "inch", "px"] | None = Field(
-        None, description="with an outline: unit of its file; default: the one that the file says"
+        None, description="with an outline: unit of its file; default: the unit that the file names"
     )
     bright: bool = Field(
-        True, description="with an outline: whether the part is brighter than what is behind it"
+        True, description="with an outline: whether the part is brighter than its background"
     )
     angle: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = Field(
         (-180.0, 180.0),
-        description="degrees that the part may be turned by since it was taught, from and to",
+        description="smallest and largest rotation since the part was taught, degrees",
     )
     scale: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = Field(
-        (1.0, 1.0), description="size of the part in parts of the taught one, from and to"
+        (1.0, 1.0), description="smallest and largest size, as a ratio to the taught size"
     )
     most: int = Field(
-        1, ge=1, le=MAX_PARTS, description="parts in the result at most, of each model"
+        1, ge=1, le=MAX_PARTS, description="largest number of parts of each model in the result"
     )
     count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number | None = Field(
         None,
-        description="how many there have to be: a number, or from and to; default: one or more",
+        description="expected number of parts, or its limits; default: one or more",
     )
     least_score: float = Field(
-        0.7, ge=0.3, le=1.0, description="part of its edges that has to be seen"
+        0.7, ge=0.3, le=1.0, description="least share of a part's edges that must be visible"
     )
     overlap: float = Field(
-        0.5, ge=0.0, le=1.0, description="part of its area that another one may cover"
+        0.5, ge=0.0, le=1.0, description="largest share of a part's area that others may cover"
     )
     polarity: Literal["same", "any"] = Field(
         "same", description="any: dark and bright may be exchanged"
@@ -91,17 +91,18 @@ class LocateSettings(ToolSettings):
         None,
         ge=1,
         le=255,
-        description="grey levels of 255 of an edge at least; default: an eighth of its taught ones",
+        description="least contrast of an edge, grey levels of 255; default: an eighth of the "
+        "taught contrast",
     )
     sigma: float | None = Field(
         None,
         gt=0,
         allow_inf_nan=False,
         description="largest standard deviation of a place, pixels, or millimetres with a "
-        "calibration; a part that is known less well is not ok",
+        "calibration; a part whose place is less certain is not ok",
     )
     seconds: float = Field(
-        1.0, ge=0.01, le=MAX_SECONDS, description="seconds after which it looks no further"
+        1.0, ge=0.01, le=MAX_SECONDS, description="seconds after which the search ends"
     )
 
     @model_validator(mode="after")

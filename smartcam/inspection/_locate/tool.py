@@ -1,4 +1,4 @@
-"""The tool `locate`: taught parts, with their poses and the errors of these."""
+"""The tool `locate`: taught parts, with their poses and the errors of the poses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_DRAWN: Final = 80
 """Largest number of edges of a part that are drawn."""
 
 POSE_STEPS: Final = np.array([0.5, 0.5, 1e-3])
-"""Pixels, and radians, by which a pose is moved to see what its place in the plane does."""
+"""Steps, pixels and radians, of the numerical derivative of a pose in the plane."""
 
 
 class PlanePose(NamedTuple):
@@ -38,7 +38,7 @@ class PlanePose(NamedTuple):
     covariance: Array  # (3, 3)
 
     def fields(self, si: float) -> dict[str, float]:
-        """Return the fields of a result, in SI units by the metres of a length's unit."""
+        """Return the fields of a result in SI units; ``si``: metres per unit of length."""
         units = np.array([si, si, 1.0])
         x, y, theta = (self.values * units).tolist()
         sigmas = np.sqrt(np.diag(self.covariance))
@@ -66,7 +66,7 @@ class Locate(Tool[LocateSettings]):
 
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "locate needs")  # now, so that the first picture need not wait
+        load("scipy.special", "locate needs")  # saves the first picture the import
         self.models = [PartModel.read(setup.folder / one) for one in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
@@ -83,7 +83,7 @@ class Locate(Tool[LocateSettings]):
                     unit=settings.unit,
                 )
             )
-        for model in self.models:  # worked out now, for the same reason
+        for model in self.models:  # computed here, so that the first picture takes no longer
             _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
@@ -178,7 +178,7 @@ class Locate(Tool[LocateSettings]):
         )
 
     def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
-        """Return why what was found is not ok; "" if it is."""
+        """Return the reason why the found parts are not ok; "" if they are ok."""
         least, most = self._wanted
         count, nearest = len(found.parts), found.nearest
         if not least <= count <= most:
@@ -253,7 +253,7 @@ def _values(found: Located) -> dict[str, Any]:
 
 def _near(nearest: LocatedPart | None, named: bool) -> str:
     if nearest is None:
-        return "; nothing is like it"
+        return "; nothing in the picture resembles it"
     name = f"{nearest.name} " if named else ""
     return f"; {name}at {nearest.pose.x:.0f}, {nearest.pose.y:.0f}: {nearest.refusal}"
 

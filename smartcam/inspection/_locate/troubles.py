@@ -1,4 +1,4 @@
-"""Say why a part cannot be taught."""
+"""Reasons why a part cannot be taught."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class TeachingTrouble(enum.Enum):
     BORDER = "border"
     """Too many of the edges lie at the border of the region: it cuts the part."""
     OPEN = "open"
-    """All edges run in one direction, so nothing tells the place along them."""
+    """All edges run in one direction, and do not determine the place along it."""
     TOO_LARGE = "too large"
-    """The region or the outline has more pixels, corners or bytes than are taught."""
+    """The region or the outline has more pixels, corners or bytes than the limit."""
     UNREADABLE = "unreadable"
     """The file with the outline cannot be read."""
     UNIT = "unit"
-    """The file with the outline does not say its unit."""
+    """The file with the outline does not name its unit."""
     UNSUPPORTED = "unsupported"
-    """The file with the outline has something that is no line or curve in a plane."""
+    """The file with the outline has an object that is no line or curve in a plane."""
     NO_OUTLINE = "no outline"
-    """The file's lines make no closed outline."""
+    """The file's lines form no closed outline."""
 
 
 class TeachingError(ConfigurationError):

@@ -126,11 +126,11 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
     axes = np.eye(3)[:, :2] if robot else plane.rotation[:, :2]
     middle = np.asarray(plane.robot_points, dtype=np.float64).mean(axis=0)
     origin = np.zeros(3) if robot else middle
-    turned_up = calibration.kind == "plane" and calibration.y_down
+    flips_v = calibration.kind == "plane" and calibration.y_down
 
     def mapped(one: Any) -> Callable[[Array], Array]:
         def points(pixels: Array) -> Array:
-            seen = pixels * [1.0, -1.0] if turned_up else pixels
+            seen = pixels * [1.0, -1.0] if flips_v else pixels
             flat: Array = MM * (one.transform(seen) - origin) @ axes
             return flat
 
@@ -149,7 +149,7 @@ def _remark(calibration: Any, plane: Any) -> str:
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")
-    return f"sigma is without {' and '.join(unknown)}, which nothing tells" if unknown else ""
+    return f"sigma does not include {' and '.join(unknown)}: unknown" if unknown else ""
 
 
 def _plane_variants(plane: Any) -> list[Any]:

@@ -87,9 +87,9 @@ class EmulatedSr(LineCamera):
         }
         return answers.get(line, f"ER,{word},{'02' if word == 'LON' else '00'}")
 
-    def _ends(self) -> None:
+    def _before_stop(self) -> None:
         """Forget the current reading, like a reader that loses power."""
-        super()._ends()
+        super()._before_stop()
         self._reading, self._code, self._run = None, None, self._run + 1
 
     def _begin(self, call: LineClient) -> None:

@@ -52,14 +52,14 @@ class VisionStates:
         return found
 
     def _find(self, target: str, cause: str) -> Transition | None:
-        """Return the transition from the present state; of two the one within its machine."""
+        """Return the transition from the present state, one that stays within its machine."""
         here = {VISION: self.vision, AUTOMATIC: self.automatic}
         own = {(one.machine, one.source) for one in transitions()}
         for one in transitions():
             if here[one.machine] != one.source or one.cause != cause:
                 continue
             if (one.machine, one.target) not in own:
-                continue  # Preoperational to Initialized crosses machines: it has another way
+                continue  # Preoperational to Initialized leads into the other machine
             if target in ("", one.target):
                 return one
         return None

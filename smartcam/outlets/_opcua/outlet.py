@@ -23,7 +23,7 @@ MAX_STATES = 1_000
 
 
 class OpcUaOutlet(Outlet[OpcUaSettings]):
-    """Serves cameras as vision systems; each result is delivered when the server has it.
+    """Serves cameras as vision systems; a result counts as delivered once the server has it.
 
     The server has a thread, so that neither its nodeset nor its clients block the cameras.
     """
@@ -54,7 +54,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         desk = OutletDesk(self.desk.columns, self._command, self.desk.cameras, self.desk.names)
         await asyncio.to_thread(self._thread.start)
         self._server = server = VisionServer(self.name, self.settings, self.folder, desk)
-        await self._there(server.start())
+        await self._in_server_thread(server.start())
         self._open = True
         for camera, state in self._states.items():
             self._tell(server, camera, state)
@@ -63,7 +63,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         """Publish entries in the server's thread."""
         if self._server is None:
             raise OutletError("the server does not listen")
-        await self._there(self._server.publish(entries))
+        await self._in_server_thread(self._server.publish(entries))
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Schedule the camera's state to be published."""
@@ -75,21 +75,21 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
     async def watch(self) -> None:
         """Wait until the server fails."""
         if self._server is not None:
-            await self._there(self._server.failed())
+            await self._in_server_thread(self._server.failed())
 
     async def close(self) -> None:
         """Stop listening."""
         server, self._server, self._open = self._server, None, False
         try:
             if server is not None:
-                await self._there(server.stop())
+                await self._in_server_thread(server.stop())
         finally:
             await asyncio.to_thread(self._thread.stop)
 
     def _tell(self, server: VisionServer, camera: str, state: Mapping[str, Any]) -> None:
         self._thread.post(lambda: server.state_changed(camera, state))
 
-    async def _there(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _in_server_thread(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine in the server's thread."""
         await asyncio.wrap_future(self._thread.submit(work))
 

@@ -76,7 +76,7 @@ class Users:
 
     Args:
         settings: settings of the server.
-        folder: folder of relative paths.
+        folder: folder to which relative paths refer.
 
     Raises:
         ConfigurationError: a password is not at the place that the settings name.

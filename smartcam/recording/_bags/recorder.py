@@ -52,14 +52,14 @@ class BagRecorder(Recorder):
 
     Args:
         path: the bag's folder.
-        overwrite: take the place of a bag that is there.
+        overwrite: replace an existing bag.
 
     Attributes:
         path: path that was given.
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """Keep a container in case that it cannot be interpreted."""
+        """Keep a result container, which is recorded if it cannot be interpreted."""
         if entry.message == "ResultContainer":
             self._put(entry, len(entry.hex))
 

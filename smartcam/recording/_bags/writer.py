@@ -101,7 +101,7 @@ def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
     except FileExistsError as exc:
         if not overwrite:
             raise ConfigurationError(
-                f"{what}: it is there already; overwrite (--force) takes the place of a bag"
+                f"{what}: it exists already; overwrite (--force) replaces a bag"
             ) from exc
         if not folder.is_dir():
             raise ConfigurationError(f"{what}: this is no folder") from exc

@@ -316,5 +316,7 @@ class _SeenReading:
             application=result.application, data=result.raw, cells=cells, fault=fault
         )
         at = result.received_at
-        done = interpret(container, endian, camera=self._camera, number=result.number, at=at)
-        return result._replace(value=done.value, sequence=done.sequence)
+        value, sequence, _ = interpret(
+            container, endian, camera=self._camera, number=result.number, at=at
+        )
+        return result._replace(value=value, sequence=sequence)

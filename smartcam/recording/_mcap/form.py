@@ -144,7 +144,7 @@ class Kind(NamedTuple):
     properties: Mapping[str, Any]  # the schema's, by field
     required: tuple[str, ...]  # fields that are always there
     to_text: Callable[..., str]  # makes the message of an item, in ASCII
-    # makes the item of an object; raises whatever comes where it does not fit
+    # makes the item of an object; raises any exception if the object does not fit
     from_json: Callable[[dict[str, Any]], Item]
 
     @property

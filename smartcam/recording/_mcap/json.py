@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from smartcam.models import Result
     from smartcam.observers import RawFrame
 
-MAX_FRAMES_ALIKE = 256
+MAX_CACHED_FRAME_TEXTS = 256
 """Largest number of kinds of frames whose text is kept, without their time and data."""
 
 VALUE_IS_RAW = '"raw"'
@@ -57,7 +57,7 @@ class FrameTexts:
     def text(self, raw: RawFrame) -> tuple[str, str]:
         """Return a frame's text, as from :func:`frame_text`, and its data as hex.
 
-        The data is "" without data, and for frames of the client.
+        The data is "" if the frame has no data or is a frame of the client.
         """
         frame, dialect = raw.frame, raw.dialect
         if isinstance(frame, TraceEntry):
@@ -74,7 +74,7 @@ class FrameTexts:
             before = f'{{"at":{text_of(raw.at)}'
             behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
             if text.startswith(before) and text.endswith(data + behind):
-                if len(self._known) >= MAX_FRAMES_ALIKE:
+                if len(self._known) >= MAX_CACHED_FRAME_TEXTS:
                     self._known.clear()
                 front = text[len(before) : len(text) - len(data) - len(behind)]
                 self._known[kind] = front, behind, dialect
@@ -96,7 +96,7 @@ def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[
     """
     end = data[2 * data_from :]
     if data_from < 0 or not end:
-        raise ValueError(f"data_from: {data_from} came, expected a byte of {len(data) // 2}")
+        raise ValueError(f"data_from: {data_from} came, expected an offset below {len(data) // 2}")
     return {**(fields or {}), "data": end}
 
 

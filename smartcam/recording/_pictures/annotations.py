@@ -1,8 +1,8 @@
 """The marks of a picture as Foxglove's message ``foxglove.ImageAnnotations``.
 
-A viewer draws it over the picture. Fields from 100 on are ours, and part of the schema in the file:
-so the marks that are read are the marks that were written. Foxglove counts pixels from the upper
-left corner of the upper left pixel, smartcam from its centre.
+A viewer draws them over the picture. Fields with numbers from 100 on are smartcam's, and stand in
+the file's schema: with them a mark is read exactly as it was written. Foxglove counts pixels from
+the upper left corner of the upper left pixel, smartcam from its centre.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ _MESSAGES: Final[dict[str, Fields]] = {
         "texts": WireField(3, "message", ".foxglove.TextAnnotation", repeated=True),
     },
 }
-"""Foxglove's messages and their fields. ``place`` counts the marks of a picture from 1 on, ``word``
-is the text beside the first point, which is a text without a place, too."""
+"""Foxglove's messages and their fields. ``place`` is the number of a mark in its picture, from 1.
+``word`` is the text beside a mark's first point, which viewers get as a text without a place."""
 
 _TYPES: Final = ("UNKNOWN", "POINTS", "LINE_LOOP", "LINE_STRIP", "LINE_LIST")
 _KINDS: Final[dict[int, Kind]] = {1: "points", 2: "polygon", 3: "line"}
@@ -95,7 +95,7 @@ def schema_data(name: str) -> bytes:
 def annotations_message(frame: Frame) -> bytes:
     """Return the message of a frame's marks.
 
-    Marks behind the first thousand are left out, and those with a place that is not finite.
+    Marks after the first thousand are left out, and marks whose coordinates are not finite.
     """
     thick = stroke_width(frame.width, frame.height)
     stamp = timestamp(frame.utc)
@@ -143,12 +143,12 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         kind = _KINDS.get(values.get("type", 0))
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
-        points = tuple(map(_place, values.get("points", ())))
+        points = tuple(map(_coordinates, values.get("points", ())))
         found[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
     for one in lists.get("texts", ()):
         values = values_of(_MESSAGES["TextAnnotation"], one, 100)
         if "place" in values:  # others are the words of points
-            point = _place(values.get("position", memoryview(b"")))
+            point = _coordinates(values.get("position", memoryview(b"")))
             found[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
     return tuple(one for _, one in sorted(found.items()))
 
@@ -157,13 +157,13 @@ def _point(x: float, y: float) -> bytes:
     return message(_MESSAGES["Point2"], {"x": x + 0.5, "y": y + 0.5})
 
 
-def _place(data: memoryview) -> tuple[float, float]:
+def _coordinates(data: memoryview) -> tuple[float, float]:
     values = values_of(_MESSAGES["Point2"], data, 10)
     return values.get("x", 0.0) - 0.5, values.get("y", 0.0) - 0.5
 
 
 def _colour(role: Role | None) -> bytes:
-    """Return the colour of a role; of none a dark one that lets the picture through."""
+    """Return the colour of a role; without a role, a transparent black for the background."""
     red, green, blue = (0, 0, 0) if role is None else COLOURS[role]
     opacity = 0.5 if role is None else 1.0
     values = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": opacity}

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
     from smartcam.models import Localization, Pose, Result
 
-OWN_FRAMES = 20.0
+OWN_PICTURE_TIMEOUT = 20.0
 """Seconds of the timeout for a picture of the camera itself."""
 
 
@@ -74,7 +74,7 @@ class RosCalibrationCamera:
         camera = self._camera
         if camera.capabilities.read_image and not getattr(camera, "has_frames", False):
             await camera.trigger(interpret_as="raw")
-        frame = await one_frame(None, camera, OWN_FRAMES)
+        frame = await one_frame(None, camera, OWN_PICTURE_TIMEOUT)
         return await asyncio.to_thread(frame.grey)
 
 

@@ -30,8 +30,8 @@ DISPARITY_STEP: Final = 1 / 16
 """Resolution of OpenCV's matchers, pixels."""
 
 
-LARGEST_VALUE: Final = 65534.0
-"""Largest number of steps of a compressed depth from the farthest, which is 1, to the nearest."""
+MAX_DEPTH_STEPS: Final = 65534.0
+"""Number of steps in a compressed depth picture between the farthest depth, 1, and the nearest."""
 
 MIN_DEPTH_RANGE: Final = 1.001
 """Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""
@@ -92,7 +92,7 @@ def compressed_depth_fields(
     elif there.any():
         near, far = float(depth[there].min()), float(depth[there].max())
         far = max(far, near * MIN_DEPTH_RANGE)
-        a = LARGEST_VALUE / (1 / near - 1 / far)
+        a = MAX_DEPTH_STEPS / (1 / near - 1 / far)
         b = 1 - a / far
         inverse = a / np.where(there, depth, np.float32(far)).astype(np.float64) + b
         values = np.where(there, np.rint(inverse), 0).astype(np.uint16)

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from smartcam.settings import CameraSettings
 
 SWITCH_TIMEOUT = 9.0
-"""Seconds of the timeout of a switch: setting a parameter is given up after 10."""
+"""Largest timeout of an application switch, seconds: ROS gives setting a parameter 10 seconds."""
 
 MAX_APPLICATION_ID = 0xFFFFFFFF
-PERIODS = (0.1, 3600.0)
-"""Range of the seconds between two diagnostics."""
+DIAGNOSTICS_PERIODS = (0.1, 3600.0)
+"""Smallest and largest number of seconds between two diagnostics messages."""
 
 SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
     "url": ("URL of the camera, without a password", lambda one: masked(one.address.url)),
@@ -52,13 +52,13 @@ SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
 }
 """Read-only parameters: the description, and a function that returns the value."""
 
-FRAMES = {
+PICTURE_PARAMETERS = {
     "video_device": "source of the frames",
     "pixel_format": "format of frames, as four characters",
     "image_size": "width and height of frames in pixels",
     "camera_info_url": "file of the lens calibration",
 }
-"""Descriptions by v4l2_camera's names."""
+"""Descriptions of the parameters of the source of frames, by v4l2_camera's names."""
 
 
 def as_text(spec: object) -> str:
@@ -117,23 +117,23 @@ class CameraParameters:
             on_set=self._switch,
         )
         frame_id = options.frame_id or camera.name
-        self._declare("frame_id", frame_id, "of results", read_only=True)
+        self._declare("frame_id", frame_id, "frame of results", read_only=True)
         self._declare(
-            "parent_frame", options.parent_frame, "that the camera's place is in", read_only=True
+            "parent_frame", options.parent_frame, "parent of the camera's frame", read_only=True
         )
         self._declare(
             "diagnostics_period",
             float(options.diagnostics_period),
             "seconds between two diagnostics",
-            minimum=min(PERIODS[0], options.diagnostics_period),
-            maximum=PERIODS[1],
+            minimum=min(DIAGNOSTICS_PERIODS[0], options.diagnostics_period),
+            maximum=DIAGNOSTICS_PERIODS[1],
             on_set=self._status.set_period,
         )
         for name, value in options.frames.items():
-            self._declare(name, value, FRAMES.get(name, ""), read_only=True)
+            self._declare(name, value, PICTURE_PARAMETERS.get(name, ""), read_only=True)
         if options.frames:
             optical = CameraFrames(frame_id).optical
-            self._declare("camera_frame_id", optical, "of pictures", read_only=True)
+            self._declare("camera_frame_id", optical, "frame of pictures", read_only=True)
         self._stop_listening = self._status.listen(self._follow)
 
     def _declare(self, name: str, value: object, description: str, **how: Any) -> None:

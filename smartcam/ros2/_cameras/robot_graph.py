@@ -29,7 +29,7 @@ LENS_WAIT: Final = 1.5
 PICTURE_WAIT: Final = 25.0
 """Seconds of the timeout for a picture from a topic."""
 
-MAX_APART: Final = 60.0
+MAX_CLOCK_DIFFERENCE: Final = 60.0
 """Largest number of seconds between a stamp and this computer's clock; beyond it the stamp is of
 another clock."""
 
@@ -151,7 +151,7 @@ async def _fresh(heard: Any, came: list[float]) -> tuple[Any, float | None]:
     while True:
         message = await anext(heard)
         utc = utc_of(message.header)
-        if abs(utc - time.time()) <= MAX_APART:
+        if abs(utc - time.time()) <= MAX_CLOCK_DIFFERENCE:
             if utc >= begun:
                 return message, utc
         elif came:

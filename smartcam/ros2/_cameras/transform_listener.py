@@ -32,7 +32,7 @@ TOPICS: Final = {"/tf": QoS(depth=100), "/tf_static": QoS(latched=True, depth=10
 """Topics of transforms, with the quality of service of tf2's own listener."""
 
 LINGER: Final = 60.0
-"""Seconds for which transforms are received after the last question."""
+"""Seconds for which transforms are received after the last request for a pose."""
 
 WAIT: Final = 3.0
 """Seconds of the timeout for a transform that is not known yet."""
@@ -41,13 +41,13 @@ MAX_AGE: Final = 2.0
 """Largest age of the newest transform of a moving frame, by its arrival and by its stamp."""
 
 MAX_GAP: Final = 1.0
-"""Largest number of seconds between two transforms to interpolate between."""
+"""Largest number of seconds between two transforms between which poses are interpolated."""
 
 MAX_EXTRAPOLATION_SECONDS: Final = 0.25
-"""Seconds before the first received transform for which that transform is still used."""
+"""Seconds by which a pose may be older than the first received transform, which is then used."""
 
-MAX_BACK: Final = 10.0
-"""Largest number of seconds of a stamp before the newest one; beyond, the clock was set back."""
+MAX_STAMP_STEP_BACK: Final = 10.0
+"""Largest delay of a stamp behind the newest one; a larger one means that the clock was reset."""
 
 MAX_FRAMES: Final = 2000
 """Largest number of known frames; others are left out, and logged."""
@@ -55,7 +55,7 @@ MAX_FRAMES: Final = 2000
 MAX_MOMENTS: Final = 300
 """Number of kept transforms of one frame; beyond it the oldest is dropped."""
 
-MAX_NAMED: Final = 20
+MAX_FRAMES_IN_ERROR: Final = 20
 """Largest number of frames that the text of an error names."""
 
 Found = TypeVar("Found")
@@ -87,7 +87,7 @@ class _FrameLink:
 
     def add(self, utc: float, message: Any) -> None:
         """Add the frame's transform at a time; ignore one that is older than the newest."""
-        if self.times and utc < self.times[-1] - MAX_BACK:  # the clock was set back
+        if self.times and utc < self.times[-1] - MAX_STAMP_STEP_BACK:  # the clock was set back
             self.times.clear()
             self.moments.clear()
         if not self.times or utc > self.times[-1]:
@@ -294,12 +294,12 @@ class TransformListener:
 
     def _strange(self, frame: str, base: str = "") -> CalibrationError:
         known = sorted({*self._links, *(one.parent for one in self._links.values())})
-        some = ", ".join(known[:MAX_NAMED]) or "no frame at all"
+        some = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
         way = f" to {base!r}" if base and base != frame else ""
         return Code.WRONG_FRAME.refusal(
             f"TF: no way leads from {frame!r}{way}; expected frames of one tree on /tf and "
             f"/tf_static, which have {some}",
-            known[:MAX_NAMED],
+            known[:MAX_FRAMES_IN_ERROR],
             frame,
         )
 

@@ -131,7 +131,7 @@ class NativeParameters(RosParameters):
     # ------------------------------------------------------------------ from ROS to here
 
     def _on_set(self, parameters: Sequence[Any]) -> Any:
-        """Accept or refuse values; runs in the thread that sets them, bounded."""
+        """Accept or refuse values; called in the thread that sets them, which waits for hooks."""
         result = class_of("rcl_interfaces/msg/SetParametersResult")
         if getattr(self._own, "now", False):
             return result(successful=True)

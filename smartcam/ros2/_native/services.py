@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-AT_ONCE = QoS(depth=2 * MAX_CONCURRENT_CALLS)
-"""Quality of services: with ROS' own depth of 10 the oldest of more calls at once would be lost."""
+CALL_QUEUE_QOS = QoS(depth=2 * MAX_CONCURRENT_CALLS)
+"""Quality of services: with ROS' own depth of 10, the oldest of more simultaneous calls is lost."""
 
 
 class ServiceCalls:
@@ -170,7 +170,7 @@ class NativeService:
             made = self._calls.on_request
             self._raw = node.made(
                 lambda ros: ros.create_service(
-                    cls, name, made, qos_profile=profile_of(AT_ONCE), callback_group=group
+                    cls, name, made, qos_profile=profile_of(CALL_QUEUE_QOS), callback_group=group
                 )
             )
 
@@ -204,7 +204,7 @@ class NativeClient:
         self._waiting: set[asyncio.Future[Any]] = set()
         self._raw = node.made(
             lambda ros: ros.create_client(
-                cls, name, qos_profile=profile_of(AT_ONCE), callback_group=node.side_by_side
+                cls, name, qos_profile=profile_of(CALL_QUEUE_QOS), callback_group=node.side_by_side
             )
         )
 

@@ -84,7 +84,7 @@ def message_class(definition: Definition) -> type[RosMessage]:
 
 
 class LocatedError(MisfitError):
-    """A field's value does not fit; ``path`` is the field's, from the outermost message on."""
+    """A field's value does not fit; ``path`` has the names that lead to it, the innermost first."""
 
     def __init__(self, text: str, place: str) -> None:
         super().__init__(text)
@@ -144,7 +144,7 @@ _ZERO: Final[dict[str, Any]] = {"string": "", "bool": False, "float32": 0.0, "fl
 
 
 def filled(kind: MessageType, fields: Mapping[str, Any]) -> Any:
-    """Return a message of these fields, zero elsewhere.
+    """Return a message with these fields; all others are defaults or zeros.
 
     Raises:
         LocatedError: the type has no such field, or a value does not fit.

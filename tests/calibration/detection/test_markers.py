@@ -90,7 +90,7 @@ def covered(picture: Drawn, columns: range, target: Charuco) -> Drawn:
     return picture
 
 
-@pytest.mark.sampled(every=3)
+@pytest.mark.sampled(every=5)
 @pytest.mark.parametrize("said", [NEW, LEGACY])
 @pytest.mark.parametrize(
     ("columns", "rows", "hidden"), [(9, 6, 0), (9, 6, 2), (8, 6, 0), (7, 4, 0), (8, 6, 3)]

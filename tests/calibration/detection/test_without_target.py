@@ -204,6 +204,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counted
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("hide", [half_hidden, cut, glare, finger], ids=lambda hide: hide.__name__)
 def test_search_for_a_board_in_part_takes_few_times_the_work_of_a_whole_one(
     hide: Callable[[Drawn], None], calls: Counter[str], fits: list[int]

@@ -201,7 +201,7 @@ def test_chain_without_a_transform_between_cameras_raises() -> None:
         ("camera_info", "rows: 3", "rows: 2", Code.MALFORMED, "camera_matrix: expected"),
         ("camera_info", '"camera"', "[a]", Code.MALFORMED, "camera_name: expected a text"),
         ("kalibr", "pinhole", "omni", Code.MALFORMED, "cam0.camera_model: expected pinhole"),
-        ("kalibr", "radtan", "fov", Code.MALFORMED, "one of radtan, equidistant, got 'fov'"),
+        ("kalibr", "radtan", "fov", Code.MALFORMED, "one of radtan, equidistant, none, got 'fov'"),
         ("kalibr", "cam1", "cam7", Code.MALFORMED, "the keys cam0, cam1"),
         ("kalibr", "T_cn_cnm1", "T_other", Code.MALFORMED, "the keys T_cn_cnm1"),
         ("kalibr", "[ 530.0, ", "[ ", Code.MALFORMED, "cam0.intrinsics: expected a list of 4"),

@@ -139,6 +139,7 @@ def test_hand_eye_does_not_depend_on_the_order(setup: Setup) -> None:
     np.testing.assert_allclose(later.errors, first.errors[order], atol=1e-12)
 
 
+@pytest.mark.judged
 def test_hand_eye_takes_poses_of_a_controller() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT, poses=5)
     noon = datetime(2026, 3, 4, 12, tzinfo=UTC)
@@ -229,7 +230,6 @@ def test_hand_eye_expects_what_a_sheet_does_that_is_bent_once(bent: float) -> No
     assert 0.7 < ratio(16, known=False, bent=bent, board=board) < 1.4
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> None:
     """A bent sheet leaves more residuals than a lens that is fitted to it as flat."""
@@ -244,7 +244,6 @@ def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> 
     assert {one.code for one in found.warnings} == {Code.SHEET_NOT_EXACT}
 
 
-@pytest.mark.long
 @pytest.mark.judged
 @pytest.mark.parametrize("setup", ONE_LONG)
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
@@ -316,7 +315,6 @@ def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: fl
     assert caught.value.got == pytest.approx(1 / factor, rel=0.01)
 
 
-@pytest.mark.long
 @pytest.mark.judged
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> None:
@@ -327,7 +325,7 @@ def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> Non
     assert scene(setup, poses=10).errors(found.camera_pose)[1] < 2e-3
 
 
-@pytest.mark.sampled(every=2)
+@pytest.mark.judged
 @pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.05, True)])
 def test_hand_eye_tells_a_size_that_was_not_to_be_adjusted(factor: float, told: bool) -> None:
     poses, views = printed("eye-in-hand", factor)
@@ -361,7 +359,6 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
     assert truth.errors(found.camera_pose)[1] < 1e-3
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_second_camera_on_the_hand_is_where_the_pair_has_it() -> None:
     truth, random = scene("eye-in-hand", poses=9), np.random.default_rng(5)
@@ -441,6 +438,7 @@ def test_hand_eye_names_a_wrong_pose_and_leaves_it_out(setup: Setup) -> None:
     assert HandEyeCalibration.from_data(found.to_data()).used == found.used
 
 
+@pytest.mark.judged
 def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
     poses, views = _with_a_wrong_pose("eye-in-hand")
     found = calibrate_hand_eye(
@@ -458,6 +456,7 @@ def test_hand_eye_told_to_keep_a_wrong_pose_names_it_only() -> None:
     assert found.warnings[0].text.endswith("it is used all the same")
 
 
+@pytest.mark.judged
 def test_hand_eye_of_few_poses_keeps_a_wrong_one() -> None:
     poses, views = _with_a_wrong_pose("eye-in-hand", poses=8)
     found = calibrate_hand_eye(
@@ -599,6 +598,7 @@ def test_to_plane_of_a_moving_camera_is_where_the_part_is() -> None:
         np.testing.assert_allclose(where, parts, rtol=0, atol=1e-9)
 
 
+@pytest.mark.judged
 def test_to_plane_of_raised_features_is_where_they_are() -> None:
     truth = scene("eye-to-hand", poses=5)
     poses, views = measured("eye-to-hand", 0.0, EXACT, poses=5)
@@ -653,6 +653,7 @@ def test_point_errors_of_its_own_poses_are_its_errors(noisy: HandEyeCalibration)
     np.testing.assert_allclose(rms, noisy.errors, rtol=1e-9)
 
 
+@pytest.mark.judged
 def test_point_errors_of_a_target_of_another_size_are_those_of_the_adjusted_one() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT, poses=6)
     said = Checkerboard(columns=5, rows=4, square=0.03 / 0.98)

@@ -83,7 +83,6 @@ def test_hand_eye_of_transposed_rotations_is_refused(setup: Setup) -> None:
         calibrated(turned, views, setup)
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
     poses, views = measured("eye-in-hand")
@@ -114,6 +113,7 @@ def test_hand_eye_of_two_exchanged_poses_leaves_both_out() -> None:
     assert "it belongs to another view, or numbers the target" in found.warnings[0].text
 
 
+@pytest.mark.judged
 def test_hand_eye_of_six_poses_leaves_one_of_another_view_out() -> None:
     poses, views = measured("eye-in-hand", poses=6)
     found = calibrated([*poses[:5], poses[0]], views)
@@ -150,7 +150,6 @@ def test_hand_eye_of_what_moved_before_the_last_views_is_not_good(setup: Setup, 
     assert any(f"the {moved} seems to have moved by 67" in one.text for one in found.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.judged
 @pytest.mark.parametrize(("number", "level"), [(-1, "unknown"), (-2, "good")])
 def test_hand_eye_of_which_the_last_view_does_not_fit_is_not_good(number: int, level: str) -> None:
@@ -180,7 +179,6 @@ def test_hand_eye_of_a_robot_that_stood_for_half_of_the_views_is_refused() -> No
         calibrate_hand_eye([*poses[:7], *[poses[7]] * 7], views, setup="eye-in-hand", camera=CAMERA)
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_hand_eye_of_a_poor_robot_says_so() -> None:
     poses, views = measured("eye-in-hand", sigmas=RobotSigmas(math.radians(0.5), 4e-3))
@@ -189,7 +187,6 @@ def test_hand_eye_of_a_poor_robot_says_so() -> None:
     assert "of a robot that is 2 mm and 0.25 deg off" in found.warnings[0].text
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_hand_eye_of_four_poses_expects_no_error() -> None:
     poses, views = measured("eye-in-hand", poses=5)
@@ -212,6 +209,7 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
     )
 
 
+@pytest.mark.judged
 def test_check_poses_that_belong_together_tells_no_gross_ones() -> None:
     asked = problem(list(scene("eye-in-hand", poses=8).robot_poses), "eye-in-hand")
     assert check_poses(asked).gross(most_error(asked)).tolist() == []

@@ -159,6 +159,7 @@ def test_matrices_in_place_of_transforms_are_refused(make: Any, text: str) -> No
         make()
 
 
+@pytest.mark.judged
 def test_poses_visited_thrice_tell_no_more_than_once() -> None:
     robot, seen = TRUTH.measured(
         pixel_sigma=0.1, robot_sigmas=NOISE, random=np.random.default_rng(1)

@@ -94,6 +94,7 @@ def test_calibrate_stereo_held_out_error_is_that_of_a_calibration_without_the_pa
     assert found.pairs[0].held_out == pytest.approx(math.sqrt(np.mean(errors**2)), rel=1e-3)
 
 
+@pytest.mark.judged
 def test_calibrate_stereo_uses_views_of_one_camera_alone() -> None:
     left, right = pairs(8)
     some: Views = [None if number == 2 else view for number, view in enumerate(right)]
@@ -123,6 +124,7 @@ def test_calibrate_stereo_names_a_view_of_another_moment_and_leaves_it_out() -> 
     assert np.linalg.norm(_off(found.transform)[3:]) < 4e-4
 
 
+@pytest.mark.judged
 def test_calibrate_stereo_leaves_a_swapped_pair_out() -> None:
     left, right = pairs(8)
     left[3], right[3] = right[3], left[3]
@@ -191,7 +193,6 @@ def test_calibrate_stereo_of_a_camera_on_its_head_numbers_alike() -> None:
     assert found.bad_views == ()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
     bent = BOARD.points + np.random.default_rng(7).normal(size=(54, 3)) * 2e-4
@@ -205,7 +206,6 @@ def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
     assert found.held_out_epipolar < exact.held_out_epipolar
 
 
-@pytest.mark.long
 @pytest.mark.judged
 def test_calibrate_stereo_of_a_stretched_sheet_adjusts_it_or_has_a_remark() -> None:
     stretched = moved_to_nominal(BOARD.points * [1.01, 1.0, 1.0], BOARD.points)

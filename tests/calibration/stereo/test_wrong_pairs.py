@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Code, StereoCalibration, TargetView, Transform, calibrate_stereo
+from smartcam.geometry._inside import exp_rotation
 from tests.calibration.inside import check_apart
 from tests.calibration.lens.test_wrong_views import flipped, mirrored
 from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
@@ -127,3 +128,32 @@ def test_calibrate_stereo_of_invalid_arguments_is_refused() -> None:
     found = known(*twice)
     texts = {one.code: one.text for one in found.warnings}
     assert texts[Code.COINCIDENT].startswith("views that are the same to the last digit: 00, left")
+
+
+ZOOMED = dataclasses.replace(RIGHT, matrix=np.diag([1.01, 1.01, 1.0]) @ RIGHT.matrix)
+TURNED = dataclasses.replace(RIG, rotation=exp_rotation(np.array([0, 2e-3, 0])) @ RIG.rotation)
+SHIFTED = dataclasses.replace(RIG, translation=RIG.translation + np.array([1e-3, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("camera", "rig", "moved", "code", "text"),
+    [
+        (ZOOMED, RIG, 0.0, Code.WRONG_LENS, "right camera: was the zoom or the focus moved"),
+        (RIGHT, TURNED, 0.0, Code.WRONG_LENS, "did the cameras move against each other"),
+        (RIGHT, SHIFTED, 0.0, Code.POOR_FIT, "from 05 on do not fit those before: did the cameras"),
+        (RIGHT, RIG, 3e-4, Code.NOT_SIMULTANEOUS, "did the target move between the two"),
+    ],
+)
+def test_calibrate_stereo_reports_what_changed_between_pairs(
+    camera: Any, rig: Transform, moved: float, code: Code, text: str
+) -> None:
+    (left, right), random = pairs(10), np.random.default_rng(5)
+    then = [
+        dataclasses.replace(one, translation=one.translation + random.normal(0, moved, 3))
+        for one in poses(10, name="left")
+    ]
+    other = seen(camera, [rig @ one for one in then], seed=2)
+    found = calibrate_stereo(left, other if moved else [*right[:5], *other[5:]])
+    (remark,) = found.warnings
+    assert remark.code == code
+    assert text in remark.text

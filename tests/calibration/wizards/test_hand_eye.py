@@ -124,7 +124,6 @@ async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:
     assert (await say(session))["step"] == "view-2"
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_view_removed_is_calculated_without(tmp_path: Path) -> None:
     session = begin(tmp_path, Cell())
@@ -166,7 +165,6 @@ async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
     again.close()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path) -> None:
     cell = Cell()
@@ -217,7 +215,6 @@ def typed(pose: Transform) -> dict[str, float]:
     return dict(zip(ROBOTS["kuka"].numbers, pose_to("kuka", pose), strict=True))
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_touches_of_the_sheet_verify_a_calibration_or_refute_it(tmp_path: Path) -> None:
     session = begin(tmp_path, Cell())

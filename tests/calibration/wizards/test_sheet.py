@@ -134,7 +134,6 @@ async def test_wrong_touch_is_touched_again_or_removed(tmp_path: Path) -> None:
     session.close()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_smaller_print_is_reported_unless_the_rulers_are_smaller_too(tmp_path: Path) -> None:
     cell = Cell(scale=0.97, sigma=0.0)
@@ -211,6 +210,7 @@ async def test_rulers_that_no_printer_makes_keep_the_step(tmp_path: Path) -> Non
     session.close()
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("picture", "text"),
     [
@@ -234,7 +234,6 @@ async def test_picture_without_the_sheet_keeps_the_step(
     session.close()
 
 
-@pytest.mark.long
 @pytest.mark.judged
 async def test_unmarked_origin_is_reported(tmp_path: Path) -> None:
     cell = Cell()

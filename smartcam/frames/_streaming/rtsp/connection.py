@@ -39,7 +39,7 @@ REQUEST_TIMEOUT: Final = 10.0
 """Seconds for receiving a request that has begun."""
 
 IDLE_TIMEOUT: Final = 60.0
-"""Seconds that a connection may be without a session, even with requests."""
+"""Seconds that a connection may stay open without a session, even if requests come."""
 
 MAX_STRAY_PACKETS: Final = 64
 """Largest number of packets accepted without a session, such as RTCP after a TEARDOWN."""
@@ -48,7 +48,7 @@ CLOSE_TIMEOUT: Final = 1.0
 """Seconds for sending the last bytes before a connection is aborted."""
 
 MAX_ANSWER_BYTES, MAX_PLAYING_BYTES = 64 << 10, 4 * MAX_WAITING_BYTES
-"""Largest number of bytes that wait for a client: before and while it plays."""
+"""Largest number of bytes that wait for a client, before it plays and while it plays."""
 
 
 class ConnectionOwner(Protocol):
@@ -66,10 +66,10 @@ class ConnectionOwner(Protocol):
         ...
 
     def served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served, the last to be closed for room."""
+        """Mark a connection as the most recently served, which makes room last."""
         ...
 
-    def unseated(self, connection: RtspConnection) -> None:
+    def last_session_ended(self, connection: RtspConnection) -> None:
         """Note that a connection has no session any more."""
         ...
 
@@ -106,7 +106,7 @@ class RtspConnection(asyncio.Protocol):
         self._strays = 0
         self._closing = False
         self._reading = True
-        self._cut: asyncio.TimerHandle | None = None
+        self._abort_timer: asyncio.TimerHandle | None = None
         self.task: asyncio.Task[None] | None = None
 
     # asyncio
@@ -151,8 +151,8 @@ class RtspConnection(asyncio.Protocol):
         self._closing = True
         self._lost.set()
         self._end_sessions("")
-        if self._cut is not None:
-            self._cut.cancel()
+        if self._abort_timer is not None:
+            self._abort_timer.cancel()
         if self.task is not None:
             self.task.cancel()
 
@@ -166,7 +166,7 @@ class RtspConnection(asyncio.Protocol):
         self._closing = True
         self.transport.close()
         loop = asyncio.get_running_loop()
-        self._cut = loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
+        self._abort_timer = loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
     def abort(self) -> None:
         """Abort the connection."""
@@ -209,7 +209,7 @@ class RtspConnection(asyncio.Protocol):
         if self.sessions.pop(session.id, None) is not None:
             self.owner.dismiss(session, str(self.peer[0]))
             if not self.sessions:
-                self.owner.unseated(self)
+                self.owner.last_session_ended(self)
 
     def channels(self) -> Iterator[int]:
         """Yield the channels in use."""

@@ -89,10 +89,10 @@ class RtspServing:
         self._acceptor.leave(connection)
 
     def served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served, the last to be closed for room."""
+        """Mark a connection as the most recently served, which makes room last."""
         self._acceptor.move_back(connection)
 
-    def unseated(self, connection: RtspConnection) -> None:
+    def last_session_ended(self, connection: RtspConnection) -> None:
         """Note that a connection has no session any more."""
         self._acceptor.move_back(connection)
         self._acceptor.expect(connection, IDLE_TIMEOUT, "no session")

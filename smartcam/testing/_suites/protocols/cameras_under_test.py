@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
 COUNTER, OTHER, SLOW, ECHO, FREE = 7, 3, 4, 5, 9
-NOBODYS = 99
-"""No application has this id."""
+UNUSED_APPLICATION_ID = 99
+"""An id that no application has."""
 
 SLOW_TIME = 0.15
 """Seconds that an inspection of ``SLOW`` takes."""
@@ -28,17 +28,17 @@ SLOW_TIME = 0.15
 class LiveCamera:
     """A camera that is up, with ``COUNTER`` active and ready to run.
 
-    A subclass has ``url`` and what else can be done with the camera. A check that needs what a
-    subclass leaves out is skipped, and says so.
+    A subclass implements ``url``, and each of the other methods that its camera supports. A check
+    that needs a missing method is skipped, with this reason.
 
     Attributes:
         COUNTER: id of the application that answers each trigger with the number of the run, from 0.
         OTHER: id of a second application that answers as ``COUNTER`` does.
-        SLOW: id of the application that answers so after ``SLOW_TIME``.
-        ECHO: id of the application that sends the number that came as input data, where the camera
-            takes any.
-        FREE: id of the application that runs free, some 200 times per second, and sends the number
-            of the run, where the camera sends unasked.
+        SLOW: id of an application like ``COUNTER`` whose inspection takes ``SLOW_TIME``.
+        ECHO: id of the application that sends the number in its input data, if the camera accepts
+            input data.
+        FREE: id of the application that runs free, about 200 times per second, and sends the number
+            of the run, if the camera sends results without a trigger.
         SLOW_TIME: seconds that an inspection of ``SLOW`` takes.
     """
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MAX_LENGTH = 1 << 12
 """Length of the longest payload, in bytes, that the machines of a suite accept."""
 
-Told: TypeAlias = Message | type[RemoteProtocolError]
+MachineOutput: TypeAlias = Message | type[RemoteProtocolError]
 """An output of a machine: a message, or the kind of error that ends the link."""
 
 
@@ -49,7 +49,7 @@ class Came(NamedTuple):
     """
 
     data: bytes
-    events: tuple[Told, ...] = ()
+    events: tuple[MachineOutput, ...] = ()
     wire: bytes = b""
 
 

@@ -45,7 +45,7 @@ FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
 MAX_MESSAGES = 1000
-"""Bytes without an end count as messages after this many messages."""
+"""Number of messages after which endless bytes count as a valid series of messages."""
 
 MAX_HIDDEN_FACTOR = 2
 """Largest memory of a machine for waiting bytes, without events, in multiples of the bound."""

@@ -22,9 +22,9 @@ from smartcam import (
 from smartcam.testing._suites.protocols.cameras_under_test import (
     COUNTER,
     FREE,
-    NOBODYS,
     OTHER,
     SLOW,
+    UNUSED_APPLICATION_ID,
 )
 from smartcam.testing._suites.protocols.client_checks import (
     SHORT_TIMEOUT,
@@ -207,7 +207,7 @@ class TriggerChecks(Parameters):
             if not camera.capabilities.switch:
                 return
             with pytest.raises(CommandRejectedError) as caught:
-                await camera.switch_application(NOBODYS)
+                await camera.switch_application(UNUSED_APPLICATION_ID)
             assert caught.value.active_application == COUNTER
             assert caught.value.code != 0
             assert await number(camera) == 0

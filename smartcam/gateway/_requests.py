@@ -1,4 +1,4 @@
-"""One robot at a gateway: its requests, their answers, and the parts that it may still get."""
+"""Answer the requests of one robot at a gateway, and keep the parts that it may still get."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ CODES: tuple[tuple[type[BaseException], AnswerCode], ...] = (
 """The code of an error; the first class that matches counts."""
 
 
-class SharedDesk:
-    """The parts of a gateway that all its robots share.
+class GatewayCamera:
+    """The camera of a gateway, with the settings and counts that all robots share.
 
     Args:
         camera: the camera.
@@ -84,14 +84,14 @@ class SharedDesk:
         self.turn = asyncio.Lock()
 
 
-class Desk:
+class RobotRequests:
     """The requests of one robot, one after the other.
 
     Args:
-        shared: the parts that it shares with other robots.
+        shared: the camera that the robot shares with other robots.
     """
 
-    def __init__(self, shared: SharedDesk) -> None:
+    def __init__(self, shared: GatewayCamera) -> None:
         self._shared = shared
         self._rows: list[Row] | None = None  # rows of the last result; None without one
         self._until = 0.0  # loop time until which the rows may be asked for
