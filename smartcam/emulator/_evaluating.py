@@ -107,8 +107,8 @@ class EvaluatingCamera(LineCamera):
             number: itertools.cycle(some) for number, some in parts.items()
         }
         self._numbers_of_applications = [*parts]
-        self._call: LineClient | None = None  # call that the running evaluation answers
-        self._run = 0  # a switch voids the running evaluation
+        self._asking_client: LineClient | None = None  # asked for the running evaluation
+        self._run = 0  # number of the last evaluation or switch; a switch ends a running one
         self.device: Any = Operator(self)
 
     @classmethod
@@ -165,24 +165,24 @@ class EvaluatingCamera(LineCamera):
     def _before_stop(self) -> None:
         """Forget the running evaluation, like a device that loses power."""
         super()._before_stop()
-        self.busy, self._call, self._run = False, None, self._run + 1
+        self.busy, self._asking_client, self._run = False, None, self._run + 1
 
     def begin(self, call: LineClient | None) -> None:
         """Begin an evaluation, for a request or without one."""
-        self.busy, self._run, self._call = True, self._run + 1, call
+        self.busy, self._run, self._asking_client = True, self._run + 1, call
         run = self._run
         self.after(self.evaluation_time, lambda: self._end(run))
 
     def _end(self, run: int) -> None:
         if run != self._run:
             return
-        call, self._call, self.busy = self._call, None, False
+        call, self._asking_client, self.busy = self._asking_client, None, False
         self.evaluated(None if call is None or call.gone else call, next(self.parts[self.active]))
         self.activated()
 
     def activate(self, application: int) -> None:
         """Make another application the active one; the running evaluation gives no result."""
-        call, self._call, self.busy = self._call, None, False
+        call, self._asking_client, self.busy = self._asking_client, None, False
         self.active, self._run = application, self._run + 1
         if call is not None and not call.gone:
             self.voided(call)

@@ -53,19 +53,19 @@ class HeldResults:
         self._ready: list[Event] = []
         self._waiting: deque[Event | _Held] = deque()
         self._size = 0
-        self._last_question = 0  # number of the last question
-        self._open_questions: set[int] = set()  # numbers of questions without an answer
+        self._last = 0  # number of the last question
+        self._unanswered: set[int] = set()  # numbers of questions without an answer
         self._named: int | None = None  # the application that the camera named last
-        self._trigger_question = 0  # number of the question before the last trigger
+        self._before_trigger = 0  # number of the question before the last trigger
         self._seen: set[int] | None = None  # applications named since that question
 
     def ask(self, *, trigger: bool = False) -> int:
         """Return the number of a new question, which may stand before a trigger."""
-        self._last_question += 1
-        self._open_questions.add(self._last_question)
+        self._last += 1
+        self._unanswered.add(self._last)
         if trigger:
-            self._trigger_question, self._seen = self._last_question, set()
-        return self._last_question
+            self._before_trigger, self._seen = self._last, set()
+        return self._last
 
     def add(self, messages: tuple[Event, ...], *, answers_trigger: bool) -> bool:
         """Add messages; return True if a result among them needs a question now.
@@ -79,9 +79,7 @@ class HeldResults:
             seen, self._seen = self._seen, None
         if results:
             size = sum(len(one.data) for one in results)
-            self._waiting.append(
-                _Held(messages, size, self._last_question + 1, self._trigger_question, seen)
-            )
+            self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
             self._size += size
         elif self._waiting:
             self._waiting.extend(messages)
@@ -92,7 +90,7 @@ class HeldResults:
                 f"{len(self._waiting)} events came, with results of {self._size} bytes, and no "
                 "answer to the question for the application that they are of"
             )
-        return bool(results) and not self._open_questions
+        return bool(results) and not self._unanswered
 
     def pass_on(self, events: tuple[Event, ...]) -> None:
         """Add events that need no application."""
@@ -109,17 +107,13 @@ class HeldResults:
                 True if a question is needed now for a result that came since the last one.
         """
         self._named = application
-        self._open_questions.discard(question)
+        self._unanswered.discard(question)
         held = [one for one in self._waiting if isinstance(one, _Held)]
         for seen in (self._seen, *(one.seen for one in held)):
             if seen is not None:
                 seen.add(application)
         self._release()
-        return (
-            bool(self._waiting)
-            and held[-1].question > self._last_question
-            and not self._open_questions
-        )
+        return bool(self._waiting) and held[-1].question > self._last and not self._unanswered
 
     def take(self) -> list[Event]:
         """Return the events that can be reported, in order; the caller owns the list."""
@@ -134,7 +128,7 @@ class HeldResults:
         while self._waiting:
             first = self._waiting[0]
             if isinstance(first, _Held):
-                waits = first.question > self._last_question or not self._open_questions.isdisjoint(
+                waits = first.question > self._last or not self._unanswered.isdisjoint(
                     {first.front, first.question}
                 )
                 if waits and not ended:

@@ -66,7 +66,7 @@ def cut_windows(
     ``half_sides`` (N, 2, 2): vectors from each point along the half sides of the parallelogram
     whose pixels count, or along the half axes of an ellipse (``round_``). A window reaches at most
     ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): count only a cross whose arms lie
-    along the half sides; its half widths are these shares of the half sides. None: count all.
+    along the half sides, with these shares of them as half widths; None: count all.
     """
     reach = (
         np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)

@@ -393,8 +393,7 @@ def fit_corners(
 
     A sheet that lies flat keeps its shape. If touches do not fit that shape, a warning says so
     (NOT_SIMILAR), and the shape is kept. If the scale is not the target's, a warning says so, too
-    (SCALE_MISMATCH), and the touches' scale is used: the printed rulers were measured wrong, or
-    not at all.
+    (SCALE_MISMATCH), and the touches' scale is used: the printed rulers were not measured right.
 
     Args:
         target: target with its lengths as they are on paper.

@@ -60,7 +60,7 @@ MAX_FREQUENT_KEYS = 64
 """Largest number of keys with a publisher of their own, which routers have to know."""
 
 IDLE_KEY_TIME = 10.0
-"""Seconds without use after which a key loses its publisher to another key. The publisher's end
+"""Seconds without use after which a key loses its publisher to another key. Closing it
 would overtake messages that still wait for room."""
 
 SENDERS = 8

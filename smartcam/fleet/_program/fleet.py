@@ -308,11 +308,9 @@ class Fleet:
             deadline = loop.time() + self._timeout
             await self._program.open(self._timeout)
             keys, bus = self._program.keys, self._program.bus
-            camera_keys = await bus.present(
-                keys.camera("*", "**"), max(0.0, deadline - loop.time())
-            )
-            self._meets = len(camera_keys) <= MAX_CAMERAS_MET
-            for key in camera_keys:
+            present = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
+            self._meets = len(present) <= MAX_CAMERAS_MET
+            for key in present:
                 self._on_camera(key, True)
             if self._meets:
                 self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))

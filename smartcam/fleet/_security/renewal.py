@@ -71,9 +71,8 @@ class CertificateWatch:
         if identity is not None and seen is not None and identity.digest != seen.digest:
             if self._listens:
                 await self._reopen()
-            logger.info(
-                "certificates ! those of %s were renewed: until %s", identity, identity.ends
-            )
+            text = "certificates ! those of %s were renewed: until %s"
+            logger.info(text, identity, identity.ends)
         return identity or seen
 
     async def _look(self) -> Identity | None:

@@ -284,7 +284,7 @@ class PartModel:
     @cached_property
     def coarse(self) -> CoarseModel:
         """The points for the coarse search."""
-        some = [self.segments.some(one) for one in self.levels]
+        some = [self.segments.selected(one) for one in self.levels]
         return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
 
     def bands_at(self, scale: float) -> Bands:
@@ -366,7 +366,7 @@ def _taught(
             f"{len(exact)} pieces of edges whose place can be measured, expected {MIN_SEGMENTS} or "
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
-    segments = edges.segments.some(exact)
+    segments = edges.segments.selected(exact)
     moves = blurred_moves(levels, segments, found.points)
     segments = segments._replace(moves=moves)
     _check_directions(segments)
@@ -457,7 +457,7 @@ def _ordered(segments: Segments) -> Segments:
     order = np.argsort(np.arctan2(segments.middles[:, 1], segments.middles[:, 0]), kind="stable")
     if len(order) > MAX_SEGMENTS:
         order = order[np.linspace(0, len(order) - 1, MAX_SEGMENTS).round().astype(int)]
-    return segments.some(order)
+    return segments.selected(order)
 
 
 def _check_directions(segments: Segments) -> None:

@@ -50,7 +50,7 @@ class Segments(NamedTuple):
     sigmas: Array  # (N,), standard deviation of the place across the edge
     moves: Array  # (N, K), shift of the fitted step across the edge by each of BLURS_PX2
 
-    def some(self, which: NDArray[Any]) -> Segments:
+    def selected(self, which: NDArray[Any]) -> Segments:
         """Return some of the segments."""
         return Segments(*(one[which] for one in self))
 
