@@ -303,7 +303,7 @@ async def test_reservation_that_is_cancelled_as_it_is_made_is_given_back() -> No
     async with Plant(bus=bus) as plant, plant.cameras(1) as (robot,):
         host = plant.agent.hosts[NAME]
         bus.fate = only("states", lambda *_: ())  # what the reply speaks of is waited for
-        host._say({"kind": "Tried"})
+        host._publish_state({"kind": "Tried"})
         reservation = robot.reserve(timeout=5.0)
         task = asyncio.create_task(reservation.__aenter__())
         await until(lambda: host.gate.holder is not None)

@@ -69,7 +69,7 @@ def check(data: bytes) -> None:
     if spec.startswith("localizations"):
         check_localizations(value, number)
         mirrored = interpretation(spec, lenient=lenient, y_down=not y_down)
-        other = mirrored(container, endian, camera="camera", number=number, at=AT).value
+        other, _, _ = mirrored(container, endian, camera="camera", number=number, at=AT)
         check_mirrored(value, other)
 
 

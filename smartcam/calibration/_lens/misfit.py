@@ -244,7 +244,7 @@ class _Misfit:
         )
 
     def score(self, squares: float, unknowns: float) -> float:
-        """Return how badly a cause explains the views that leaves these squares."""
+        """Return the information criterion of a cause that leaves these squares."""
         # Schwarz, Estimating the Dimension of a Model (1978)
         return self._count * math.log(max(squares, 1e-300)) + unknowns * math.log(self._count)
 
