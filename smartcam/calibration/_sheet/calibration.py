@@ -176,10 +176,9 @@ class SheetCalibration(storage.SavedCalibration):
         """
         if self.camera is None or self.lens_covariance is None:
             return ()
-        values, deviations = lens_values(self.camera), independent_parts(self.lens_covariance)
+        values, moves = lens_values(self.camera), independent_parts(self.lens_covariance)
         return tuple(
-            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane
-            for one in deviations
+            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane for one in moves
         )
 
     def transform(self, pixels: ArrayLike) -> Array:
@@ -254,7 +253,7 @@ class SheetCalibration(storage.SavedCalibration):
             flat = self.sheet.near_sheet(points * y_up)
             return np.column_stack([flat, np.zeros(len(flat))])
 
-        def value_derivatives(points: Array) -> Array:
+        def slopes(points: Array) -> Array:
             flat = self.sheet.near_sheet(points * y_up)
             rows = np.zeros((len(flat), 3, 9 + len(lenses)))
             rows[:, :2, :9] = self.sheet.element_slopes(flat)
@@ -265,9 +264,7 @@ class SheetCalibration(storage.SavedCalibration):
         covariance = np.eye(9 + len(lenses))
         covariance[:9, :9] = self.sheet.covariance
         normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
-        return robot_sigmas(
-            parts, on_sheet, normal, value_derivatives, covariance, size, flip=False
-        )
+        return robot_sigmas(parts, on_sheet, normal, slopes, covariance, size, flip=False)
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
