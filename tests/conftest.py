@@ -36,8 +36,13 @@ ROOT = Path(__file__).parent.parent
 ONLY_LONG = frozenset({"long", "long and not widest", "judged"})
 """Choices of marks by which only ``long`` tests run."""
 
-SOME_LONG = re.compile(r"\b(long|sampled|judged|widest|LONG|ONE_LONG)\b|_long\b")
-"""Pattern of the words of which each module that has ``long`` tests has one."""
+SOME_LONG = re.compile(
+    r"\b(long|sampled|judged|widest|LONG|ONE_LONG|BROWSER_MARKS|needs_tshark)\b|_long\b"
+)
+"""Pattern of the words of which each module that has ``long`` tests has one; those of the client
+get the mark by their connection, too, and need none."""
+
+CLIENT = Path(__file__).parent / "client"
 
 ALL_LONG = re.compile(r"^pytestmark = (\[[^]]*)?pytest\.mark\.long\b(?!\()", re.MULTILINE)
 """Pattern of the line that marks all tests of a module as ``long``."""
@@ -136,8 +141,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not collection_path.match("test_*.py") or marks not in {"not long", *ONLY_LONG}:
         return None
     text = collection_path.read_text(encoding="utf-8")
-    none = SOME_LONG.search(text) is None if marks in ONLY_LONG else ALL_LONG.search(text)
-    return True if none else None
+    if marks == "not long":
+        return ALL_LONG.search(text) is not None or None
+    if marks != "judged" and collection_path.is_relative_to(CLIENT):
+        return None
+    return SOME_LONG.search(text) is None or None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -171,7 +179,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             left_out[test] += 1
         counts[test] += 1
     for path in long_ones:
-        if SOME_LONG.search(path.read_text(encoding="utf-8")) is None:
+        found = SOME_LONG.search(path.read_text(encoding="utf-8"))
+        if found is None and not path.is_relative_to(CLIENT):
             raise pytest.UsageError(f"{path} has long tests, but not a word of {SOME_LONG.pattern}")
 
 
