@@ -8,7 +8,7 @@ from tests import ROOT
 
 READS = re.compile(
     r"json\.loads|yaml_module|[^_]compose\(text|load_yaml|load_json|expat|zipfile|literal_eval"
-    r"|\.unpack(?:_from)?\(|iter_unpack|from_bytes\(|fromhex\(|b64decode|frombuffer|unhexlify"
+    r"|XMLParser|\.unpack(?:_from)?\(|iter_unpack|from_bytes\(|fromhex\(|b64decode|frombuffer|unhexlify"
     r"|decode_jpeg|\.recv\("
 )
 """The pattern by which a module that reads bytes or text is known."""

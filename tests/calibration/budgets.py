@@ -189,8 +189,11 @@ PARSERS: tuple[Parser, ...] = (
             f"cameras: {name}",
             from_file(form.read, "a"),
             _CAMERAS,
-            form.most,
-            "calibration.formats._cameras.MAX_FILE_BYTES",
+            SAMPLES["moveit_yaml"].most
+            if name == "mrcal"
+            else form.most,  # mrcal: beside the solver's inputs
+            "calibration.formats."
+            + ("_file_format.MAX_YAML_BYTES" if name == "mrcal" else "_cameras.MAX_FILE_BYTES"),
             size=2500,
             short=PAST_LOOKAHEAD,
             needs=("yaml",),

@@ -60,7 +60,7 @@ def test_convert_filters(ply: str, tmp_path: Path, options: list[str], points: i
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["convert", "{ply}", "{ply}"], 2, "there already; --force"),
+        (["convert", "{ply}", "{ply}"], 2, "exists already; --force"),
         (["convert", "{ply}", "b.stl"], 2, "ends in .ply or .pcd"),
         (["convert", "no.ply", "b.ply"], 3, "no.ply: cannot be read"),
         (["convert", "torn.ply", "b.ply"], 5, "expected a PLY file"),

@@ -368,7 +368,7 @@ def test_status_interrupted_during_connect_says_disconnect() -> None:
 
 @pytest.mark.parametrize(
     ("name", "command"),
-    [("click", "protocols"), ("construct", "decode"), ("asyncio", "status"), ("pydantic", "probe")],
+    [("click", "protocols"), ("construct", "decode"), ("asyncio", "status"), ("asyncio", "probe")],
 )
 def test_command_interrupted_during_import_exits_130(
     tmp_path: Path, name: str, command: str

@@ -180,6 +180,28 @@ def test_woven_planes_of_ten_bits_in_the_high_bits() -> None:
     assert np.array_equal(u, interleaved[:, : 2 * u.shape[1] : 2] >> 6)
 
 
+@pytest.mark.parametrize("name", ["p010le", "p016le", "p210le", "p416be", "y210le", "xv48le"])
+def test_deep_rows_of_an_odd_width_are_those_of_a_wider_picture(name: str) -> None:
+    """FFmpeg alone writes colour into Y here."""
+    chance, first = np.random.default_rng(7), []
+    wide, narrow = (av.VideoFrame(width, 481, name) for width in (672, 641))
+    for whole, part in zip(wide.planes, narrow.planes, strict=True):
+        rows = chance.integers(0, 2**16, (whole.height, whole.line_size // 2)).astype("<u2")
+        rows &= 0xFFC0 if "10" in name else 0xFFFF
+        whole.update(rows.tobytes())
+        part.update(np.ascontiguousarray(rows[:, : part.line_size // 2]).tobytes())
+    for video in (wide, narrow):
+        found, (y, *_) = planes_of(video)
+        assert found.name.startswith("I4")
+        first.append(y[:, :641])
+    assert np.array_equal(*first)
+
+
+def test_format_that_ffmpeg_cannot_convert_is_an_error_of_ours() -> None:
+    with pytest.raises(FrameFormatError, match="rgb4: no conversion to rgb24"):
+        from_video(av.VideoFrame(16, 16, "rgb4"))
+
+
 @pytest.mark.parametrize(
     ("name", "across", "down"),
     [("yuv411p", 4, 1), ("yuv410p", 4, 4), ("yuv440p", 1, 2), ("yuvj440p", 1, 2)],

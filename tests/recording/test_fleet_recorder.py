@@ -110,7 +110,7 @@ async def test_files_follow_and_no_result_is_lost_between(
     assert runs(whole) == numbers
     played = [
         int.from_bytes(data[:4], "little")
-        for take in plan_replay(whole).applications[1].unasked
+        for take in plan_replay(whole).applications[1].untriggered
         for data in take.containers
     ]
     # frames come while the session ends, whose results nobody is handed
@@ -210,7 +210,7 @@ def test_trigger_behind_which_a_file_is_damaged_gets_no_others_result(tmp_path: 
     os.truncate(first, size)
     app = plan_replay(load_recording(tmp_path / "rec")).applications[5]
     assert [take.containers for take in app.triggered] == [[b"one"], [b"two"]]
-    assert [take.containers for take in app.unasked] == [[b"by itself"]]
+    assert [take.containers for take in app.untriggered] == [[b"by itself"]]
 
 
 # ---------------------------------------------------------------------- the bound on the disk

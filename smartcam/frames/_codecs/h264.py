@@ -14,7 +14,7 @@ from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.pictures import decoded
 from smartcam.frames._frame import changed
 from smartcam.frames._pixels.formats import find_format
-from smartcam.frames._video.frames import from_video, to_video
+from smartcam.frames._video.frames import converted, from_video, to_video
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -257,7 +257,7 @@ class H264Decoder:
 
     def _made(self, picture: Any) -> Frame:
         frame = self._waiting.pop(picture.pts)
-        picture = picture.reformat(format=self._to) if self._to else picture
+        picture = converted(picture, self._to) if self._to else picture
         pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam._extras import load
 from smartcam._natural import natural
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_video
+from smartcam.frames._video.frames import CONVERTIBLE, Pixels, converted, from_video
 from smartcam.frames._video.jpegxl import is_jpegxl, read_jpegxl
 from smartcam.frames._video.redirects import follow_redirects
 
@@ -346,7 +346,7 @@ class VideoReading(PictureReading):
             return Pixels(wanted, context.width, context.height, 0, bytes(picture))
         try:
             if wanted is not None:
-                picture = picture.reformat(format=CONVERTIBLE[wanted.name])
+                picture = converted(picture, CONVERTIBLE[wanted.name])
             return from_video(picture)
         except FrameFormatError as exc:
             raise self.plan.wrong(f"{exc}; #format=RGB8 converts") from exc

@@ -164,13 +164,13 @@ def _repacked(video: Any) -> Any:
     parts = kind.components
     deep = max(part.bits for part in parts)
     alpha = any(part.is_alpha for part in parts)
-    if deep > 16 or kind.name.startswith("xyz"):
+    if deep > 16 or kind.name.startswith(("xyz", "bayer")):
         return video
     if kind.has_palette or kind.is_rgb or len(parts) == 2:
         to = ("rgba" if alpha or kind.has_palette else "rgb24", "rgba64le" if alpha else "rgb48le")
-        return video.reformat(format=to[deep > 8])
+        return converted(video, to[deep > 8])
     if len(parts) == 1:
-        return video.reformat(format=_wider_grey(kind.name, deep))
+        return converted(video, _wider_grey(kind.name, deep))
     return _with_supported_subsampling(video, deep, alpha=alpha)
 
 
@@ -213,13 +213,49 @@ def _chroma(video: Any) -> tuple[float, float]:
 def _same_colours(video: Any, name: str) -> Any:
     """Return a frame with the same samples in another layout."""
     full = video.format.name.startswith("yuvj")
-    return _with_colour_properties(video.reformat(format=name), video, full=full)
+    return _with_colour_properties(converted(video, name), video, full=full)
 
 
 def _with_colour_properties(made: Any, video: Any, *, full: bool) -> Any:
     made.color_range = FULL if full else video.color_range
     made.colorspace = video.colorspace
     return made
+
+
+def converted(video: Any, name: str) -> Any:
+    """Return a frame in another pixel format of FFmpeg.
+
+    Args:
+        video: frame of FFmpeg.
+        name: name of the format, such as ``rgb24``.
+
+    Raises:
+        FrameFormatError: FFmpeg does not convert between these formats.
+    """
+    kind, width = video.format, video.width
+    wide = -(-width // RIGHT_WIDTH) * RIGHT_WIDTH
+    padded = wide != width and not kind.has_palette and max(one.bits for one in kind.components) > 8
+    try:
+        made = (_resized(video, wide) if padded else video).reformat(format=name)
+    except (OSError, ValueError) as exc:
+        raise FrameFormatError(
+            f"FFmpeg's pixel format {kind.name}: no conversion to {name}: {exc}"
+        ) from exc
+    return _resized(made, width) if padded else made
+
+
+RIGHT_WIDTH: Final = 32
+"""Multiple of pixels at which FFmpeg converts wide rows of more than 8 bits right. In other widths
+it writes 8 samples of colour into Y, as measured with p010le of 641 x 481 in FFmpeg 8 (PyAV 18)."""
+
+
+def _resized(video: Any, width: int) -> Any:
+    """Return a copy with the rows cut off or filled up with zeros on the right."""
+    made = _new(width, video.height, video.format.name)
+    for to, plane in zip(made.planes, video.planes, strict=True):
+        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        _fill(to, rows[:, : min(to.line_size, plane.line_size)])
+    return _with_colour_properties(made, video, full=False)
 
 
 def _opaque(video: Any) -> bool:

@@ -122,7 +122,7 @@ def test_rotation_centre_residuals_show_a_bad_sight() -> None:
 
 
 def test_rotation_centre_of_a_part_that_hardly_turned_is_refused() -> None:
-    with refused("TOO_FEW", "two sights or more, got 1"):
+    with refused("TOO_FEW", "two localizations or more, got 1"):
         fit_rotation_centre(turned([0.3]))
     with refused("INSUFFICIENT_ROTATION", "a spread of 0.0998"):
         fit_rotation_centre(turned([0.3, 0.5]))
@@ -137,5 +137,5 @@ def test_tool_tip_of_poses_in_different_frames_is_refused() -> None:
 
 def test_rotation_centre_of_sights_in_different_frames_is_refused() -> None:
     sights = [part(0.1, 0.0), part(0.0, 0.1, 1.5, frame="other")]
-    with refused("WRONG_FRAME", "rotation centre: expected sights of one and the same frame"):
+    with refused("WRONG_FRAME", "expected localizations of one and the same frame"):
         fit_rotation_centre(sights)
