@@ -28,7 +28,16 @@ class Room(NamedTuple):
         return module in (self.modules or (self.title,))
 
 
-VALUES = ("models", "exceptions", "settings", "registry", "streams", "observers", "backoff")
+VALUES = (
+    "models",
+    "exceptions",
+    "settings",
+    "_settings_model",
+    "registry",
+    "streams",
+    "observers",
+    "backoff",
+)
 HELPERS = (
     *(
         "_accepting",

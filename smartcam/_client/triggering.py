@@ -280,6 +280,7 @@ class Triggers:
             and self._state.bits & _TELLS_AGAINST == _WAITING
             and (expected is None or expected == self._state.active)
             and request.input_data is None
+            and self._doubtful is None
             and not correlation.doubted
             and not correlation.owed
             and not self._commands.is_halted()

@@ -377,7 +377,7 @@ def test_part_that_may_be_turned_otherwise_is_in_doubt() -> None:
     taught = PartModel.teach(drawn(PlacedPart(shapes, *TAUGHT)), name="key")
     assert taught.symmetry.fold == 1
     assert taught.symmetry.alike
-    assert "must be in sight" in taught.symmetry.text()
+    assert "must be visible" in taught.symmetry.text()
     clear = drawn(PlacedPart(shapes, 98, 101, 0.3))
     (found,) = locate(Picture(clear), [taught], PartSearch(seconds=30.0)).parts
     assert not found.doubt
