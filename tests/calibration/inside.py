@@ -46,6 +46,7 @@ from smartcam.calibration._hand_eye.equations import (
     Setup,
     Solution,
     adjust,
+    bends,
     carried,
     sums,
     without_each,

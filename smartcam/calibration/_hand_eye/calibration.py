@@ -30,11 +30,11 @@ from smartcam.calibration._hand_eye.closed_forms import (
     second_turns,
 )
 from smartcam.calibration._hand_eye.equations import (
-    BENDS,
     PixelObservations,
     PoseObservations,
     RobotPoses,
     RobotSigmas,
+    bends,
     is_in_hand,
     pull,
 )
@@ -217,9 +217,10 @@ def calibrate_hand_eye(
     ordered, strays = without_strays(ordered, located, lens, given=camera is not None)
     located = [locate(one, lens) for one in ordered] if strays else located
     poses = Rigid.stacked(one.transform.rigid for one in located)
+    seen = _observations(ordered, located, lens)
     problem = Problem(
         robot=robot,
-        seen=_observations(ordered, located, lens),
+        seen=seen,
         poses=poses,
         given=_given(ordered),
         sigmas=_positive(robot_sigmas),
@@ -228,7 +229,7 @@ def calibrate_hand_eye(
     named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
     kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
     if own is not None:  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
-        kept += [5 + len(lens.distortion) + i for i in range(BENDS)]
+        kept += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
     free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
     free["scale and camera"] = (0, *free["camera"])
     if own is not None and adjust == "auto":
@@ -395,7 +396,7 @@ def _observations(
         mask = given[index]
         points[index, mask], pixels[index, mask] = one.object_points, one.points
         white[index, mask] = whitening(one.covariance, more)
-    return PixelObservations(white, camera, points, pixels)
+    return PixelObservations(white, camera, points, pixels, bends(points, given))
 
 
 def _allowed(free: Mapping[str, tuple[int, ...]], adjust: str) -> dict[str, tuple[int, ...]]:

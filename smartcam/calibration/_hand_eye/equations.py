@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
     Index = NDArray[np.intp] | slice
+    Mask = NDArray[np.bool_]
 
 Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 """Place of the camera: on the robot's hand, or beside the robot, looking at it."""
@@ -57,8 +58,8 @@ FIRST_DAMPING = 1e-6
 """Part of the diagonal that is added at first: closed forms are so near that hardly any damping is
 needed."""
 
-BENDS = 3
-"""Bends of a target that may be adjusted: heights that grow with x^2, x y and y^2."""
+MIN_OWN_SHARE_OF_BEND = 1e-3
+"""Least share of a bend's heights that no tilt of the target and no bend before it has."""
 
 ROUNDING_COST = 100.0
 """Squared standard deviations that are added to the cost with which a gain is compared, for
@@ -153,7 +154,7 @@ class Observations(ABC):
 
     whitening: Array  # matrices that make the errors independent, with a variance of 1
     # numbers of the parameters that are adjusted beside the poses, ascending: 0 is the target's
-    # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the K of the distortion, from 5 + K on three bends
+    # scale, 1 to 4 are fx, fy, cx, cy, from 5 on the K of the distortion, from 5 + K on bends
     free: tuple[int, ...] = field(default=(), kw_only=True)
 
     @property
@@ -195,11 +196,13 @@ class PixelObservations(Observations):
         model: the camera.
         points: (V, N, 3), on the target, metres.
         pixels: (V, N, 2).
+        heights: (V, N, B), of each point per metre of each bend, metres: see :func:`bends`.
     """
 
     model: CameraModel
     points: Array
     pixels: Array
+    heights: Array
 
     def taken(self, index: Index) -> PixelObservations:
         """Return some of the views."""
@@ -207,6 +210,7 @@ class PixelObservations(Observations):
             self,
             points=self.points[index],
             pixels=self.pixels[index],
+            heights=self.heights[index],
             whitening=self.whitening[index],
         )
 
@@ -219,7 +223,7 @@ class PixelObservations(Observations):
         """Return the camera with some of its parameters changed, (extra,)."""
         if not any(self.free):
             return self.model
-        return with_lens(self.model, lens_values(self.model) + self._full(change)[1:-BENDS])
+        return with_lens(self.model, lens_values(self.model) + self._full(change)[1 : self._lens])
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
         """Return whitened residuals (V, 2 N) and their derivatives (V, 2 N, 6 + extra).
@@ -240,32 +244,50 @@ class PixelObservations(Observations):
         there = linearize((near + seen.translation[:, None]).reshape(-1, 3), self.camera(change))
         moved = pose_changes(there.by_point, near.reshape(-1, 3))
         grown = there.by_point @ nominal.reshape(-1, 3, 1)
-        risen = self.scale(change) * seen.rotation[:, None, :, 2:] * self._heights()[:, :, None]
-        bent = there.by_point @ risen.reshape(-1, 3, BENDS)
+        risen = self.scale(change) * seen.rotation[:, None, :, 2:] * self.heights[:, :, None]
+        bent = there.by_point @ risen.reshape(views * count, 3, -1 if risen.size else 0)
         beside = np.concatenate([grown, there.by_lens, bent], axis=2)[:, :, list(self.free)]
         slopes = np.concatenate([moved, beside], axis=2).reshape(views, count, 2, -1)
         off = (there.pixels.reshape(views, count, 2) - self.pixels)[..., None]
         off, slopes = self.whitening @ off, self.whitening @ slopes
         return off.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
 
+    @property
+    def _lens(self) -> int:
+        """Number of the parameters up to the last one of the lens."""
+        return 5 + len(self.model.distortion)
+
     def _full(self, change: Array) -> Array:
-        full = np.zeros(5 + len(self.model.distortion) + BENDS)
+        full = np.zeros(self._lens + self.heights.shape[2])
         full[list(self.free)] = change
         return full
-
-    def _heights(self) -> Array:
-        """Return each point's height per metre of each bend, (V, N, BENDS): 0 in the mean."""
-        given = self.whitening.any(axis=(2, 3))
-        seen = self.points[given][:, :2]
-        x, y = np.moveaxis((self.points[..., :2] - seen.mean(axis=0)) / np.ptp(seen, axis=0), 2, 0)
-        heights = np.stack([x * x, x * y, y * y], axis=2)
-        return np.asarray(heights - heights[given].mean(axis=0), dtype=np.float64)
 
     def _bent(self, full: Array) -> Array:
         """Return the target's points with the bends of ``full`` made, (V, N, 3)."""
         points = self.points.copy()
-        points[..., 2] += self._heights() @ full[-BENDS:]
+        points[..., 2] += self.heights @ full[self._lens :]
         return points
+
+
+def bends(points: Array, given: Mask) -> Array:
+    """Return the heights of a target's points per metre of each bend, (V, N, B), 0 in the mean.
+
+    The bends grow with x^2, x y and y^2. One that is a tilt of the target or another bend at these
+    points is left out: four corners of a rectangle show one bend only.
+
+    ``points`` (V, N, 3) are those of all views, not all on one line, ``given`` (V, N) the mask of
+    those that were seen.
+    """
+    seen = points[given][:, :2]
+    x, y = np.moveaxis((points[..., :2] - seen.mean(axis=0)) / np.ptp(seen, axis=0), 2, 0)
+    known = [np.ones_like(x), x, y]
+    for bend in (x * x, x * y, y * y):
+        before = np.stack([one[given] for one in known], axis=1)
+        rest = bend[given] - before @ np.linalg.lstsq(before, bend[given], rcond=None)[0]
+        if np.linalg.norm(rest) > MIN_OWN_SHARE_OF_BEND * np.linalg.norm(bend[given]):
+            known.append(bend)
+    heights = np.stack(known, axis=2)[:, :, 3:]
+    return np.asarray(heights - heights[given].mean(axis=0), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

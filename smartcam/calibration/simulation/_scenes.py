@@ -204,7 +204,8 @@ class HandEyeScene:
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
         transforms = [self.seen(pose) for pose in self.robot_poses]
         pixels = [self.camera.project(one.apply(self.target.points)) for one in transforms]
-        seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels))
+        flat = np.zeros((len(points), count, 0))
+        seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels), flat)
         poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)
         noise = RobotNoise(robot_sigmas) if max(robot_sigmas) > 0 else None
         truth = Solution(self.camera_pose.rigid, self.target_pose.rigid, noise=noise)

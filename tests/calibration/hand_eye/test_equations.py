@@ -24,6 +24,7 @@ from tests.calibration.inside import (
     RobotPoses,
     Solution,
     adjust,
+    bends,
     carried,
     check_motion,
     solve_linear,
@@ -50,7 +51,8 @@ def pixels(
     before = points @ np.swapaxes(seen.rotation, 1, 2) + seen.translation[:, None]
     shown = model.project(before.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     white = np.broadcast_to(np.eye(2) / 0.1, (*points.shape[:2], 2, 2))
-    return PixelObservations(white, model, points, shown, free=free)
+    given = np.ones(points.shape[:2], dtype=np.bool_)
+    return PixelObservations(white, model, points, shown, bends(points, given), free=free)
 
 
 def poses(seen: Rigid, free: tuple[int, ...] = ()) -> PoseObservations:
@@ -120,16 +122,30 @@ def test_adjust_of_exact_samples_finds_the_truth(in_hand: bool, noise: RobotNois
 def test_adjust_of_a_bent_target_finds_its_bends() -> None:
     robot, camera, target, seen = problem(in_hand=True)
     observed = pixels(seen, free=(10, 11, 12))
-    bends = np.array([4e-4, -2e-4, 1e-4])
+    made = np.array([4e-4, -2e-4, 1e-4])
     x, y = ((SHEET.points[:, :2] - SHEET.points[:, :2].mean(axis=0)) / [0.12, 0.09]).T
-    raised = np.column_stack([x * x, x * y, y * y]) @ bends
+    raised = np.column_stack([x * x, x * y, y * y]) @ made
     bent = SHEET.points + np.outer(raised - raised.mean(), [0.0, 0.0, 1.0])
     shown = [CAMERA.project(bent @ turn.T + shift) for turn, shift in zip(*seen, strict=True)]
     found = adjust(
         robot, dataclasses.replace(observed, pixels=np.array(shown)), Solution(camera, target)
     )
     assert found.cost < 1e-9
-    np.testing.assert_allclose(found.change, bends, atol=1e-9)
+    np.testing.assert_allclose(found.change, made, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "count"), [(2, 2, 1), (3, 2, 2), (2, 3, 2), (3, 3, 3), (9, 6, 3)]
+)
+def test_bends_that_points_do_not_show_are_left_out(columns: int, rows: int, count: int) -> None:
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    points = np.tile(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * 0.02, (4, 1, 1))
+    turned = points @ exp_rotation(np.array([0.0, 0.0, 0.3])).T
+    for one, least in ((points, count), (turned, min(count, 3))):
+        heights = bends(one, np.ones(one.shape[:2], dtype=np.bool_))
+        flat = np.column_stack([np.ones(one[0].shape[0]), one[0][:, :2], heights[0]])
+        assert heights.shape[2] == least
+        assert np.linalg.matrix_rank(flat) == 3 + least
 
 
 def test_adjust_that_begins_behind_the_camera_has_no_cost() -> None:

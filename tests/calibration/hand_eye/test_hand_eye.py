@@ -244,6 +244,35 @@ def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> 
     assert {one.code for one in found.warnings} == {Code.SHEET_NOT_EXACT}
 
 
+@pytest.mark.filterwarnings("error")
+def test_hand_eye_of_four_points_with_its_own_lens_is_not_suspected() -> None:
+    """Four corners show one bend of the target; with two more nothing could be solved."""
+    board = Checkerboard(columns=9, rows=6, square=0.03)
+    truth = hand_eye_scene(
+        board,
+        CAMERA,
+        setup=SETUPS[0],
+        poses=12,
+        tilt=0.5,
+        distance=0.6,
+        random=np.random.default_rng(1),
+    )
+    poses, whole = truth.measured(
+        pixel_sigma=0.05, robot_sigmas=NOISE, random=np.random.default_rng(3)
+    )
+    corners = [0, 7, 32, 39]
+    views = [
+        dataclasses.replace(
+            one,
+            ids=one.ids[corners],
+            points=one.points[corners],
+            covariance=one.covariance[corners],
+        )
+        for one in whole
+    ]
+    assert not calibrate_hand_eye(poses, views, setup=SETUPS[0]).warnings
+
+
 @pytest.mark.judged
 @pytest.mark.parametrize("setup", ONE_LONG)
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
