@@ -40,6 +40,15 @@ accept."""
 MAX_NAME_CHARACTERS = 200
 """Largest number of characters of a camera's name from a user."""
 
+MAX_OPTION_SECONDS = 86_400.0
+"""Largest time limit among the options of a connection, seconds."""
+
+MAX_CONNECT_ATTEMPTS = 100
+"""Largest number of links that may be tried for a dialect."""
+
+MIN_PAYLOAD_LIMIT_BYTES = 16
+"""Least value of the largest payload that a client accepts."""
+
 MAX_SHOWN_LENGTH = 80
 """Largest number of characters of a wrong value that an error's text shows."""
 

@@ -10,21 +10,31 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, InstanceOf, create_model
 
-from smartcam._arguments import MAX_NAME_CHARACTERS, plain
+from smartcam._arguments import (
+    MAX_APPLICATION_ID,
+    MAX_CONNECT_ATTEMPTS,
+    MAX_DATA_BYTES,
+    MAX_NAME_CHARACTERS,
+    MAX_OPTION_SECONDS,
+    MIN_PAYLOAD_LIMIT_BYTES,
+    plain,
+)
 from smartcam.backoff import Backoff
 
 PLAIN = BeforeValidator(plain)
 """Lets a strict type take numbers and texts of any class, such as numpy's."""
 
-Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
-ApplicationId = Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF), PLAIN]
-Text = Annotated[str, Field(strict=True), PLAIN]
-Flag = Annotated[bool, Field(strict=True), PLAIN]
-
 
 def _integer(least: int, most: int) -> Any:
     return Annotated[int, Field(strict=True, ge=least, le=most), PLAIN]
 
+
+Seconds = Annotated[
+    float, Field(strict=True, gt=0, le=MAX_OPTION_SECONDS, allow_inf_nan=False), PLAIN
+]
+ApplicationId = Annotated[int, Field(strict=True, ge=0, le=MAX_APPLICATION_ID), PLAIN]
+Text = Annotated[str, Field(strict=True), PLAIN]
+Flag = Annotated[bool, Field(strict=True), PLAIN]
 
 OPTIONS: dict[str, tuple[Any, str]] = {
     "name": (
@@ -45,7 +55,7 @@ OPTIONS: dict[str, tuple[Any, str]] = {
     "y_down": (Flag, "the camera's y axis points down; turned to y up on the way in"),
     "lenient": (Flag, "any non-zero byte is a true bool"),
     "connect_timeout": (Seconds, "longest wait for a session, all attempts"),
-    "connect_attempts": (_integer(1, 100), "fresh links tried per dialect"),
+    "connect_attempts": (_integer(1, MAX_CONNECT_ATTEMPTS), "fresh links tried per dialect"),
     "switch_timeout": (Seconds, "longest wait for a switch"),
     "request_timeout": (Seconds, "longest wait for the answer to a request"),
     "close_timeout": (Seconds, "longest wait for an orderly end of the link"),
@@ -59,7 +69,10 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         "after a reconnect have the named application and the run state back that were wanted; "
         "else they are left as the camera has them",
     ),
-    "max_length": (_integer(16, 1 << 30), "largest payload accepted, bytes"),
+    "max_length": (
+        _integer(MIN_PAYLOAD_LIMIT_BYTES, MAX_DATA_BYTES),
+        "largest payload accepted, bytes",
+    ),
 }
 """Type of each option, and its description."""
 

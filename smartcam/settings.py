@@ -13,7 +13,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar, cast
 from urllib.parse import parse_qsl, quote, quote_plus, unquote, urlencode, urlsplit
 
-from smartcam._arguments import MAX_NAME_CHARACTERS, check_text, shown
+from smartcam._arguments import (
+    MAX_APPLICATION_ID,
+    MAX_CONNECT_ATTEMPTS,
+    MAX_DATA_BYTES,
+    MAX_NAME_CHARACTERS,
+    MAX_OPTION_SECONDS,
+    MIN_PAYLOAD_LIMIT_BYTES,
+    check_text,
+    shown,
+)
 from smartcam._suggestions import did_you_mean, hint
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
@@ -310,7 +319,9 @@ class CameraOptions(OtherOptions, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Options of one client. Times are seconds, each bounds one step.
+    """Options of one client, checked by :meth:`make` or :meth:`of`, which make it.
+
+    Times are seconds, each bounds one step.
 
     Attributes:
         given: names of the options that were given.
@@ -370,13 +381,13 @@ class CameraSettings:
 _UNUSUAL = object()
 """Stands for a value about which pydantic has to decide."""
 
-_SECONDS = (float, sys.float_info.min, 86_400.0)
+_SECONDS = (float, sys.float_info.min, MAX_OPTION_SECONDS)
 _BOUNDS: dict[str, tuple[type[float], float, float]] = {
     **dict.fromkeys(("y_down", "lenient", "restore"), (bool, 0, 1)),
     **{f"{of}_timeout": _SECONDS for of in ("connect", "switch", "request", "close", "liveness")},
-    "application": (int, 0, 0xFFFFFFFF),
-    "connect_attempts": (int, 1, 100),
-    "max_length": (int, 16, 1 << 30),
+    "application": (int, 0, MAX_APPLICATION_ID),
+    "connect_attempts": (int, 1, MAX_CONNECT_ATTEMPTS),
+    "max_length": (int, MIN_PAYLOAD_LIMIT_BYTES, MAX_DATA_BYTES),
 }
 """Type, least and largest value of options that are numbers or truth values."""
 
