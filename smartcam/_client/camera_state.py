@@ -67,7 +67,7 @@ class CameraState:
         self.loads_by_others: int = 0
         self.statuses_received: int = 0
         self.status_asked_at: float = 0.0
-        self._statuses_due = 0  # number of statuses received once all requests are answered
+        self._statuses_due = 0
         self._name = name
         self._listeners = listeners
         self._last_status: int | None = None  # the last status of this session
@@ -121,10 +121,15 @@ class CameraState:
         """True if a request for the status is not answered yet."""
         return self.statuses_received < self._statuses_due
 
+    @property
+    def statuses_due(self) -> int:
+        """Number of statuses received once all requests are answered."""
+        return max(self._statuses_due, self.statuses_received)
+
     def status_asked(self, now: float, count: int = 1) -> None:
         """Note ``count`` requests for the status, whose answers are pending."""
         self.status_asked_at = now
-        self._statuses_due = max(self._statuses_due, self.statuses_received) + count
+        self._statuses_due = self.statuses_due + count
 
     def status_lost(self) -> None:
         """Note that the pending statuses will not come."""

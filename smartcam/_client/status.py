@@ -141,18 +141,21 @@ class StatusRequests:
     async def refresh(self, deadline: float) -> None:
         """Get the present status, if it can be requested.
 
+        An answer to a request from before this call does not count: it may be older than the call.
+
         Raises:
             ResponseTimeoutError: the camera did not send it.
         """
-        connection = self._connection
+        connection, state = self._connection, self._state
         if not connection.dialect.has(m.GetStatus):
             return
-        heard = self._state.statuses_received
+        older = state.statuses_due
         while True:  # a datagram may be lost
             self._requests.ask_status()
             await self._requests.fence(deadline)
-            if self._state.statuses_received != heard:
+            if state.statuses_received > older:
                 return
+            older = state.statuses_received  # answers that the fence did not bring are lost
             await self.pause(deadline, "the camera to tell its status")
 
     async def pause(self, deadline: float, what: str) -> None:

@@ -619,6 +619,21 @@ async def test_bid_query_status_whose_answer_is_lost_asks_again(transport: str) 
         assert await camera.query_status() == Status.RUNNING
 
 
+@TRANSPORTS
+async def test_bid_query_status_takes_no_answer_to_an_earlier_request(transport: str) -> None:
+    async with bid_by_hand(box={"transport": transport}) as (box, camera):
+        answer, late = box.script[STATUS], box.status_frame(BID_IDLE)
+        box.script[STATUS] = quiet
+        asked = box.ids.count(STATUS)
+        earlier = asyncio.create_task(camera.query_status())
+        await until(lambda: box.ids.count(STATUS) > asked)
+        await cancelled(earlier)
+        box.status = BID_READY
+        lates = iter([late])  # the answer to the second request is lost
+        box.script[STATUS] = lambda payload: next(lates, b"") or answer(payload)
+        assert await camera.query_status() == Status.RUNNING
+
+
 async def test_bid_wait_ready_asks_and_waits_within_one_timeout() -> None:
     async with bid_by_hand() as (box, camera):
         silences = iter([True] * 4)
