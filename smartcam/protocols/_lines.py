@@ -607,8 +607,9 @@ class LineMachine:
     ) -> None:
         """Send a request, or queue it; write :meth:`data_to_send` next.
 
-        A Get status whose answer is pending is not repeated: it is new enough. Disconnect sends
-        nothing, it ends the connection. A request without an answer is sent at once.
+        A Get status that is queued already is not repeated: its answer will be new enough; that of
+        one already sent may not be. Disconnect sends nothing, it ends the connection. A request
+        without an answer is sent at once.
 
         Raises:
             LocalProtocolError: not in this state, or an answer of the same kind is pending.
@@ -626,9 +627,11 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        if any(row.request is one.row.request and not one.question for one in self._open):
-            if kind is m.GetStatus:
+        same = [one for one in self._open if one.row.request is row.request and not one.question]
+        if kind is m.GetStatus:
+            if not all(one.sent for one in same):
                 return
+        elif same:
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
         if kind is m.Trigger and self._query is not None:
             self._ask_application(trigger=True)

@@ -348,6 +348,14 @@ def test_get_status_in_line_is_not_repeated() -> None:
     assert talk.hear(b"1\r\n") == b""
 
 
+def test_get_status_is_repeated_behind_one_that_was_sent() -> None:
+    talk = Talk().logged_in()
+    assert talk.send(m.GetStatus()) == b"GO\r\n"
+    assert talk.send(m.GetStatus()) + talk.send(m.GetStatus()) == b""
+    assert talk.hear(b"1\r\n") == b"GO\r\n"
+    assert talk.hear(b"0\r\n") == b""
+
+
 @pytest.mark.parametrize("name", ["a\r\nSO1", "\u65e5\u672c.job", "x" * MAX_LINE_BYTES, "a\0b"])
 def test_load_file_that_cannot_be_sent_is_refused_and_changes_nothing(name: str) -> None:
     talk = Talk().logged_in()

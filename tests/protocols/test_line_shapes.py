@@ -214,6 +214,26 @@ def test_containers_say_whether_a_trigger_has_asked_for_them() -> None:
     assert [one.asked for one in made.events()] == [False, True, False]  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize(
+    ("dialect", "answer", "sent"),
+    [(ECHO, b"RS,OK\n", [b"RS\n"]), (AT_ONCE, b"", [b"||2>STATE\n", b"||3>STATE\n"])],
+)
+def test_status_is_requested_again_behind_a_request_that_was_sent(
+    dialect: LineDialect, answer: bytes, sent: list[bytes]
+) -> None:
+    made = machine(dialect)
+    made.send(m.GetStatus())
+    made.send(m.GetStatus())
+    assert made.data_to_send() == sent
+    if answer:
+        made.send(m.GetStatus())  # one is queued
+        made.receive_data(answer)
+        assert made.data_to_send() == [b"RS\n"]
+        made.receive_data(answer)
+        assert made.data_to_send() == []
+        assert len(made.events()) == 2
+
+
 def test_answer_of_several_lines_has_a_bound() -> None:
     made = machine(SEVERAL, max_length=100)
     made.send(m.Trigger())

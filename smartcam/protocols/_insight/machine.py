@@ -260,8 +260,9 @@ class InSightMachine:
     ) -> None:
         """Queue a request; write :meth:`data_to_send` next.
 
-        A Get status that is queued already is not repeated: its answer is new enough. Disconnect
-        sends nothing: the connection ends, and waiting requests are dropped.
+        A Get status that is queued already is not repeated: its answer will be new enough; that of
+        one already sent may not be. Disconnect sends nothing: the connection ends, and waiting
+        requests are dropped.
 
         Raises:
             LocalProtocolError: there is no session, or an answer of the same kind is pending.
@@ -279,11 +280,14 @@ class InSightMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        elif kind not in {job.kind for job in (self._job, *self._waiting) if job is not None}:
-            self._waiting.append(_PendingRequest(kind, self._scripts[kind](message)))
-            self._begin_next()
-        elif kind is not m.GetStatus:
-            raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
+        else:
+            queued = kind in {job.kind for job in self._waiting}
+            running = self._job is not None and self._job.kind is kind
+            if kind is not m.GetStatus and (queued or running):
+                raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
+            if not queued:
+                self._waiting.append(_PendingRequest(kind, self._scripts[kind](message)))
+                self._begin_next()
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
