@@ -149,14 +149,15 @@ class StatusRequests:
         connection, state = self._connection, self._state
         if not connection.dialect.has(m.GetStatus):
             return
-        older = state.statuses_due
-        while True:  # a datagram may be lost
+        older, before = state.statuses_due, state.statuses_received
+        while True:
             self._requests.ask_status()
             await self._requests.fence(deadline)
             if state.statuses_received > older:
                 return
-            older = state.statuses_received  # answers that the fence did not bring are lost
-            await self.pause(deadline, "the camera to tell its status")
+            if state.statuses_received == before:  # a datagram may be lost
+                await self.pause(deadline, "the camera to tell its status")
+            older = before = state.statuses_received  # earlier answers have come or are lost
 
     async def pause(self, deadline: float, what: str) -> None:
         """Wait a moment before the camera is asked again.
