@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Callable, Coroutine
 from datetime import datetime
 from typing import Any
@@ -28,6 +29,7 @@ from smartcam import (
 from tests.client.camera_by_hand import (
     BID_IDLE,
     BID_READY,
+    BID_SIMULATION,
     BID_TRIGGER_ERROR,
     CONNECT,
     DISCONNECT,
@@ -63,6 +65,14 @@ from tests.insides import inside
 
 TRANSPORTS = pytest.mark.parametrize("transport", ["tcp", "udp"])
 IDLE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+STATUSES = {
+    BID_IDLE: IDLE,
+    BID_READY: Status.RUNNING,
+    0: Status.RUNNING | Status.BUSY,
+    BID_IDLE | BID_SIMULATION: IDLE | Status.SIMULATION_MODE,
+    BID_READY | BID_SIMULATION: Status.RUNNING | Status.SIMULATION_MODE,
+    BID_SIMULATION: Status.RUNNING | Status.BUSY | Status.SIMULATION_MODE,
+}
 
 
 def codes(box: HandmadeBid, message_id: int, *given: int) -> Callable[[bytes], bytes]:
@@ -632,6 +642,42 @@ async def test_bid_query_status_takes_no_answer_to_an_earlier_request(transport:
         lates = iter([late])  # the answer to the second request is lost
         box.script[STATUS] = lambda payload: next(lates, b"") or answer(payload)
         assert await camera.query_status() == Status.RUNNING
+
+
+@pytest.mark.parametrize(
+    "seed", [11, *(pytest.param(one, marks=pytest.mark.long) for one in range(10))]
+)
+async def test_bid_query_status_is_never_older_than_its_call(seed: int) -> None:
+    """Answers are lost or come late, and calls are cancelled."""
+    chance, late, codes = random.Random(seed), list[bytes](), [BID_IDLE]  # noqa: S311
+
+    def arriving() -> bytes:
+        arrived, late[:] = b"".join(late), []
+        return arrived
+
+    def answer(_: bytes) -> bytes:
+        codes.append(chance.choice([one for one in STATUSES if one != codes[-1]]))
+        frame, fate = box.said(STATUS, codes[-1]), chance.random()
+        if fate > 0.5:
+            return arriving() + frame
+        late.extend([frame] * (fate > 0.2))
+        return b""
+
+    async with bid_by_hand(box={"transport": "udp"}) as (box, camera), camera.statuses():
+        query = box.script[QUERY]
+        box.script[STATUS] = answer
+        box.script[QUERY] = lambda payload: (
+            (arriving() if chance.random() < 0.5 else b"") + query(payload)
+        )
+        for _ in range(60):
+            known = len(codes) - 1
+            task = asyncio.create_task(camera.query_status())
+            if chance.random() < 0.5:
+                await steps(chance.randrange(12))
+                task.cancel()
+            status = (await asyncio.gather(task, return_exceptions=True))[0]
+            if isinstance(status, Status):
+                assert status in {STATUSES[code] for code in codes[known:]}
 
 
 async def test_bid_wait_ready_asks_and_waits_within_one_timeout() -> None:
