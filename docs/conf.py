@@ -833,21 +833,51 @@ def _which_frame(
     return named(signature), named(gives)
 
 
+class _Returned(typing.NamedTuple):
+    """A class that functions return and no module exports.
+
+    Attributes:
+        lines: its docstring, and what its methods do.
+        gives: words in the types that its methods return.
+    """
+
+    lines: list[str]
+    gives: frozenset[str]
+
+
 @functools.cache
-def _returned_classes() -> dict[str, list[str]]:
-    """Return the docstrings of classes that functions return and no module exports, in lines."""
+def _returned_classes() -> dict[str, _Returned]:
+    """Return the classes that no module exports and that have attributes or methods to tell."""
     exported: set[str] = set()
-    found: dict[str, list[str]] = {}
+    found: dict[str, _Returned] = {}
     for path in sorted((ROOT / "smartcam").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                text = ast.get_docstring(node) or ""
-                if "\nAttributes:\n" in text:
-                    found[node.name] = text.splitlines()
+                text, (methods, gives) = ast.get_docstring(node) or "", _methods(node)
+                if "\nAttributes:\n" in text or methods:
+                    found[node.name] = _Returned([*text.splitlines(), *methods], gives)
             elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
                 exported.update(ast.literal_eval(node.value) if path.stem != "_inside" else ())
-    return {name: lines for name, lines in found.items() if name not in exported}
+    return {name: one for name, one in found.items() if name not in exported}
+
+
+def _methods(node: ast.ClassDef) -> tuple[list[str], frozenset[str]]:
+    """Return a list of a class' public methods and properties, and words of what they return."""
+    lines: list[str] = []
+    gives: set[str] = set()
+    for one in node.body:
+        if not isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if one.name[0] != "_" or one.name in {"__getitem__", "__aiter__", "__anext__"}:
+            gives.update(re.findall(r"\w+", ast.unparse(one.returns) if one.returns else ""))
+        text = (ast.get_docstring(one) or "").partition("\n\n")[0]
+        if text and one.name[0] != "_":
+            is_property = any(getattr(mark, "id", "") == "property" for mark in one.decorator_list)
+            taken = ast.unparse(one.args).removeprefix("self").removeprefix(", ")
+            given = "" if is_property else f"({taken})"
+            lines.append(f"- ``{one.name}{given}``: {' '.join(text.split())}")
+    return (["", *lines] if lines else []), frozenset(gives)
 
 
 def _tell_returned(
@@ -855,10 +885,16 @@ def _tell_returned(
 ) -> None:
     """Add what a function returns, where that class has no place of its own in the reference."""
     gives = getattr(getattr(member, "fget", member), "__annotations__", {}).get("return")
-    for name in re.findall(r"\w+", str(gives or "")):
-        if name in _returned_classes():
-            first, *rest = _returned_classes()[name]
+    waiting = re.findall(r"\w+", str(gives or ""))
+    told: set[str] = set()
+    while waiting:
+        name = waiting.pop(0)
+        if name in _returned_classes() and name not in told:
+            told.add(name)
+            one = _returned_classes()[name]
+            first, *rest = one.lines
             lines += ["", f"``{name}``: {first}", *rest]
+            waiting += sorted(one.gives)
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:

@@ -282,10 +282,6 @@ ConformanceOptions.__init__  url: text, application: integer or None,
     switch_timeout: seconds, reboot_timeout: seconds, sequence_offset: integer or None,
     input_data: bytes or None
 judge  options: object, names: not judged
-perform  client: object, scene: object, dialect: choice or None, transport: choice or None,
-    timeout: seconds
-CommandClient.__init__  command: text, cwd: text or None
-FunctionClient.__init__  function: function
 Layout.__init__  text: text, lenient: flag, start: integer
 load_fleet  path: text
 load_scenario  path: text, dialect: text or None
@@ -404,11 +400,10 @@ NOT_HERE: dict[str, str] = {
         DeviceFeatures FrameSource.trigger_failed FrameSource.watch_events
         FrameSource.wait_until_streaming Outlet OutletDesk Outlets.offer_result
         Outlets.offer_error Outlets.state_changed Device.handle Device.watch LineClient
-        LineCamera TicketedClient TicketedCamera CommandClient.arguments
-        CommandClient.perform FunctionClient.perform Recorder.describe Recorder.on_error
+        LineCamera TicketedClient TicketedCamera Recorder.describe Recorder.on_error
         Recorder.on_frame Recorder.on_result Recorder.on_raw_frame Recorder.on_results
         Recorder.on_picture BagRecorder.on_picture Tool Recorder.on_state
-        BagRecorder.on_frame ReplayedCamera.received Scene Task ClientConformance
+        BagRecorder.on_frame ReplayedCamera.received Task ClientConformance
         CameraConformance EmulatedCamera.application_of EmulatedCamera.from_scenario
         EmulatedCamera.lost EmulatedCamera.make_machine EmulatedCamera.mistake
         EmulatedCamera.received EmulatedCamera.serves EmulatedCamera.state_options

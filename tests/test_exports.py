@@ -26,7 +26,7 @@ PUBLIC = [
     "ConnectionClosedError", "ConnectionLostError", "ConnectionTakenError", "Disconnected",
     "EntryRefusedError", "FrameError", "FrameFeatureError", "FrameFormatError", "FrameLostError",
     "FrameSourceError", "FrameTimeoutError",
-    "Header", "Histogram", "InputContainerError", "InspectionError", "InterpretationError",
+    "Header", "InputContainerError", "InspectionError", "InterpretationError",
     "Layout",
     "LayoutError", "LinkError", "LocalProtocolError", "Localization", "MessageError",
     "MissingExtraError", "NotAllowedError", "NotRunningError", "NoticeReceived", "Observer",

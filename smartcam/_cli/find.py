@@ -19,8 +19,7 @@ from smartcam._extras import from_part
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
-    from smartcam.doctor import FoundPort
-    from smartcam.doctor._inside import CameraSearch
+    from smartcam.doctor._inside import CameraSearch, FoundPort
 
 DEFAULT_ADDRESSES, MAX_ADDRESSES = 65_536, 1 << 24
 MAX_OPEN_CONNECTIONS, MAX_OPENINGS_PER_SECOND, MAX_SECONDS = 1_000, 10_000.0, 60.0

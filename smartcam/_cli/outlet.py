@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 async def outlet(url: str, file: str, options: Options) -> None:
     """Deliver results."""
     from smartcam._cli.live import have_open
-    from smartcam.outlets import Outlets, OutletsFile
+    from smartcam.outlets import Outlets
+    from smartcam.outlets._inside import OutletsFile
 
     found = OutletsFile.load(file)
     source = _OutletSource(options)

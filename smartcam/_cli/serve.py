@@ -54,10 +54,10 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
 async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
     """Share cameras."""
     import smartcam.fleet
-    from smartcam.fleet._inside import raise_descriptor_limit
+    from smartcam.fleet._inside import fleet_schema, raise_descriptor_limit
 
     if schema:
-        click.echo(json.dumps(smartcam.fleet.fleet_schema(), indent=2))
+        click.echo(json.dumps(fleet_schema(), indent=2))
         return
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.frames import FrameSource
-    from smartcam.inspection import Inspection, Teaching
+    from smartcam.inspection import Inspection
+    from smartcam.inspection._inside import Teaching
     from smartcam.web import TeachSite
 
 LINGER: Final = 3.0
@@ -72,7 +73,7 @@ async def teach(
 ) -> None:
     """Serve the page, or carry out the options."""
     with from_part("inspection", "smartcam teach needs"):
-        from smartcam.inspection import Teaching
+        from smartcam.inspection._inside import Teaching
 
     teaching = Teaching(cell, camera, which)
     files = [file for one in pictures for file in picture_files(Path(one))]

@@ -16,7 +16,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_target, takes
 from smartcam._arguments import shown
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -8,7 +8,7 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.layout._classes import describes_layout, read_class
-    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, misfit
+    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit
     from smartcam.layout._texts import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
     from smartcam.layout._yaml_files import read_model
@@ -19,6 +19,7 @@ __all__ = [
     "TYPES",
     "UNITS",
     "BadYamlError",
+    "Field",
     "ShownUnits",
     "compose",
     "describes_layout",
@@ -35,7 +36,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_classes": "describes_layout read_class",
-            "_text": "SI_SYMBOLS TYPES UNITS misfit",
+            "_text": "Field SI_SYMBOLS TYPES UNITS misfit",
             "_texts": "pack_texts",
             "_units": "ShownUnits units_of",
             "_yaml_files": "read_model",

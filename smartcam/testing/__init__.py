@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.testing._logs import CameraLog
     from smartcam.testing._suites.interpreters import ContainerSample, InterpreterSuite
     from smartcam.testing._suites.protocols.cameras_under_test import (
         CameraKind,
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Came",
     "CameraKind",
-    "CameraLog",
     "CameraSuite",
     "ContainerSample",
     "Conversation",
@@ -48,7 +46,6 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_logs": "CameraLog",
             "_suites.interpreters": "ContainerSample InterpreterSuite",
             "_suites.protocols.cameras_under_test": "CameraKind LiveCamera",
             "_suites.protocols.conversations": "Came Conversation Sent",

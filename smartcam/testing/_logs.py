@@ -31,8 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.emulator import LogEntry
-    from smartcam.emulator._inside import Visit
+    from smartcam.emulator._inside import LogEntry, Visit
 
 Expected: TypeAlias = "type[m.Message] | m.Message | str | int"
 """A message type or its name, a message with all its fields, or a message id."""

@@ -15,8 +15,7 @@ import pytest
 
 from smartcam._cli import find as command
 from smartcam._cli.find import fleet_lines, telling
-from smartcam.doctor import FoundPort
-from smartcam.doctor._inside import CameraSearch
+from smartcam.doctor._inside import CameraSearch, FoundPort
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run

@@ -8,9 +8,17 @@ import threading
 
 import pytest
 
-from smartcam.conformance.client import CommandClient, FunctionClient, Outcome, Task
+from smartcam.conformance.client import Task
 from smartcam.exceptions import ConfigurationError
-from tests.conformance.inside import read_results
+from tests.argument_table import KINDS, ODD
+from tests.conformance.inside import (
+    SCENES,
+    CommandClient,
+    FunctionClient,
+    Outcome,
+    perform,
+    read_results,
+)
 from tests.conformance.pace import at_any_pace, slowed
 
 pytestmark = pytest.mark.real_time
@@ -65,6 +73,41 @@ def test_command_without_task_or_address_is_refused(template: str) -> None:
 def test_command_with_an_open_quotation_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="No closing quotation"):
         CommandClient("./mine '{url} {task}")
+
+
+@pytest.mark.parametrize("odd", sorted(ODD.keys() - KINDS["text"] - {"list"}))
+def test_odd_command_is_refused(odd: str) -> None:
+    with pytest.raises(ConfigurationError):
+        CommandClient(ODD[odd])
+    if odd != "None":
+        with pytest.raises(ConfigurationError):
+            CommandClient("x {task} {url}", cwd=ODD[odd])
+
+
+@pytest.mark.parametrize("odd", sorted(ODD))
+def test_odd_function_is_refused(odd: str) -> None:
+    with pytest.raises(ConfigurationError):
+        FunctionClient(ODD[odd])
+
+
+@pytest.mark.parametrize(
+    ("argument", "odd"),
+    [
+        (argument, odd)
+        for argument, kind in [
+            ("client", "object"),
+            ("scene", "object"),
+            ("dialect", "choice or None"),
+            ("transport", "choice or None"),
+            ("timeout", "seconds"),
+        ]
+        for odd in sorted(ODD.keys() - KINDS[kind])
+    ],
+)
+async def test_odd_argument_of_a_run_is_refused(argument: str, odd: str) -> None:
+    given = {"client": FunctionClient(lambda _: []), "scene": SCENES["trigger"]}
+    with pytest.raises(ConfigurationError):
+        await perform(**{**given, argument: ODD[odd]})
 
 
 # ---------------------------------------------------------------------- what it prints

@@ -11,8 +11,8 @@ import pytest
 
 import smartcam
 from smartcam import Backoff, ConfigurationError
-from smartcam.doctor import FoundPort, _search
-from smartcam.doctor._inside import CameraSearch
+from smartcam.doctor import _search
+from smartcam.doctor._inside import CameraSearch, FoundPort
 from smartcam.doctor._opening import MAX_SAID_BYTES, Opened, is_own
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Protocol, Transport

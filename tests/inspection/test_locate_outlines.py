@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection import PartModel, Picture, TeachingError, TeachingTrouble
+from smartcam.inspection import PartModel, Picture, TeachingError
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, photograph, shares
+from tests.inspection.inside import TeachingTrouble
 from tests.inspection.proofs.locate import PartSearch, locate
 
 ezdxf: Any = pytest.importorskip("ezdxf", reason="needs the extra inspection")

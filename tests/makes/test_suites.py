@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from smartcam.exceptions import FrameError
-from smartcam.makes import IV3, PCIC, SR
+from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Status
 from smartcam.protocols import LineCommand, LineReply
 from smartcam.protocols import messages as m
@@ -46,7 +46,7 @@ V3_SESSION = (
 
 
 class TestPcicWire(WireSuite):
-    protocol = PCIC
+    protocol = EmulatedIfm.protocol
     conversations = (
         Conversation(
             name="a trigger by its ticket, and what the device says meanwhile",
@@ -183,7 +183,7 @@ class TestPcicWire(WireSuite):
 
 
 class TestIv3Wire(WireSuite):
-    protocol = IV3
+    protocol = EmulatedIv3.protocol
     conversations = (
         Conversation(
             name="triggers, programs and errors",
@@ -240,7 +240,7 @@ class TestIv3Wire(WireSuite):
 
 
 class TestSrWire(WireSuite):
-    protocol = SR
+    protocol = EmulatedSr.protocol
     conversations = (
         Conversation(
             name="readings, with other answers between",

@@ -16,8 +16,7 @@ import pytest
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
-from smartcam.outlets import StoreQuestion
-from smartcam.outlets._inside import read_store
+from smartcam.outlets._inside import StoreQuestion, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
 from tests.outlets.outletkit import FarEnd, ListOutlet, until

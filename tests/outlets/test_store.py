@@ -17,8 +17,8 @@ import pytest
 from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
 from smartcam.models import PoseSigma
-from smartcam.outlets import OutletDesk, OutletEntry, Outlets, StoreQuestion
-from smartcam.outlets._inside import columns_of, read_store
+from smartcam.outlets import OutletDesk, OutletEntry, Outlets
+from smartcam.outlets._inside import StoreQuestion, columns_of, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import result, until
 

@@ -22,9 +22,9 @@ from smartcam.protocols import (
     TicketedDialect,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import unread
 from smartcam.registry import PROTOCOLS
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 

@@ -11,11 +11,12 @@ import pytest
 
 import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, SmartCamError
-from smartcam.ros2 import CameraNode, CameraNodeOptions, Node, RosParameters
+from smartcam.ros2 import CameraNode, CameraNodeOptions, Node
 from smartcam.ros2._inside import LATCHED, OK
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import Plant
 from tests.processes import free_place
+from tests.ros2.inside import RosParameters
 from tests.ros2.nodekit import COUNTER, FAST, NAME, OTHER, NotedNode, away, box, seen, until
 from tests.ros2.roskit import make_node, soon, way
 

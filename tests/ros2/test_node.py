@@ -23,8 +23,8 @@ from smartcam.exceptions import (
     ServiceCallError,
     ServiceTimeoutError,
 )
-from smartcam.ros2 import Node, QoS, RosContext
-from smartcam.ros2._inside import LATCHED
+from smartcam.ros2 import Node, QoS
+from smartcam.ros2._inside import LATCHED, RosContext
 from smartcam.testing import LinkProxy
 from tests.processes import free_place
 from tests.ros2.inside import Attachment

@@ -13,9 +13,9 @@ import pytest
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
-from smartcam.protocols import BVS, INSIGHT, Transport
+from smartcam.protocols import BVS, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, ONLINE
+from smartcam.protocols._inside import HANDBOOK, INSIGHT, ONLINE
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.conversations import Step
 from tests import ROOT

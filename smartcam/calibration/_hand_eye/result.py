@@ -21,8 +21,8 @@ from smartcam.calibration._verdict import (
     judge,
 )
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import CameraModel, Code, Transform
-from smartcam.geometry._inside import Array, as_motion, as_points, check_finite
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, as_motion, as_points, check_finite
 from smartcam.models import Pose
 
 if TYPE_CHECKING:

@@ -33,8 +33,8 @@ from smartcam.calibration._lens.suspicions import examined
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._views import TargetView, as_list, as_views, label
-from smartcam.geometry import CameraModel, Code, Remark, Transform
-from smartcam.geometry._inside import Array, Rigid, check_choice
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, Remark, Rigid, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

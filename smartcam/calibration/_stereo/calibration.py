@@ -39,8 +39,8 @@ from smartcam.calibration._stereo.start import (
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
 from smartcam.calibration._views import TargetView, as_covariances, as_list, label
-from smartcam.geometry import CameraModel, Code, Remark, Transform
-from smartcam.geometry._inside import Array, as_points, check_choice
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, Remark, as_points, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -13,8 +13,7 @@ from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
 from smartcam.calibration._views import TargetView, as_list
-from smartcam.geometry import Code
-from smartcam.geometry._inside import IDENTITY, Rigid
+from smartcam.geometry._inside import IDENTITY, Code, Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

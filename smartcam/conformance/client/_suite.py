@@ -73,8 +73,8 @@ class ClientConformance:
     not fail its test; the plugin ``smartcam`` shows it at the end.
 
     Attributes:
-        command: program and arguments, see :class:`~smartcam.conformance.client.CommandClient`;
-            None for ``--client-command``.
+        command: program and arguments, in which ``{task}``, ``{host}``, ``{port}``, ``{url}``,
+            ``{transport}`` and ``{dialect}`` are replaced; None for ``--client-command``.
         dialects: names of the dialects that the client speaks.
         transports: names of the transports that the client can use.
         timeout: seconds for a task. A client's own timeouts must end within it.

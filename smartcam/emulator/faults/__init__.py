@@ -62,7 +62,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 __all__ = [
-    "FAULTS",
     "BusyForEver",
     "ChangeByteOrder",
     "ClearFaults",
@@ -75,7 +74,6 @@ __all__ = [
     "Drop",
     "Duplicate",
     "ExtraResult",
-    "Fault",
     "HalfOpen",
     "Insert",
     "LateResult",
@@ -92,7 +90,6 @@ __all__ = [
     "SecondClient",
     "Split",
     "Truncate",
-    "make_faults",
 ]
 
 MAX_FAULTS = 10_000

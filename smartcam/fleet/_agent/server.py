@@ -225,8 +225,7 @@ class FleetServer(Server):
         domain: int | None = None
         if self.file.ros2 is not None:
             with from_part("ros2", '"ros2:" in a fleet file needs'):
-                from smartcam.ros2 import RosContext
-                from smartcam.ros2._inside import SETTINGS
+                from smartcam.ros2._inside import SETTINGS, RosContext
 
             settings |= SETTINGS
             domain = RosContext(domain=self.file.ros2.domain).domain

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames import FrameSource
     from smartcam.geometry import CameraModel
-    from smartcam.inspection import CellCamera
+    from smartcam.inspection._inside import CellCamera
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
@@ -642,13 +642,13 @@ def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamer
         MissingExtraError: a package that it needs is not installed.
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection import Software, make_camera
+        from smartcam.inspection._inside import Software, make_camera
     return make_camera(name, validated(Software, given, f"{name}: software"), folder)
 
 
 def _of_software(name: str, given: dict[str, Any], folder: Path) -> Iterator[Mistake]:
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection import Software, software_mistakes
+        from smartcam.inspection._inside import Software, software_mistakes
     try:
         software = Software.model_validate(given)
     except ValidationError as exc:

@@ -54,7 +54,7 @@ from smartcam.models import (
     StatusChanged,
     ValueT,
 )
-from smartcam.protocols import Counters
+from smartcam.protocols._inside import Counters
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:

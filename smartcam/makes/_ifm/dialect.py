@@ -25,9 +25,9 @@ from smartcam.protocols import (
     TicketedDialect,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import unread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Mapping

@@ -26,9 +26,9 @@ from smartcam.protocols import (
     Protocol,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import unread
 
 if TYPE_CHECKING:
     from collections.abc import Generator

@@ -13,13 +13,13 @@ from smartcam import CalibrationError
 from smartcam.calibration import (
     Checkerboard,
     CircleGrid,
-    Code,
     StereoCalibration,
     Transform,
     calibrate_stereo,
 )
 from smartcam.calibration._stereo.errors import spacing_errors
 from smartcam.calibration._stereo.start import Lenses, as_moments, start
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, remark_sides
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused

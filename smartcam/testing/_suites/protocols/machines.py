@@ -16,9 +16,9 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     UnsupportedError,
 )
-from smartcam.protocols import Counters, Frame, LinkEnded, LinkFailed, State, Transport, Verdict
+from smartcam.protocols import Frame, LinkEnded, LinkFailed, State, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import ResultBurst
+from smartcam.protocols._inside import Counters, ResultBurst
 from smartcam.testing._suites.protocols.conversations import Came, Player, Sent
 from smartcam.testing._suites.protocols.dialects import see_spelled
 from smartcam.testing._suites.protocols.parameters import Parameters
