@@ -234,7 +234,7 @@ Fleet.stored_results  pattern: pattern, since: function or None, failed: flag, m
     timeout: seconds
 Fleet.trigger  pattern: url, timeout: seconds
 Outlets.__init__  section: mapping, folder: text, columns: function, command: function or None,
-    cameras: function, names: function, tell: function
+    cameras: function, names: function, on_trouble: function
 Outlets.stored  question: object
 Fleet.url_of  name: text
 fleet.open  place: url, connect_timeout: seconds
@@ -386,7 +386,7 @@ NOT_HERE: dict[str, str] = {
         FrameTrigger AwaitedTrigger FrameFeatures.__init__ FrameFeature.__init__ FoundSource
         Frame FrameSet PixelFormat ReaderStatistics SourceStatistics FrameAddress Finding
         FoundPort H264Encoder H264Decoder Camera.__init__ SmartCamera.__init__
-        Recording.__init__ FleetCamera.__init__ FleetCamera.agent_left FleetCamera.attend
+        Recording.__init__ FleetCamera.__init__ FleetCamera.agent_left FleetCamera.follow
         Fleet.__init__ FrameReader.__init__ SyncCameraBase.__init__
         SyncSubscription.__init__ SyncFrameReaderBase SyncFrameReader CameraLog.__init__
         ThreadedCamera.in_thread Backoff.delays WireCamera.__init__ Device.__init__
@@ -398,7 +398,7 @@ NOT_HERE: dict[str, str] = {
         Observer FrameDriver FrameSink FrameSource.attach FrameSource.ended
         FrameSource.frame FrameSource.lost FrameSource.skipped RateControl.sent
         DeviceFeatures FrameSource.trigger_failed FrameSource.watch_events
-        FrameSource.wait_until_streaming Outlet OutletDesk Outlets.offer_result
+        FrameSource.wait_until_streaming Outlet OutletContext Outlets.offer_result
         Outlets.offer_error Outlets.state_changed Device.handle Device.watch LineClient
         LineCamera TicketedClient TicketedCamera Recorder.describe Recorder.on_error
         Recorder.on_frame Recorder.on_result Recorder.on_raw_frame Recorder.on_results

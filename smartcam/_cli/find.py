@@ -181,7 +181,10 @@ def _show(
     """Print the findings, and the addresses left alone, as a table or as JSON."""
     if options.as_json:
         for one in found:
-            value = {name: getattr(one, name) for name in one.__dataclass_fields__}
+            value = {
+                "said" if name == "received" else name: getattr(one, name)
+                for name in one.__dataclass_fields__
+            }
             options.show({**value, "greeting": one.greeting, "urls": one.urls}, "")
         for host, cameras in alone.items():
             for name, url in cameras.items():
@@ -207,7 +210,7 @@ def evidence(found: FoundPort) -> str:
     if found.answer is not None:
         return f"a camera answers: {found.answer.url}"
     if found.evidence == "other":
-        heard = f"it says {found.greeting!r:.60}" if found.said else "it does not greet"
+        heard = f"it says {found.greeting!r:.60}" if found.received else "it does not greet"
         return f"another service: {heard}"
     protocols = " or ".join(found.protocols)
     text = _EVIDENCE[found.evidence].format(protocols=protocols, greeting=found.greeting[:60])

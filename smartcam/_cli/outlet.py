@@ -49,7 +49,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
         Path(file).parent,
         columns=source.columns,
         command=source.command,
-        tell=source.tell,
+        on_trouble=source.tell,
         cameras=source.cameras,
         names=source.names,
     )

@@ -64,7 +64,7 @@ class FleetOutlets(Server):
             server.folder,
             columns=self._columns,
             command=self._command,
-            tell=tell,
+            on_trouble=tell,
             cameras=self._cameras,
             names=self._names,
         )

@@ -14,13 +14,13 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.outlets._entry import OutletEntry
-    from smartcam.outlets._outlet import Outlet, OutletDesk
+    from smartcam.outlets._outlet import Outlet, OutletContext
     from smartcam.outlets._outlets import Outlets
     from smartcam.outlets._settings import OutletSettings
 
 __all__ = [
     "Outlet",
-    "OutletDesk",
+    "OutletContext",
     "OutletEntry",
     "OutletSettings",
     "Outlets",
@@ -31,7 +31,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_entry": "OutletEntry",
-            "_outlet": "OutletDesk Outlet",
+            "_outlet": "OutletContext Outlet",
             "_outlets": "Outlets",
             "_settings": "OutletSettings",
         },

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.protocols._insight.dialect import INSIGHT
     from smartcam.protocols._insight.machine import ONLINE
     from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
-    from smartcam.protocols._lines import unread
+    from smartcam.protocols._lines import refuse_line
     from smartcam.protocols._machine import Counters, Event, ResultBurst, send_each
 
 __all__ = [
@@ -38,8 +38,8 @@ __all__ = [
     "Spelled",
     "StatusCode",
     "load_protocol",
+    "refuse_line",
     "send_each",
-    "unread",
     "view_fields",
     "words",
 ]
@@ -48,7 +48,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_lines": "unread",
+            "_lines": "refuse_line",
             "_insight.dialect": "INSIGHT",
             "_base": "Spelled POLICIES Policy load_protocol",
             "_bvs": "DEFAULT_PORT HANDBOOK MessageId ResultCode",

@@ -32,14 +32,14 @@ class JudgedResult(NamedTuple):
     Attributes:
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
-        told: True if the picture was recorded for this result, as after ``read_image()``; False
+        linked: True if the picture was recorded for this result, as after ``read_image()``; False
             if it was found by its time. Without a trigger of this client it cannot be found by
             time: the picture is None.
     """
 
     result: Result[Any]
     picture: Frame | None
-    told: bool
+    linked: bool
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:

@@ -103,7 +103,7 @@ class CameraLog(Sequence["LogEntry"]):
         return _messages(self._read(), "in")
 
     @property
-    def said(self) -> list[m.Message]:
+    def sent(self) -> list[m.Message]:
         """Messages that the camera has sent."""
         return _messages(self._read(), "out")
 

@@ -166,13 +166,13 @@ def test_lines_load_whatever_was_said(tmp_path: Path) -> None:
             found(port=36702),
             found("fd00::7"),
             found("10.0.0.8", protocols=("bvs", "insight"), evidence="ended"),
-            found("10.0.0.9", protocols=(), evidence="other", said=b"SSH"),
+            found("10.0.0.9", protocols=(), evidence="other", received=b"SSH"),
             found("10.0.0.10", refusal="silence"),
             found(
                 "10.0.0.11",
                 protocols=("insight",),
                 evidence="greeted",
-                said=b'Welcome to In-Sight "\x1b[2J # {\xff\nrm: x',
+                received=b'Welcome to In-Sight "\x1b[2J # {\xff\nrm: x',
             ),
         ]
     )

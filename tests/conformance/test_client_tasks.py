@@ -131,13 +131,13 @@ def test_line_that_is_no_result_is_reported(line: bytes) -> None:
 async def test_command_that_ends_well_gives_its_results() -> None:
     code = "import sys; print('0102'); print(*sys.argv[2:], file=sys.stderr)"
     outcome = await command(code).perform(TASK, 60)
-    assert without_time(outcome) == Outcome(results=(b"\x01\x02",), said="switch 3")
+    assert without_time(outcome) == Outcome(results=(b"\x01\x02",), output="switch 3")
     assert outcome.seconds > 0
 
 
 async def test_command_that_fails_has_its_exit_code_and_its_words() -> None:
     outcome = await command("import sys; print('01'); sys.exit('no camera')").perform(TASK, 60)
-    assert without_time(outcome) == Outcome((b"\x01",), "exit code 1", said="no camera")
+    assert without_time(outcome) == Outcome((b"\x01",), "exit code 1", output="no camera")
 
 
 async def test_command_with_exit_code_77_cannot_do_such_a_task() -> None:
@@ -200,7 +200,7 @@ async def test_function_that_is_not_implemented_cannot_do_such_a_task() -> None:
         raise NotImplementedError("it only triggers")
 
     outcome = await FunctionClient(perform).perform(TASK, 60)
-    assert without_time(outcome) == Outcome(supported=False, said="it only triggers")
+    assert without_time(outcome) == Outcome(supported=False, output="it only triggers")
 
 
 async def test_function_that_does_not_end_is_left_behind() -> None:

@@ -255,11 +255,11 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
 
 
 async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path: Path) -> None:
-    from smartcam.outlets import OutletDesk, OutletEntry
+    from smartcam.outlets import OutletContext, OutletEntry
 
     kind: Any = OUTLETS.load("sqlite")
     settings = kind.settings_class.model_validate({"file": "results.sqlite"})
-    store = kind("s", settings, tmp_path, OutletDesk(lambda _c, _a: [("passed", "bool", "")]))
+    store = kind("s", settings, tmp_path, OutletContext(lambda _c, _a: [("passed", "bool", "")]))
     await store.open()
     body = '{{"camera":"a","application":1,"value":{{"passed":{}}}}}'
     await store.deliver(

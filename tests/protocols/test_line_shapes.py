@@ -24,7 +24,7 @@ from smartcam.protocols import (
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import unread
+from smartcam.protocols._inside import refuse_line
 from smartcam.registry import PROTOCOLS
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 
@@ -91,7 +91,7 @@ ECHO = LineDialect(
         LineRow(m.GetStatus, "RS", m.StatusReport, status),
         LineRow(m.Query, "PR", m.QueryAnswer, query),
         LineRow(m.Trigger, "TA", m.ResultContainer, taken, echo="TA", also=(m.TriggerAnswer,)),
-        LineRow(m.EndTrigger, "TE", None, unread),
+        LineRow(m.EndTrigger, "TE", None, refuse_line),
     ),
     split=first_word,
     codes=CODES,
@@ -326,7 +326,7 @@ def test_frames_have_as_many_digits_as_their_dialect_says(tickets: range, digits
 
 
 OWN = (
-    LineRow(m.Reboot, "RESTART", None, unread),
+    LineRow(m.Reboot, "RESTART", None, refuse_line),
     LineRow(LineCommand, "{line}", LineReply, lambda line: LineReply(data=line.encode())),
 )
 

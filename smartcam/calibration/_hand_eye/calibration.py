@@ -210,7 +210,7 @@ def calibrate_hand_eye(
         lens = own.camera
         of_sheet = [one for one in own.warnings if one.code == Code.SHEET_NOT_EXACT]
     located = [locate(one, lens) for one in ordered]
-    if ordered[0].target.turned_alike:
+    if ordered[0].target.half_turn_symmetric:
         ordered = _numbered_alike(ordered, robot, located)
         located = [locate(one, lens) for one in ordered]
         views = [ordered[i] for i in np.argsort(order)]

@@ -304,7 +304,7 @@ class HandEyeCalibration(storage.SavedCalibration):
             )
         found = [
             point_errors(lens, seen.rigid, one.points, self.target_scale * one.object_points)
-            for one in (view, *([half_turned(view)] if view.target.turned_alike else []))
+            for one in (view, *([half_turned(view)] if view.target.half_turn_symmetric else []))
         ]
         errors = min(found, key=lambda off: float(np.median(off)))
         return errors if errors is found[0] else errors[::-1]

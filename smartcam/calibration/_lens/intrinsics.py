@@ -305,7 +305,7 @@ def calibrate_intrinsics(
     )
     turned = list[str]()
     target = given[0].target
-    if target.turned_alike and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
+    if target.half_turn_symmetric and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
         found, turned = _numbered_alike(found, distortion_model, fixed_names, sheet)
     again = functools.partial(
         calibrate_intrinsics,

@@ -248,7 +248,7 @@ class StereoCalibration(storage.SavedCalibration):
         if left is None or right is None:
             return PairErrors(np.zeros(0), np.zeros((0, 2)))
         ways = [right]
-        if right.target.turned_alike:
+        if right.target.half_turn_symmetric:
             ways.append(half_turned(right))
         found = [pair_errors(self._cameras, left, one) for one in ways]
         return min(found, key=lambda one: _rms([one.epipolar]))

@@ -115,7 +115,7 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     poses: list[Poses] = list(zip(ones, twos, strict=True))
     target = next(view.target for moment in moments for view in moment if view is not None)
     turns = [IDENTITY]
-    if target.turned_alike:
+    if target.half_turn_symmetric:
         turns.append(half_turn(target))
     rig, apart, turned = _rig(moments, poses, right, turns)
     for number in turned:

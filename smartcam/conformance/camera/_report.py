@@ -111,7 +111,7 @@ class CameraReport:
                 f"  {one.item.name}: {one.item.about}",
                 f"    source:   {one.source}, {one.grade}",
                 f"    expected: {one.expected}",
-                f"    came:     {one.came}",
+                f"    came:     {one.observed}",
                 *(f"      {row}" for row in one.wire),
             ]
         return ["", "differs from the documented device:", *lines] if lines else []

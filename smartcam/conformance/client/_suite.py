@@ -134,7 +134,7 @@ class ClientConformance:
         check, dialect, transport = client_case
         run = self._run(check, dialect, transport, request.config)
         if not run.outcome.supported:
-            reason = f": {run.outcome.said}" if run.outcome.said else ""
+            reason = f": {run.outcome.output}" if run.outcome.output else ""
             pytest.skip(f'the client cannot do the task "{run.task}"{reason}')
         finding = judge(check, run)
         if finding is None:

@@ -257,7 +257,7 @@ class Insert(CameraWireFault):
         return self
 
     @property
-    def word(self) -> m.Message | None:
+    def inserted(self) -> m.Message | None:
         """The message that is inserted, None for bytes."""
         return _build(self.message, self.fields) if isinstance(self.message, str) else None
 

@@ -65,7 +65,7 @@ class EmulatedSr(LineCamera):
 
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
-        call = client.keep()
+        call = client.answer_later()
         word, _, rest = line.partition(",")
         bank = rest.isdecimal() and len(rest) == 2 and int(rest) <= LAST_BANK
         if line == "LON" or (word == "LON" and bank):

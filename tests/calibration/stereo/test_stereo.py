@@ -162,7 +162,7 @@ def test_calibrate_stereo_of_swapped_sides_has_a_remark() -> None:
 
 def test_calibrate_stereo_numbers_a_sheet_that_looks_the_same_when_turned_alike() -> None:
     target = Checkerboard(columns=8, rows=6, square=0.025)
-    assert target.turned_alike
+    assert target.half_turn_symmetric
     lefts = poses(6, name="left")
     left = seen(LEFT, lefts, target=target)
     right = seen(RIGHT, [RIG @ one for one in lefts], target=target, seed=2)
