@@ -132,7 +132,7 @@ class Serving:
             server.reloads.on_reload = self._on_reload
             stack.enter_context(notifier.telling(self._status))
             await stack.enter_async_context(_while_here(self._reload_when(wanted)))
-            await server.wait_tried()
+            await server.wait_first_attempts()
             self._ready = True
             notifier.ready(self._status())
             if server.warning:
@@ -308,7 +308,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
 
 async def share(server: FleetServer, options: Options) -> None:
     """Print the URLs of a started agent's cameras, and then each event, until cancelled."""
-    await server.wait_tried()
+    await server.wait_first_attempts()
     events = server.events()
     for name in server.hosts:
         value = _camera(server, name)

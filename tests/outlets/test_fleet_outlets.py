@@ -42,7 +42,7 @@ def fleet(folder: Path, text: str = FLEET) -> Path:
 async def serving(path: Path) -> Any:
     server = FleetServer(path, bus=MemoryBus().end())
     async with FleetOutlets(server) as outlets, server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await until(lambda: server.hosts["line1/cam1"].connected)
         yield server, outlets.outlets
 
@@ -239,7 +239,7 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
     path = fleet(tmp_path, f"listen: tcp/127.0.0.1:0\n{FLEET}")
     server = FleetServer(path)
     async with FleetOutlets(server) as outlets, server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await server.hosts["line1/cam1"].camera.trigger(timeout=20)
         await until(lambda: outlets.outlets.states["store"].account.delivered == 1)
         url = f"fleet://127.0.0.1:{server.address.port}"

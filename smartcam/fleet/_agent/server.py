@@ -430,10 +430,10 @@ class FleetServer(Server):
         await stack.enter_async_context(camera)
         return camera.url
 
-    async def wait_tried(self) -> None:
+    async def wait_first_attempts(self) -> None:
         """Wait for the end of each camera's first attempt; bounded by ``connect_timeout``."""
         if self._agent is not None:
-            await self._agent.wait_tried()
+            await self._agent.wait_first_attempts()
 
     def events(
         self,

@@ -209,8 +209,8 @@ class CameraStatus:
 
     def _is_heard(self, counted: Statistics) -> bool:
         """Return True if the program that has the session is alive, or was."""
-        if self._options.heard is not None:
-            return self._options.heard()
+        if self._options.is_agent_alive is not None:
+            return self._options.is_agent_alive()
         return bool(counted.sessions or counted.last_error)
 
     def _values(
