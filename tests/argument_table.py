@@ -417,7 +417,7 @@ NOT_HERE: dict[str, str] = {
     """,
     "judged by their own rooms' tests: layouts, files, pictures, links that break": """
         Layout FleetServer serve ThreadedFleet register_generator Rectifier Undistorter
-        LinkProxy CameraKind ContainerSample Conversation LiveCamera
+        CameraKind ContainerSample Conversation LiveCamera
         EmulatedInSight.set_image TableScene.to_pixels TableScene.to_table
         Recorder.add_image Recorder.record RotatingRecorder.record
     """,

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, get_type
 from smartcam.models import Status
 
 __all__ = [
-    "Acknowledgement",
     "CellValue",
     "ClockAnswer",
     "Connect",

@@ -2,9 +2,10 @@
 
 ::
 
-    async with LinkProxy("127.0.0.1", emulator.port, rules=[Cut(at=20)]) as proxy:
-        async with smartcam.connect(proxy.url(emulator.url)) as camera:
-            ...
+    with ThreadedCamera() as emulator, smartcam.sync.connect(emulator.url) as camera:
+        ...
+
+:mod:`smartcam.testing.proxy` has a link whose bytes get lost, late or changed.
 
 Names are resolved when they are first used.
 """
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent
     from smartcam.testing._suites.protocols.suite import CameraSuite, ProtocolSuite, WireSuite
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
-    from smartcam.testing.proxy._proxy import LinkProxy
 
 __all__ = [
     "Came",
@@ -33,7 +33,6 @@ __all__ = [
     "ContainerSample",
     "Conversation",
     "InterpreterSuite",
-    "LinkProxy",
     "LiveCamera",
     "ProtocolSuite",
     "Sent",
@@ -50,7 +49,6 @@ if not TYPE_CHECKING:
             "_suites.protocols.cameras_under_test": "CameraKind LiveCamera",
             "_suites.protocols.conversations": "Came Conversation Sent",
             "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",
-            "proxy._proxy": "LinkProxy",
             "_threads": "ThreadedCamera ThreadedFleet",
         },
     )

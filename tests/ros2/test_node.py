@@ -25,7 +25,7 @@ from smartcam.exceptions import (
 )
 from smartcam.ros2 import Node, QoS
 from smartcam.ros2._inside import LATCHED, RosContext
-from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import LinkProxy
 from tests.processes import free_place
 from tests.ros2.inside import Attachment
 from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, TRIGGER, soon, two_nodes, until

@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 __all__ = [
     "CameraChain",
     "HandEyeSample",
-    "compose",
     "plane_frame",
     "pose_from",
     "pose_to",
