@@ -181,10 +181,8 @@ def _show(
     """Print the findings, and the addresses left alone, as a table or as JSON."""
     if options.as_json:
         for one in found:
-            value = {
-                "said" if name == "received" else name: getattr(one, name)
-                for name in one.__dataclass_fields__
-            }
+            value = {name: getattr(one, name) for name in one.__dataclass_fields__}
+            value["said"] = value.pop("received")
             options.show({**value, "greeting": one.greeting, "urls": one.urls}, "")
         for host, cameras in alone.items():
             for name, url in cameras.items():

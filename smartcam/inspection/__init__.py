@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._camera.device import SoftwareDevice
     from smartcam.inspection._cell import load_cell
     from smartcam.inspection._finding import Finding, Inspection
+    from smartcam.inspection._locate.find import LocatedPart
     from smartcam.inspection._locate.model import PartModel
     from smartcam.inspection._locate.troubles import TeachingError
     from smartcam.inspection._picture import Picture
@@ -41,6 +42,7 @@ __all__ = [
     "Drawing",
     "Finding",
     "Inspection",
+    "LocatedPart",
     "PartModel",
     "Picture",
     "PixelPose",
@@ -65,6 +67,7 @@ if not TYPE_CHECKING:
             "_camera.device": "SoftwareDevice",
             "_cell": "load_cell",
             "_finding": "Finding Inspection",
+            "_locate.find": "LocatedPart",
             "_locate.model": "PartModel",
             "_locate.troubles": "TeachingError",
             "_picture": "Picture",

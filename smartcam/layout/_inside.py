@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit
     from smartcam.layout._texts import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
-    from smartcam.layout._yaml_files import read_model
+    from smartcam.layout._yaml_files import file_schema, read_model
     from smartcam.layout._yamls import BadYamlError, compose, load
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "ShownUnits",
     "compose",
     "describes_layout",
+    "file_schema",
     "load",
     "misfit",
     "pack_texts",
@@ -39,7 +40,7 @@ if not TYPE_CHECKING:
             "_text": "Field SI_SYMBOLS TYPES UNITS misfit",
             "_texts": "pack_texts",
             "_units": "ShownUnits units_of",
-            "_yaml_files": "read_model",
+            "_yaml_files": "file_schema read_model",
             "_yamls": "BadYamlError compose load",
         },
     )

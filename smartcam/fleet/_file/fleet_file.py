@@ -37,7 +37,7 @@ from smartcam.fleet._file.operations import OperationsSection  # noqa: TC001 - p
 from smartcam.fleet._file.recording import RecordSection, mistakes_of
 from smartcam.fleet._file.ros import Fields, RosCamera, RosSection, node_names
 from smartcam.fleet._file.standby import Standby, standby_of
-from smartcam.layout._inside import read_model
+from smartcam.layout._inside import file_schema, read_model
 from smartcam.settings import (
     CameraSettings,
     is_fleet,
@@ -512,11 +512,7 @@ def _no_file(url: str) -> ConfigurationError:
 
 def fleet_schema() -> dict[str, Any]:
     """Return the JSON Schema of fleet files."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **FleetFile.model_json_schema(),
-        "title": "smartcam fleet",
-    }
+    return file_schema(FleetFile, "fleet")
 
 
 Mistake = tuple["Sequence[int | str]", str]
