@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
     from smartcam.inspection import Inspection
     from smartcam.inspection._inside import Teaching
-    from smartcam.web import TeachSite
+    from smartcam.web._inside import TeachSite
 
 LINGER: Final = 3.0
 """Seconds that the device continues streaming after a picture."""
@@ -80,7 +80,7 @@ async def teach(
     if changes or learn or save:
         await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
         return
-    from smartcam.web import TeachSite
+    from smartcam.web._inside import TeachSite
 
     async with contextlib.AsyncExitStack() as stack:
         source: FrameSource | None = None

@@ -22,12 +22,11 @@ if TYPE_CHECKING:
         CameraKind,
         LiveCamera,
     )
-    from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent
+    from smartcam.testing._suites.protocols.conversations import Conversation, Received, Sent
     from smartcam.testing._suites.protocols.suite import CameraSuite, ProtocolSuite, WireSuite
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
 __all__ = [
-    "Came",
     "CameraKind",
     "CameraSuite",
     "ContainerSample",
@@ -35,6 +34,7 @@ __all__ = [
     "InterpreterSuite",
     "LiveCamera",
     "ProtocolSuite",
+    "Received",
     "Sent",
     "ThreadedCamera",
     "ThreadedFleet",
@@ -47,7 +47,7 @@ if not TYPE_CHECKING:
         {
             "_suites.interpreters": "ContainerSample InterpreterSuite",
             "_suites.protocols.cameras_under_test": "CameraKind LiveCamera",
-            "_suites.protocols.conversations": "Came Conversation Sent",
+            "_suites.protocols.conversations": "Received Conversation Sent",
             "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",
             "_threads": "ThreadedCamera ThreadedFleet",
         },

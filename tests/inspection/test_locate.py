@@ -122,7 +122,7 @@ def test_what_cannot_be_taught_is_told(
         taught[30:120, 75:85] = False
     with pytest.raises(TeachingError) as caught:
         PartModel.teach(picture, taught)
-    assert caught.value.why is why
+    assert caught.value.reason is why
     assert str(caught.value).startswith(why.value)
 
 

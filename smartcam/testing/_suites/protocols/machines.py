@@ -19,7 +19,7 @@ from smartcam.exceptions import (
 from smartcam.protocols import Frame, LinkEnded, LinkFailed, State, Transport, Verdict
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Counters, ResultBurst
-from smartcam.testing._suites.protocols.conversations import Came, Player, Sent
+from smartcam.testing._suites.protocols.conversations import Player, Received, Sent
 from smartcam.testing._suites.protocols.dialects import see_spelled
 from smartcam.testing._suites.protocols.parameters import Parameters
 from smartcam.testing._suites.protocols.words import REQUESTS, example
@@ -77,7 +77,7 @@ class MachineChecks(Parameters):
                 for step in stream.steps:
                     player.step(step, cuts(step), room=room)
         for place, step in enumerate(stream.steps):
-            if isinstance(step, Came):
+            if isinstance(step, Received):
                 size = len(step.data)
                 for cut in range(1, size, 1 + size // MAX_CUTS):
                     player = Player(self.protocol, stream).play(place)
@@ -246,7 +246,7 @@ class MachineChecks(Parameters):
                 continue
             machine.send(m.Disconnect())
             player.written()
-            later = [one.data for one in conversation.steps[place:] if isinstance(one, Came)]
+            later = [one.data for one in conversation.steps[place:] if isinstance(one, Received)]
             for data in (b"", *later):
                 machine.receive_data(data)
                 machine.events()
@@ -303,7 +303,7 @@ class MachineChecks(Parameters):
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
         """Check the counter of bytes, which is in an attempt's error."""
         player = Player(self.protocol, conversation).play()
-        came = sum(len(one.data) for one in conversation.steps if isinstance(one, Came))
+        came = sum(len(one.data) for one in conversation.steps if isinstance(one, Received))
         counted = player.machine.counters.bytes_received
         assert counted == came, f"counters.bytes_received is {counted}, {came} came"
 
@@ -419,11 +419,11 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
 
 
 def _samples(conversation: Conversation) -> list[bytes]:
-    return [step.data for step in conversation.steps if isinstance(step, Came)]
+    return [step.data for step in conversation.steps if isinstance(step, Received)]
 
 
 def _bytewise(step: Step) -> list[bytes] | None:
-    return [bytes([one]) for one in step.data] if isinstance(step, Came) else None
+    return [bytes([one]) for one in step.data] if isinstance(step, Received) else None
 
 
 def _whole(_: Step) -> None:
@@ -435,8 +435,8 @@ def _joined(steps: Sequence[Step]) -> list[Step]:
     found: list[Step] = []
     for step in steps:
         last = found[-1] if found else None
-        if isinstance(step, Came) and isinstance(last, Came) and not last.wire:
-            found[-1] = Came(last.data + step.data, last.events + step.events, step.wire)
+        if isinstance(step, Received) and isinstance(last, Received) and not last.wire:
+            found[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
         else:
             found.append(step)
     return found
@@ -450,7 +450,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
     failed = False
     for place, step in enumerate(conversation.steps):
         yield place, []
-        if isinstance(step, Came):
+        if isinstance(step, Received):
             yield place, [step.data[: len(step.data) // 2]]
             failed = any(isinstance(one, type) for one in step.events)
     if not failed:
