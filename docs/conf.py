@@ -725,6 +725,25 @@ def modules() -> str:
     return _table(("in", "module", "holds"), rows)
 
 
+def public_names() -> str:
+    """Return the number of public names of each module; a name of two modules counts once."""
+    modules: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "smartcam").rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        found = re.search(
+            r"^__all__ = (\[.*?\])", path.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        )
+        if found and "._" not in name:
+            modules[name] = ast.literal_eval(found[1])
+    modules["smartcam"] = modules.pop("smartcam")  # last: most of its names are those of others
+    seen: set[str] = set()
+    rows: list[tuple[str, int]] = []
+    for module, names in modules.items():
+        rows.append((f"`{module}`", len(set(names) - seen)))
+        seen.update(names)
+    return _table(("module", "names"), [*rows, ("together", len(seen))])
+
+
 def limits() -> str:
     """Return the constants of :data:`LIMITS` with their values and the reasons in the source."""
     rows: list[tuple[object, ...]] = []
@@ -760,7 +779,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, quirks_insight, settings, transitions, policies, layers, limits),
-        modules,
+        *(modules, public_names),
         *(application, scenario, cue, faults_which, faults_wire, faults_device),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
