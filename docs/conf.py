@@ -902,18 +902,26 @@ def _methods(node: ast.ClassDef) -> tuple[list[str], frozenset[str]]:
 def _tell_returned(
     _app: Any, _what: str, _name: str, member: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Add what a function returns, where that class has no place of its own in the reference."""
-    gives = getattr(getattr(member, "fget", member), "__annotations__", {}).get("return")
-    waiting = re.findall(r"\w+", str(gives or ""))
+    """Add what a function returns, or a field holds, if its class is not in the reference."""
+    types = getattr(getattr(member, "fget", member), "__annotations__", {})
+    if inspect.isclass(member) and hasattr(member, "model_fields"):
+        return  # what pydantic reads is described by its fields
+    gives = types.values() if inspect.isclass(member) else [types.get("return")]
+    waiting = re.findall(r"\w+", " ".join(map(str, gives)))
     told: set[str] = set()
     while waiting:
         name = waiting.pop(0)
-        if name in _returned_classes() and name not in told:
-            told.add(name)
-            one = _returned_classes()[name]
-            first, *rest = one.lines
-            lines += ["", f"``{name}``: {first}", *rest]
-            waiting += sorted(one.gives)
+        one = _returned_classes().get(name)
+        if (
+            one is None
+            or name in told
+            or (inspect.isclass(member) and "Attributes:" not in one.lines)
+        ):
+            continue
+        told.add(name)
+        first, *rest = one.lines
+        lines += ["", f"``{name}``: {first}", *rest]
+        waiting += [] if inspect.isclass(member) else sorted(one.gives)
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:
