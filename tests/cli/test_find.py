@@ -136,6 +136,7 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
     assert [line.get("fleet_camera") for line in lines] == [None, "line1/cam3", "line1/cam4"]
     assert lines[0]["urls"] == [f"bvs://{NETWORK}4:{port}"]
     assert lines[0]["evidence"] == "silent"
+    assert (lines[0]["said"], "received" in lines[0]) == ("", False)
     only = search(f"{NETWORK}2", "--may-disturb", "--fleet", str(fleet))
     assert "it is line1/cam3 of the fleet" in only.out
     assert only.err.startswith("0 of 0 ports tried")
@@ -153,7 +154,7 @@ def found(host: str = "10.0.0.7", **said: object) -> FoundPort:
         "port": 36701,
         "protocols": ("bvs",),
         "evidence": "silent",
-        "said": b"",
+        "received": b"",
         "seconds": 0.1,
     }
     return FoundPort(host=host, **{**given, **said})  # type: ignore[arg-type]
