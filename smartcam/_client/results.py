@@ -302,8 +302,8 @@ class Results:
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None if one may be anything else.
 
-        Otherwise a trigger or a single waiter may need one of them, one may be a pending result, an
-        observer may need each by itself, and one that cannot be interpreted is its own item.
+        Otherwise a trigger or a single waiter may need one of them, one may be a pending result,
+        and one that cannot be interpreted is its own item.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:
