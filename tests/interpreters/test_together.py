@@ -10,7 +10,8 @@ from typing import Any
 
 from smartcam import InterpretationError
 from smartcam._client._inside import Interpretation
-from smartcam.layout import Field, Layout
+from smartcam.layout import Layout
+from smartcam.layout._inside import Field
 from smartcam.models import Localization
 from smartcam.protocols.messages import ResultContainer
 from tests.strategies import over
