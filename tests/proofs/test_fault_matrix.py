@@ -28,7 +28,7 @@ from tests.proofs.matrix_camera import by_camera
 from tests.proofs.matrix_cells import LOST, NONE, OPS, SILENT, Cell, Fault, by_rule, ops_of, places
 from tests.proofs.matrix_world import PATIENT, Bench, World
 
-STRIDE = 520
+STRIDE = 260
 """Of some 49,000 cells; the short form takes seconds."""
 
 pytestmark = [

@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 DATA = Path(__file__).parents[1] / "data"
 DEBIAN = Path("/usr/share/doc/opencv-doc/examples/data")
-PARTS = 3
+PARTS = 5
 """Random parts of each set."""
 
 LEAST = 5
 """Views of a part at least."""
 
-HALVES = 3
+HALVES = 4
 """Random divisions of a set into two halves."""
 
 MAX_Z = 2.0

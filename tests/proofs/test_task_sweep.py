@@ -10,7 +10,7 @@ import pytest
 from tests.proofs.task_scenes import SCENES
 from tests.proofs.task_sweep import Program, steps_of, sweep
 
-MAX_STEPS = 2
+MAX_STEPS = 3
 """Steps of a task behind which it is cancelled, at most; the long form has every one."""
 
 

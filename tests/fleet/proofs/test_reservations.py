@@ -9,7 +9,7 @@ import pytest
 
 from tests.fleet.proofs.reservations import TAKES_OVER, VARIANTS, Variant, Wrong, visit
 
-SHORT_DEPTH = 7
+SHORT_DEPTH = 8
 
 
 def long(*values: Any) -> Any:
@@ -42,7 +42,7 @@ def test_the_same_as_deep_as_fits(variant: Variant) -> None:
     ("without", "wrong", "depth", "options"),
     [
         ("confirmed", "between", 9, {"forgotten": 1}),
-        widest("confirmed", "between", 12, {"starts": 2, "deaths": 1}),
+        long("confirmed", "between", 12, {"starts": 2, "deaths": 1}),
         widest("fenced", "behind", 12, {"forgotten": 1, "cuts": 1}),
         long("asks", "between", 12, {**TAKES_OVER, "cuts": 1, "commands": 0}),
         widest(
