@@ -119,6 +119,9 @@ MIN_GOOD_POSES = 5
 MIN_POSES_FOR_ERROR = 5
 """The scatter of at least this many poses gives an expected error."""
 
+WEIGHT_POWER = 1 / 2
+"""Power of a pose's weight in the covariance: errors of poses are independent of each other."""
+
 POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
 """Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
 beyond what they cause is remarked on."""
@@ -613,12 +616,17 @@ def _covariance(chosen: Candidate) -> Array:
     whole, left = solution.information, others.information
     if whole is None or left is None:  # solved without a part of the poses, not without each
         return jackknife(steps[:MAX_FOLDS])
+    if len(whole) > 12:
+        steps = np.concatenate([steps, others.change - solution.change], axis=1)
     places = of_one_place(chosen.problem.robot.poses)
     alike = [places == one for one in np.unique(places)]  # poses of one place are left out together
     steps = np.array([steps[one].sum(axis=0) for one in alike])  # to first order
     left = np.array([whole - (whole - left[one]).sum(axis=0) for one in alike])
-    spreads = np.array([inverse_scaled(one)[:12, :12] for one in left])
-    scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole)[:12, :12])
+    spreads = np.array([inverse_scaled(one) for one in left])
+    scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole), WEIGHT_POWER)[:12, :12]
+    for one in chosen.rivals:
+        both = solution.camera.before(one.camera), solution.target.before(one.target)
+        scatter += np.outer(step := np.concatenate(both), step)
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
         return scatter
