@@ -58,6 +58,10 @@ SIGNIFICANCE_LEVEL = 1e-4
 """Further parameters are adjusted only if noise alone would change them by as much with less than
 this probability: a scale that is not needed puts the camera up to eight times as far off."""
 
+SURE_GAIN = 2.0
+"""A choice is open until poses are predicted better by this many standard errors: simulated robots
+that err by noise alone reach 1.9 by chance."""
+
 MAX_SIZE_ERROR_RATIO = 0.05
 """Largest error of a target's stated size, as a part of it, from which the fit still converges."""
 
@@ -332,7 +336,7 @@ def _asked(judges: Sequence[Candidate]) -> Candidate | None:
     beside, by_error = len(plain.solution.change), operator.attrgetter("held_out")
     asked = [one for one in others if one.chance(beside) < SIGNIFICANCE_LEVEL]
     best, *rest = sorted([plain, *asked], key=by_error)
-    if rest and (best is plain or not _predicts_better(best, plain)):
+    if rest and (best is plain or _gain(best, plain) < SURE_GAIN):
         best.rivals = [rest[0].solution if best is plain else plain.solution]
     return best
 
@@ -342,25 +346,25 @@ def _likelier(robot: Candidate, plain: Candidate) -> Candidate:
 
     With robots that have no error but noise, ``plain`` looks better by chance, and it puts their
     cameras up to five times as far off. By chance it is taken for two of eighty such robots, so
-    then the difference of both is an error to expect.
+    the difference of both is an error to expect until the gain is sure.
     """
-    if not _predicts_better(plain, robot):
+    gain = _gain(plain, robot)
+    if gain <= 1.0:
         return robot
-    plain.rivals = [*robot.rivals, robot.solution]
+    plain.rivals = [*robot.rivals, *([robot.solution] if gain < SURE_GAIN else [])]
     return plain
 
 
-def _predicts_better(one: Candidate, other: Candidate) -> bool:
-    """Return True if a candidate predicts poses better than another one by more than chance.
+def _gain(one: Candidate, other: Candidate) -> float:
+    """Return by how many standard errors a candidate predicts poses better than another one.
 
-    Chance is taken as one standard error over poses, which are independent of each other, unlike
-    their points.
+    Poses are independent of each other, unlike their points.
     """
     after, before = one.errors, other.errors
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
-        return one.held_out < other.held_out
+        return math.inf if one.held_out < other.held_out else -math.inf
     gain = one.problem.mask.sum(axis=1) * (before**2 - after**2)
-    return bool(gain.sum() > math.sqrt(float((gain**2).sum())))
+    return float(gain.sum()) / max(math.sqrt(float((gain**2).sum())), 1e-300)
 
 
 def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
