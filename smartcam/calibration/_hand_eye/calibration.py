@@ -239,16 +239,14 @@ def calibrate_hand_eye(
         # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
         # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
         del free[NOTHING], free["scale"]
-    asked = _Asked(_allowed(free, adjust), method, drop_bad)
-    result = _without_bad(problem, asked, named, [transforms[i] for i in order], ordered)
-    _check_scale(result.target_scale, most_scale)
+    asked = _Asked(_allowed(free, adjust), method, drop_bad, order, most_scale)
+    result = _without_bad(problem, asked, named, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
         strays = [one for one in strays if one.code != Code.WRONG_LENS]
     return dataclasses.replace(
-        _reordered(result, np.argsort(order)),
+        result,
         warnings=(*result.warnings, *remarks, *of_sheet, *strays),
-        robot_poses=tuple(transforms),
         views=tuple(views),
         target_poses=tuple(located[i].transform for i in np.argsort(order)),
         allowed_error=allowed_error,
@@ -312,12 +310,10 @@ def calibrate_hand_eye_from_poses(
         sigmas=_positive(robot_sigmas),
     )
     named = [f"pose {i}" for i in order]
-    asked = _Asked(_allowed({NOTHING: (), "scale": (0,)}, adjust), method, drop_bad)
-    result = _without_bad(problem, asked, named, [transforms[i] for i in order], seen)
-    _check_scale(result.target_scale, most_scale)
+    free = _allowed({NOTHING: (), "scale": (0,)}, adjust)
+    asked = _Asked(free, method, drop_bad, order, most_scale)
     return dataclasses.replace(
-        _reordered(result, np.argsort(order)),
-        robot_poses=tuple(transforms),
+        _without_bad(problem, asked, named, transforms, seen),
         target_poses=tuple(Transform(CAMERA, TARGET, *one.rigid) for one in target_poses),
         allowed_error=allowed_error,
     )
@@ -414,16 +410,23 @@ class _Asked(NamedTuple):
     free: Mapping[str, tuple[int, ...]]
     method: str  # name of the method, or ``auto``
     drop_bad: bool  # whether bad poses are left out
+    order: list[int]  # numbers of the given poses in the order of their values
+    most_scale: float  # part by which the target's size may be off
 
 
 def _without_bad(
     problem: Problem,
     asked: _Asked,
     named: Sequence[str],
-    robot_poses: Sequence[Transform],
+    transforms: Sequence[Transform],
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
-    """Return the calibration from the poses that are not bad, with the errors of all poses."""
+    """Return the calibration from the poses that are not bad, with the errors of all poses.
+
+    ``transforms`` are the robot's poses as given, all else is in the order of their values. Raises
+    ``SCALE_MISMATCH``, besides the errors of poses that do not fit.
+    """
+    robot_poses = [transforms[i] for i in asked.order]
     used, remarks = _near(problem, asked, named)
     result = _solved(problem.taken(used), asked, robot_poses[0])
     while len(bad := _bad(result)) and asked.drop_bad:
@@ -453,13 +456,15 @@ def _without_bad(
         if np.isfinite(off).all():
             errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
-    some = problem.taken(used)
+    some, back = problem.taken(used), np.argsort(asked.order)
     _check_fit(some, result)
+    _check_scale(result.target_scale, asked.most_scale)
     return dataclasses.replace(
         result,
-        errors=errors,
-        leave_one_out=left_out,
-        used=tuple(np.isin(np.arange(problem.count), used).tolist()),
+        errors=errors[back],
+        leave_one_out=left_out[back],
+        robot_poses=tuple(transforms),
+        used=tuple(np.isin(back, used).tolist()),
         warnings=(
             *_size_remark(some, asked),
             *_remarks(some, result),
@@ -698,12 +703,3 @@ def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Rema
             f"instead of {before:.1f} px; the calibration's camera is that one"
         )
     ]
-
-
-def _reordered(result: HandEyeCalibration, back: Any) -> HandEyeCalibration:
-    return dataclasses.replace(
-        result,
-        errors=result.errors[back],
-        leave_one_out=result.leave_one_out[back],
-        used=tuple(result.used[i] for i in back),
-    )

@@ -60,7 +60,7 @@ MIN_VIEWS_TO_EXPLAIN: Final = 4
 
 MIN_CHANGE_EVIDENCE: Final = 40.0
 """A change from one view on is reported if the information criterion prefers it by this much to all
-else: 176 random parts of 18 recorded sets reach 32, pictures resized by 1 % 48 to 350 (measured)."""
+else: 170 random parts of recorded sets reach 32, pictures resized by 1 % 48 to 350 (measured)."""
 
 APART_COST_RATIO: Final = 4.0
 """The views of pairs are reported as of different moments if another place of the cameras for each

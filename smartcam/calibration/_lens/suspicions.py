@@ -186,15 +186,16 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
     rest = [one for one in found if one.ident not in often]
     if rest:
         each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
-        more = (
-            f", and {len(each) - MAX_POINTS_IN_MESSAGE} more"
-            if len(each) > MAX_POINTS_IN_MESSAGE
-            else ""
-        )
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:MAX_POINTS_IN_MESSAGE])}{more}: each {done}"
+            f"{_listed(each, ', ')}: each {done}"
         )
+
+
+def _listed(texts: Sequence[str], separator: str) -> str:
+    more = len(texts) - MAX_POINTS_IN_MESSAGE
+    first = separator.join(texts[:MAX_POINTS_IN_MESSAGE])
+    return f"{first}, and {more} more" if more > 0 else first
 
 
 def without_strays(
@@ -256,14 +257,9 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(one) for one in groups.values() if len(one) > 1]
     if copies:
-        more = (
-            f", and {len(copies) - MAX_POINTS_IN_MESSAGE} more"
-            if len(copies) > MAX_POINTS_IN_MESSAGE
-            else ""
-        )
         yield Code.COINCIDENT.remark(
             "views that are the same to the last digit: "
-            f"{'; '.join(copies[:MAX_POINTS_IN_MESSAGE])}{more}: "
+            f"{_listed(copies, '; ')}: "
             "they count as often as they are there, and errors come out too small"
         )
 
@@ -293,10 +289,8 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
         )
 
 
-def most_rms(
-    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
-) -> float:
+def most_rms(views: Sequence[TargetView]) -> float:
     """Return the RMS of a coordinate, pixels, above which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
-    return max(worst, part * longer, MAX_RMS_SIGMAS * noise)
+    return max(MAX_RMS_PX, MAX_RMS_SHARE * longer, MAX_RMS_SIGMAS * noise)
