@@ -610,8 +610,9 @@ def _check_scale(scale: float, most: float) -> None:
 def _covariance(chosen: Candidate) -> Array:
     """Return the covariance of steps of camera and target (12, 12), from the scatter between poses.
 
-    If the lens was calibrated from the same views and not adjusted since, its own error is
-    included. NaN if there are too few poses.
+    The differences to solutions that may be right as well are included. If the lens was calibrated
+    from the same views and not adjusted since, its own error is, too. NaN if there are too few
+    poses.
     """
     solution, others = chosen.solution, chosen.others
     if others is None or chosen.problem.count < MIN_POSES_FOR_ERROR:
