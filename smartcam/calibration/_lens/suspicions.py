@@ -289,8 +289,10 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
         )
 
 
-def most_rms(views: Sequence[TargetView]) -> float:
+def most_rms(
+    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
+) -> float:
     """Return the RMS of a coordinate, pixels, above which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
-    return max(MAX_RMS_PX, MAX_RMS_SHARE * longer, MAX_RMS_SIGMAS * noise)
+    return max(worst, part * longer, MAX_RMS_SIGMAS * noise)

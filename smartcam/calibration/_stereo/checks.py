@@ -195,7 +195,7 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
     views that fit worst.
     """
-    most = most_rms([one.view for one in sights])
+    most = most_rms([one.view for one in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
     named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)
