@@ -345,7 +345,7 @@ def _likelier(robot: Candidate, plain: Candidate) -> Candidate:
     """Return ``plain`` if it predicts poses better by more than chance, else ``robot``.
 
     With robots that have no error but noise, ``plain`` looks better by chance, and it puts their
-    cameras up to five times as far off. By chance it is taken for two of eighty such robots, so
+    cameras up to five times as far off. By chance it is taken for two of 140 such robots, so
     the difference of both is an error to expect until the gain is sure.
     """
     gain = _gain(plain, robot)
