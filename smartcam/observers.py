@@ -171,6 +171,18 @@ class Observers:
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
+        self._all: tuple[Observer, ...] = ()
+        self._on_state: tuple[Callable[..., None], ...] = ()
+        self._on_result: tuple[tuple[Callable[..., None], bool], ...] = ()
+        self._on_picture: tuple[Callable[..., None], ...] = ()
+        self.see_pictures: bool = False
+        self.see_states: bool = False
+        self.see_results: bool = False
+        self.see_each: bool = False
+        if observers != ():
+            self._take(observers)
+
+    def _take(self, observers: Iterable[Observer]) -> None:
         self._all = check_all(observers, "observers", "a list of observers")
         for one in self._all:
             if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
@@ -179,10 +191,10 @@ class Observers:
         seen = self._looking_at("on_results", "on_result")
         self._on_result = [(hook, name == "on_results") for hook, name in seen]
         self._on_picture = self._overriding("on_picture")
-        self.see_pictures: bool = bool(self._on_picture)
-        self.see_states: bool = bool(self._on_state)
-        self.see_results: bool = bool(self._on_result)
-        self.see_each: bool = not all(together for _, together in self._on_result)
+        self.see_pictures = bool(self._on_picture)
+        self.see_states = bool(self._on_state)
+        self.see_results = bool(self._on_result)
+        self.see_each = not all(together for _, together in self._on_result)
 
     def __bool__(self) -> bool:
         return bool(self._all)

@@ -5,6 +5,7 @@ A wrong option is a :exc:`~smartcam.ConfigurationError` that names it.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import re
 import sys
@@ -375,8 +376,20 @@ class CameraSettings:
         if any(value is _UNUSUAL for value in used.values()):
             used = _validated(given)
         used["name"] = used.get("name") or usual
-        return cls(address=address, given=frozenset(given), **used)
+        made = object.__new__(cls)  # in a fifth of the steps of the frozen class's own constructor
+        values = vars(made)
+        values.update(_DEFAULTS)
+        values["application_names"] = {}
+        values.update(used)
+        values["address"], values["given"] = address, frozenset(given)
+        return made
 
+
+_DEFAULTS = {
+    one.name: one.default
+    for one in dataclasses.fields(CameraSettings)
+    if one.default is not dataclasses.MISSING
+}
 
 _UNUSUAL = object()
 """Stands for a value about which pydantic has to decide."""

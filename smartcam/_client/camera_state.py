@@ -117,6 +117,11 @@ class CameraState:
         self.status = report.status
 
     @property
+    def loading(self) -> bool:
+        """True while an application is being loaded, as :attr:`Status.loading` of the status."""
+        return self.bits & _RUNNING_OR_BUSY == _BUSY
+
+    @property
     def status_is_pending(self) -> bool:
         """True if a request for the status is not answered yet."""
         return self.statuses_received < self._statuses_due
@@ -144,7 +149,7 @@ class CameraState:
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""
         previous, self.active = self.active, application
-        if previous != application:
+        if previous != application and self._listeners.hears_changes:
             self._listeners.publish(
                 ApplicationChanged(
                     camera=self._name, at=at, application=application, previous=previous

@@ -16,8 +16,12 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
     from smartcam.protocols import Dialect
 
+MAX_KNOWN_FEATURES = 64
+"""Largest number of dialects whose features are kept: there are some twenty, and those with a
+camera's own layout are made anew."""
 
-@dataclass(slots=True)
+
+@dataclass(frozen=True, slots=True)
 class Features:
     """The features of a session's protocol that matter in every trigger.
 
@@ -45,9 +49,18 @@ class Features:
 
     @staticmethod
     def of(link: Link) -> Features:
-        """Return the features of a link's session."""
-        dialect = link.machine.dialect
-        ordered = link.machine.transport is Transport.TCP
+        """Return the features of a link's session; a dialect's features are found out once."""
+        dialect, ordered = link.machine.dialect, link.machine.transport is Transport.TCP
+        known = _known_features.get((id(dialect), ordered))
+        if known is not None:
+            return known[1]
+        features = Features._of(dialect, ordered=ordered)
+        if len(_known_features) < MAX_KNOWN_FEATURES:
+            _known_features[id(dialect), ordered] = dialect, features
+        return features
+
+    @staticmethod
+    def _of(dialect: Dialect, *, ordered: bool) -> Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
@@ -65,6 +78,14 @@ class Features:
         )
 
 
+NO_FEATURES = Features()
+"""The features before the first session."""
+
+_known_features: dict[tuple[int, bool], tuple[Dialect, Features]] = {}
+"""Features by the id of their dialect, which is kept beside them, and whether messages come in
+order."""
+
+
 @dataclass(eq=False)
 class Connection:
     """One link after the other.
@@ -80,7 +101,7 @@ class Connection:
 
     def __post_init__(self) -> None:
         self.link: Link | None = None
-        self.features: Features = Features()
+        self.features: Features = NO_FEATURES
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def begin_session(self, link: Link) -> None:

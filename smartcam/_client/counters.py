@@ -123,7 +123,10 @@ class ClientCounters:
     def end(self) -> None:
         """Keep the counters of a link that is over."""
         if self._open is not None:
-            self._wire, self._open = self._wire_total(), None
+            # the link's own object may still change
+            first = self.sessions == 1
+            self._wire = Counters(*_read(self._open)) if first else self._wire_total()
+            self._open = None
 
     def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:
         """Return everything counted so far."""

@@ -7,10 +7,13 @@ timer stays when a later deadline is set, and is set again only when it fires to
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import weakref
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+OwnerT = TypeVar("OwnerT")
 
 
 class DeadlineTimer:
@@ -64,3 +67,18 @@ class DeadlineTimer:
             return
         self._deadline = None
         self._callback()
+
+
+def weak_callback(owner: OwnerT, function: Callable[[OwnerT], None]) -> Callable[[], None]:
+    """Return a function that calls ``function`` with ``owner``, as long as the owner lives.
+
+    An owner of a timer that called a method of it would be freed by the garbage collector only.
+    """
+    reference = weakref.ref(owner)
+
+    def call() -> None:
+        living = reference()
+        if living is not None:
+            function(living)
+
+    return call

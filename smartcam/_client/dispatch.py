@@ -223,6 +223,7 @@ class Dispatch:
         self._waits.finish(error)
         self._results.finish()
         self._requests.finish()
+        self._takers = {}  # its methods refer to this object, which would wait for the collector
         self._listeners.end(None if isinstance(error, ConnectionClosedError) else error)
 
     # ------------------------------------------------------------------ by the kind of event

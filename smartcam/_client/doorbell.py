@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+PLAIN = os.environ.get("SMARTCAM_DOORBELL") == "plain"
+"""True if ``SMARTCAM_DOORBELL`` selected :class:`PlainDoorbell` when this module was imported."""
+
 
 class Doorbell:
     """One task may ``await`` it repeatedly; :meth:`ring` makes the task go on.
@@ -324,5 +327,4 @@ Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]
 
 def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:
     """Return a doorbell of the kind that ``SMARTCAM_DOORBELL`` selects."""
-    plain = os.environ.get("SMARTCAM_DOORBELL") == "plain"
-    return PlainDoorbell(loop) if plain else Doorbell(loop)
+    return PlainDoorbell(loop) if PLAIN else Doorbell(loop)

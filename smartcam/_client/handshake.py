@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     from smartcam.layout import Layout
     from smartcam.observers import RawFrame
+    from smartcam.protocols import Protocol
     from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
 
@@ -262,7 +263,10 @@ async def attempt(
 
 def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
     """Return the attempts at an address, each for a fresh link."""
-    protocol = load_protocol(address.protocol)
+    return _tries_by(load_protocol(address.protocol), address)
+
+
+def _tries_by(protocol: Protocol, address: Address) -> list[tuple[Dialect, ...]]:
     return protocol.tries(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
     )
@@ -300,6 +304,8 @@ def remarks(address: Address) -> set[str]:
 
 def names_of(dialects: Sequence[Dialect]) -> str:
     """Return the names of dialects that begin a session alike."""
+    if len(dialects) == 1:
+        return dialects[0].name
     return " or ".join(dict.fromkeys(dialect.name for dialect in dialects))
 
 
@@ -324,7 +330,7 @@ async def establish(
     address = settings.address
     protocol = load_protocol(address.protocol)
     transport = protocol.schemes[address.scheme]
-    groups = _for_layout(tries_for(address), layout)
+    groups = _for_layout(_tries_by(protocol, address), layout)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []

@@ -55,9 +55,8 @@ class KeepAlive:
 
         The trigger may also be another program's.
         """
-        status = self._state.status
-        loading = status is not None and status.loading
-        slow = loading or any(map(self._waits.is_pending, (m.SwitchAnswer, m.TriggerAnswer)))
+        pending = self._waits.is_pending
+        slow = self._state.loading or pending(m.SwitchAnswer) or pending(m.TriggerAnswer)
         return self._switch_timeout if slow else usual
 
 

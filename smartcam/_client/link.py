@@ -73,8 +73,32 @@ MAX_PASSES = 4
 """Largest number of turns of the loop before the next chunk, if other links share the loop: as
 long as other tasks take longer than one turn."""
 
-links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
-"""Number of links that are open on each loop."""
+
+class LinksOfLoop:
+    """The links that share an event loop.
+
+    Attributes:
+        open: number of links that are open.
+    """
+
+    __slots__ = ("open",)
+
+    def __init__(self) -> None:
+        self.open: int = 0
+
+    @staticmethod
+    def of(loop: asyncio.AbstractEventLoop) -> LinksOfLoop:
+        """Return the links of a loop: always the same object."""
+        known = _links_of_loops.get(loop)
+        if known is None:
+            known = _links_of_loops[loop] = LinksOfLoop()
+        return known
+
+
+_links_of_loops: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, LinksOfLoop] = (
+    weakref.WeakKeyDictionary()
+)
+
 
 MIN_FRAMES_PER_CHUNK = 5
 """Least number of frames of a cut chunk."""
@@ -143,6 +167,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.port = port
         self._liveness_timeout = liveness_timeout
         self.loop: asyncio.AbstractEventLoop = asyncio.get_running_loop()
+        self._beside = LinksOfLoop.of(self.loop)  # this link, and others on its loop
         self.heard_at: float = self.loop.time()
         self._transport: Any = None
         self._datagrams = machine.transport is Transport.UDP
@@ -166,8 +191,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._closers: list[asyncio.Future[None]] = []  # futures of the waits for its end
         self._loss: BaseException | None = None
         self._full = False  # the transport takes no more at present
-        self._writable = asyncio.Event()
-        self._writable.set()
+        self._writable: asyncio.Event | None = None  # made if the transport takes no more
         self._closing = False
         self._paused = False
 
@@ -209,7 +233,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     async def drain(self) -> None:
         """Wait until the transport takes more; bounded by the caller's deadline."""
-        await self._writable.wait()
+        if self._writable is not None:
+            await self._writable.wait()
 
     async def receive(self) -> Chunk:
         """Return the next chunk, one in a turn of the event loop; waits as long as the link lives.
@@ -314,7 +339,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio: the link is open."""
         self._transport = transport
-        links[self.loop] = links.get(self.loop, 0) + 1
+        self._beside.open += 1
         if self._datagrams:
             read_no_more_than_needed(transport)
             self._aside = second_socket(transport)
@@ -323,7 +348,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             # the camera sets it and advises it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
-                _keep_alive(sock, self._liveness_timeout)
+                for option in _keep_alive_options(self._liveness_timeout):
+                    sock.setsockopt(*option)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """asyncio: the buffer for the next bytes of a TCP link."""
@@ -366,7 +392,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the link is over."""
         self._lose(exc or ConnectionResetError("the camera closed the connection"))
-        links[self.loop] -= 1
+        self._beside.open -= 1
         if self._aside is not None:
             self._aside.close()
             self._aside = None
@@ -376,13 +402,13 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def pause_writing(self) -> None:
         """asyncio: the send buffer is full."""
-        self._full = True
-        self._writable.clear()
+        self._full, self._writable = True, self._writable or asyncio.Event()
 
     def resume_writing(self) -> None:
         """asyncio: the send buffer has room again."""
-        self._full = False
-        self._writable.set()
+        writable, self._full, self._writable = self._writable, False, None
+        if writable is not None:
+            writable.set()
 
     # ------------------------------------------------------------------ inside
 
@@ -440,7 +466,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     async def _give_way(self) -> None:
         """Let the loop make a turn, or several if busy other links share it."""
-        for _ in range(MAX_PASSES if links[self.loop] > 1 else 1):
+        for _ in range(MAX_PASSES if self._beside.open > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
             if perf_counter() - left < SHARED_TURN_TIME:
@@ -450,7 +476,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Set the size of the next chunks to one turn's time, by the time of the last chunk."""
         self._busy_since = None
         took = thread_time() - since
-        turn = SHARED_TURN_TIME if links[self.loop] > 1 else TURN_TIME
+        turn = SHARED_TURN_TIME if self._beside.open > 1 else TURN_TIME
         frames = int(self._busy_with * turn / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # one slow chunk may be an exception
         self._most = max(MIN_FRAMES_PER_CHUNK, min(LARGEST_CHUNK, frames))
@@ -620,13 +646,17 @@ _PROBES, _USER_TIMEOUT = (
 )
 
 
-def _keep_alive(sock: socket.socket, timeout: float) -> None:
-    """Make the system end a link whose peer acknowledges nothing for ``timeout`` seconds."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+@functools.lru_cache(maxsize=16)
+def _keep_alive_options(timeout: float) -> tuple[tuple[int, int, int], ...]:
+    """Return the options by which the system ends a link whose peer acknowledges nothing.
+
+    ``timeout``: seconds until then.
+    """
     probe = max(1, round(timeout / 3))  # whole seconds before the first probe, and between two
-    for option in _PROBE_TIMES:
-        sock.setsockopt(socket.IPPROTO_TCP, option, probe)
+    options = [(int(socket.SOL_SOCKET), int(socket.SO_KEEPALIVE), 1)]
+    options += [(int(socket.IPPROTO_TCP), option, probe) for option in _PROBE_TIMES]
     if _PROBES is not None:
-        sock.setsockopt(socket.IPPROTO_TCP, _PROBES, 2)
+        options.append((int(socket.IPPROTO_TCP), _PROBES, 2))
     if _USER_TIMEOUT is not None:  # milliseconds
-        sock.setsockopt(socket.IPPROTO_TCP, _USER_TIMEOUT, max(1, round(timeout * 1000)))
+        options.append((int(socket.IPPROTO_TCP), _USER_TIMEOUT, max(1, round(timeout * 1000))))
+    return tuple(options)

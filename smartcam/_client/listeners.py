@@ -98,6 +98,11 @@ class Listeners:
         """True if an event would go to a listener."""
         return bool(self.events.references) or self.notes_events()
 
+    @property
+    def hears_changes(self) -> bool:
+        """True if an event about a session or the active application would go to a listener."""
+        return self.sees_events
+
     def notes_events(self) -> bool:
         """Return True if an observer or the log needs events, even without a subscriber."""
         return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)

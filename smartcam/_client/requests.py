@@ -17,7 +17,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from smartcam._client.deadline import DeadlineTimer
+from smartcam._client.deadline import DeadlineTimer, weak_callback
 from smartcam._client.doorbell import wake
 from smartcam._client.handshake import code_text
 from smartcam.exceptions import (
@@ -60,7 +60,7 @@ class Requests:
         self._due: dict[object, float] = {}  # deadline of the last request of a kind
         # future of the wait that the timer belongs to
         self._late: Waiter | None = None
-        self._timer = DeadlineTimer(self._wake_late)
+        self._timer = DeadlineTimer(weak_callback(self, Requests._wake_late))
 
     def finish(self) -> None:
         """End for good: leave nothing in the event loop."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from smartcam._client.correlation import Correlation, Match, SentTrigger
-from smartcam._client.deadline import DeadlineTimer
+from smartcam._client.deadline import DeadlineTimer, weak_callback
 from smartcam._client.interpretation import new_tuple
 from smartcam._client.waits import copy_to_raise
 from smartcam.exceptions import (
@@ -107,7 +107,10 @@ class Results:
         )
         self._warned_extra = self._warned_others = False
         self._lossy = False  # a message may come twice, or not
-        self._timer = DeadlineTimer(lambda: self.give_up(TimeoutError()))
+        self._timer = DeadlineTimer(weak_callback(self, Results._time_out))
+
+    def _time_out(self) -> None:
+        self.give_up(TimeoutError())
 
     def begin_session(self, *, ordered: bool, complete: bool) -> None:
         """Begin a session.

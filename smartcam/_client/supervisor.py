@@ -86,7 +86,7 @@ class Supervisor:
         self._name = self._settings.name
         self._task: asyncio.Task[SmartCamError] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None
-        self._changed = asyncio.Event()
+        self._changed: asyncio.Event | None = None  # of the tasks that wait for a change
         self._closing = False
         self._closed: ConnectionClosedError | None = None  # error for all waits after close()
         self._ended_by: SmartCamError | None = None  # reason of the end, if not this program
@@ -200,7 +200,7 @@ class Supervisor:
                 while True:
                     if not self.started or self.over:
                         self._connection.require_link()
-                    changed = self._changed
+                    changed = self._changed = self._changed or asyncio.Event()
                     if self.connected:
                         await self._lock.settle()
                     if self.connected:
@@ -345,10 +345,12 @@ class Supervisor:
         self._dispatch.begin_session(session.dialect, ordered=ordered)
         self._commands.begin_session(session.link)
         self._counters.begin(session.link.machine.counters)
-        url, kind = session.address.url, Reconnected if again else Connected
-        logger.info("%s = connected to %s", self._name, url)
-        event = kind(camera=self._name, at=datetime.now(UTC), url=url)
-        self._listeners.publish(event)
+        kind = Reconnected if again else Connected
+        if logger.isEnabledFor(logging.INFO):
+            logger.info("%s = connected to %s", self._name, session.address.url)
+        if self._listeners.hears_changes:
+            url = session.address.url
+            self._listeners.publish(kind(camera=self._name, at=datetime.now(UTC), url=url))
         self._dispatch.dispatch_early(session.early)
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(None)
@@ -360,7 +362,7 @@ class Supervisor:
             try:
                 chunk = await link.receive()
             except ConnectionLostError as error:
-                return error
+                return error.with_traceback(None)  # else it would refer to this task's frames
             if self._listeners.has_subscribers:
                 link.wake_in_order()
             self._dispatch.dispatch(chunk)
@@ -377,9 +379,10 @@ class Supervisor:
             self._counters.note_loss(error)
             self._observers.error(self._name, error)
         self._dispatch.fail(error)
-        self._listeners.publish(
-            Disconnected(camera=self._name, at=datetime.now(UTC), reason=reason, expected=expected)
-        )
+        if self._listeners.hears_changes:
+            at = datetime.now(UTC)
+            event = Disconnected(camera=self._name, at=at, reason=reason, expected=expected)
+            self._listeners.publish(event)
         self._wake_waiters()
 
     async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
@@ -453,8 +456,9 @@ class Supervisor:
 
     def _wake_waiters(self) -> None:
         """Wake the tasks that wait for a change of the connection."""
-        self._changed.set()
-        self._changed = asyncio.Event()
+        changed, self._changed = self._changed, None
+        if changed is not None:
+            changed.set()
 
 
 def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:

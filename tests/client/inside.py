@@ -18,7 +18,7 @@ from smartcam._client.correlation import (
 from smartcam._client.dispatch import Dispatch
 from smartcam._client.doorbell import DirectFuture, Doorbell, outlast
 from smartcam._client.handshake import establish
-from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, open_link, split
+from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, LinksOfLoop, open_link, split
 from smartcam._client.requests import Requests
 from smartcam._client.results import PendingTrigger, Results
 from smartcam._client.triggering import FENCED_TRIGGER, TriggerRequest

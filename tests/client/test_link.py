@@ -451,7 +451,7 @@ async def test_drain_waits_for_a_peer_that_does_not_read(server: Listener) -> No
     link, peer = await session(server)
     peer.pause_reading()
     big = m.SetInput(data=bytes(1 << 20))
-    while link._writable.is_set():
+    while link.is_writable():
         link.send(big)
     draining = asyncio.create_task(link.drain())
     await asyncio.sleep(0)

@@ -14,7 +14,14 @@ from smartcam import Camera, CameraEvent, InterpretationError, Result, SmartCamE
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
 from tests.client.clientkit import balance, by_hand
-from tests.client.inside import LARGEST_CHUNK, DirectFuture, Doorbell, handshake, link
+from tests.client.inside import (
+    LARGEST_CHUNK,
+    DirectFuture,
+    Doorbell,
+    LinksOfLoop,
+    handshake,
+    link,
+)
 from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted, until
 
 # ---------------------------------------------------------------------- what comes early
@@ -265,8 +272,8 @@ async def test_flood_gives_way_again_while_others_are_at_work(
 async def test_link_that_has_ended_shares_no_loop() -> None:
     loop = asyncio.get_running_loop()
     async with by_hand(), by_hand():
-        assert link.links[loop] == 2
-    assert link.links[loop] == 0
+        assert LinksOfLoop.of(loop).open == 2
+    assert LinksOfLoop.of(loop).open == 0
 
 
 # ----------------------------------------------------------------------

@@ -22,7 +22,7 @@ with_magic = pytest.mark.parametrize("dialect", [HANDBOOK, THESIS], ids=label)
 FIXED = [
     (dialect, number, lengths)
     for dialect in DIALECTS
-    for number, lengths in dialect.lengths(m.Sender.CAMERA).items()
+    for number, lengths in dialect.lengths(m.Sender.CAMERA).by_id.items()
     if lengths.stop <= DEFAULT_MAX_LENGTH
 ]
 """Messages with a documented length: dialect, id, lengths that are accepted."""

@@ -121,6 +121,10 @@ class TappedListeners(Listeners):
     def watches_status(self) -> bool:
         return True
 
+    @property
+    def hears_changes(self) -> bool:
+        return True
+
     def publish(self, event: CameraEvent) -> None:
         super().publish(event)
         if self.tap is not None:

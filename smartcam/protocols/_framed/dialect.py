@@ -31,7 +31,7 @@ from smartcam.protocols._base import (
     Spelled,
     Verdict,
 )
-from smartcam.protocols._framed.framing import Buffer, Framer, HeaderLayout
+from smartcam.protocols._framed.framing import Buffer, Framer, HeaderLayout, Lengths
 from smartcam.protocols._machine import Frame
 from smartcam.protocols.messages import (
     Acknowledgement,
@@ -373,9 +373,9 @@ class FramedDialect(Dialect):
         return decoders
 
     @cached_property
-    def _lengths(self) -> dict[Sender, dict[int, range]]:
+    def _lengths(self) -> dict[Sender, Lengths]:
         return {
-            sender: {number: codec.lengths for number, codec in codecs.items()}
+            sender: Lengths({number: codec.lengths for number, codec in codecs.items()})
             for sender, codecs in self._decoders.items()
         }
 
@@ -573,8 +573,8 @@ class FramedDialect(Dialect):
         """Return the codecs of one sender's messages, by their ids."""
         return self._decoders[sender]
 
-    def lengths(self, sender: Sender) -> dict[int, range]:
-        """Return the lengths that the bodies of one sender's messages may have, by their ids."""
+    def lengths(self, sender: Sender) -> Lengths:
+        """Return the lengths that the bodies of one sender's messages may have."""
         return self._lengths[sender]
 
     def knows(self, sender: Sender, message_id: int) -> bool:

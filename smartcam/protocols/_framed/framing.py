@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import struct
+import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -107,6 +108,21 @@ class HeaderLayout:
         return reader
 
 
+class Lengths:
+    """The lengths that the payloads of one sender's messages may have.
+
+    Args:
+        by_id: lengths of a message's payload, by its id.
+
+    Attributes:
+        shortest: a length up to which no message is too long.
+    """
+
+    def __init__(self, by_id: Mapping[int, range]) -> None:
+        self.by_id = by_id
+        self.shortest: int = min((one.stop - 1 for one in by_id.values()), default=sys.maxsize)
+
+
 class Framer:
     """Cuts frames out of bytes.
 
@@ -141,13 +157,13 @@ class Framer:
         self._window = self._store  # size of the next read
         self._most = MAX_READ_BYTES  # largest size of a read
 
-    def expect(self, lengths: Mapping[int, range]) -> None:
+    def expect(self, lengths: Lengths) -> None:
         """Refuse a payload that is longer than its message allows, even if it is below the limit.
 
-        ``lengths``: allowed lengths of a message's payload, by its id; others are not limited.
+        Other messages than those of ``lengths`` are not limited.
         """
-        self._lengths = lengths
-        self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
+        self._lengths = lengths.by_id
+        self._always = min(self._max_length, lengths.shortest)
 
     @property
     def buffered(self) -> int:

@@ -138,16 +138,18 @@ TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transition
 """``{(state, sender, message type): next state}``, for both roles. All other cases are illegal."""
 
 
-_NEXT_STATES: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
-    (state, sender): {
-        kind: following
-        for (before, who, kind), following in TRANSITIONS.items()
-        if (before, who) == (state, sender)
+_NEXT_STATES: dict[m.Sender, dict[State, dict[type[Message], State]]] = {
+    sender: {
+        state: {
+            kind: following
+            for (before, who, kind), following in TRANSITIONS.items()
+            if (before, who) == (state, sender)
+        }
+        for state in State
     }
-    for state in State
     for sender in m.Sender
 }
-""":data:`TRANSITIONS` by state and sender, which is faster to look up for each message."""
+""":data:`TRANSITIONS` by sender and state, which is faster to look up for each message."""
 
 
 _Made: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
@@ -229,7 +231,17 @@ class Machine:
     __slots__ = (
         *("_asks", "_begun", "_begun_at", "_bounded", "_burst_reader", "_burst_size", "_chunks"),
         *("_constant", "_deaf", "_decoders", "_deliveries", "_events", "_familiar", "_framer"),
-        *("_header_size", "_may_come", "_may_go", "_narrows", "_open", "_outbox", "_plain"),
+        *(
+            "_header_size",
+            "_may_come",
+            "_may_go",
+            "_narrows",
+            "_next_to_come",
+            "_next_to_go",
+            "_open",
+            "_outbox",
+            "_plain",
+        ),
         *("_policy", "_result_head", "_result_id", "_results", "_says", "_sender"),
         *("_sent_data_key", "_sent_frames", "_state", "_status_id", "_status_size", "_statuses"),
         *("_takes_bursts", "_trace", "_unfinished", "_unknown_deliveries", "_volley", "counters"),
@@ -268,6 +280,7 @@ class Machine:
         # ids of the pending answers (client role), in order; of requests sent ``again``, twice
         self._open: tuple[int, ...] = ()
         self._sender, self._says = role.receives, role.sends
+        self._next_to_come, self._next_to_go = _NEXT_STATES[self._sender], _NEXT_STATES[self._says]
         self._asks = role is Role.CLIENT
         self._plain = self._asks and trace is None
         self._decoders: dict[int, Codec] = {}
@@ -316,6 +329,7 @@ class Machine:
         self._takes_bursts = self._asks and result.size > 0
         self._sent_frames = {}
         self._forget_familiar()
+        self._familiar = {self._status_id: self._statuses}
 
     @property
     def state(self) -> State:
@@ -327,8 +341,7 @@ class Machine:
         self._state = state
         self._deaf = state is State.FAILED or state is State.CLOSED
         self._narrows = state is State.CONNECTING
-        self._may_come = _NEXT_STATES[state, self._sender]
-        self._may_go = _NEXT_STATES[state, self._says]
+        self._may_come, self._may_go = self._next_to_come[state], self._next_to_go[state]
         self._forget_familiar()
 
     # ------------------------------------------------------------------ bytes in
@@ -569,6 +582,8 @@ class Machine:
         A camera has few statuses, and sends two around each result. Statuses and pending answers
         are recognized byte for byte, results by all bytes before their data.
         """
+        if not (self._statuses or self._results or len(self._familiar) > 1):
+            return
         framer, events = self._framer, self._events
         buffer, start = framer.buffer, framer.start
         if not self._plain or isinstance(buffer, memoryview):
@@ -811,9 +826,11 @@ class Machine:
 
     def _forget_familiar(self) -> None:
         """Read each message anew from now on, since it may have another meaning or none."""
-        self._statuses, self._results, self._chunks, self._deliveries = {}, {}, {}, {}
-        self._unknown_deliveries, self._volley = MAX_KNOWN_DELIVERIES, None
-        self._familiar = {self._status_id: self._statuses}
+        known = self._statuses or self._results or self._chunks or self._volley
+        if known or len(self._familiar) > 1 or self._unknown_deliveries < MAX_KNOWN_DELIVERIES:
+            self._statuses, self._results, self._chunks, self._deliveries = {}, {}, {}, {}
+            self._unknown_deliveries, self._volley = MAX_KNOWN_DELIVERIES, None
+            self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:
         """Leave out the kin without such a message, or with another length of it."""
