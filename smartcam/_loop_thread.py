@@ -111,6 +111,7 @@ class _ThreadCall:
             "_mailbox",
             "_result",
             "_task",
+            "_work",
         ),
     )
 
@@ -119,6 +120,7 @@ class _ThreadCall:
         self._mailbox = mailbox
         self._function = function
         self._task: asyncio.Task[Any] | None = None
+        self._work: Coroutine[Any, Any, object] | None = None
         self._result: Any = None
         self._error: BaseException | None = None
         self._cancelled = self._finished = False
@@ -168,9 +170,10 @@ class _ThreadCall:
         try:
             got = self._function()
             if inspect.iscoroutine(got):
-                self._task = start_task(self._finish_by(got))
+                self._work = got
+                task = self._task = start_task(self._finish_by(got))
                 if sys.version_info < (3, 12):
-                    self._task.add_done_callback(lambda _: self._never_begun(got))
+                    task.add_done_callback(self._end_unbegun)
                 return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
@@ -179,6 +182,8 @@ class _ThreadCall:
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
         """Run a coroutine; the waiting thread goes on without another turn of the loop."""
+        if sys.version_info < (3, 12) and self._task is not None:
+            self._task.remove_done_callback(self._end_unbegun)  # it would take another turn
         try:
             got = await work
         except asyncio.CancelledError:
@@ -189,10 +194,10 @@ class _ThreadCall:
         else:
             self._succeed(got)
 
-    def _never_begun(self, work: Coroutine[Any, Any, object]) -> None:
+    def _end_unbegun(self, _: asyncio.Task[None]) -> None:
         """End a coroutine that was cancelled before its task's first step; asyncio does not."""
-        if not self._finished:
-            work.close()
+        if not self._finished and self._work is not None:
+            self._work.close()
             self._fail(asyncio.CancelledError())
 
     def _succeed(self, result: object) -> None:

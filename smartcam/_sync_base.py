@@ -78,9 +78,7 @@ def _in_event_loop() -> bool:
 
     A notebook has an event loop, too, but that loop does nothing while a cell runs.
     """
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
+    if asyncio._get_running_loop() is None:  # noqa: SLF001 - documented; it raises no error
         return False
     ipython = sys.modules.get("IPython")
     return ipython is None or cast("Any", ipython).get_ipython() is None

@@ -191,7 +191,8 @@ class SmartCamera(Camera[ValueT]):
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline, timeout)
             deadline = self._connection.in_seconds(timeout)
-            await lock.turn(deadline, timeout)  # as hold() does, without an object for it
+            if not lock.take_if_free():  # as hold() does, without an object for it
+                await lock.wait_for_turn(deadline, timeout)
             try:
                 return await triggers.trigger(request, deadline, timeout)
             finally:

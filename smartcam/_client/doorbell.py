@@ -42,10 +42,10 @@ class Doorbell:
     Cancellation: safe; the task is woken by the loop.
     """
 
-    __slots__ = ("_asyncio_future_blocking", "_context", "_wake", "due", "loop")
+    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake", "due")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.loop: asyncio.AbstractEventLoop = loop
+        self._loop = loop  # asyncio's tasks read it
         # outcomes of the present delivery; None: outcomes wake by way of the loop
         self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
@@ -59,17 +59,17 @@ class Doorbell:
         if wake is None or context is None:
             return
         self._wake = None
-        if asyncio.current_task(self.loop) is None:
+        if asyncio.current_task(self._loop) is None:
             context.run(wake, self)
         else:
-            self.loop.call_soon(wake, self, context=context)
+            self._loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
         """Make the task go on as :meth:`ring` does, then the callers whose outcomes it has set.
 
         The loop raises exceptions that end the program: a transport would take them for its own.
         """
-        wake, context, loop = self._wake, self._context, self.loop
+        wake, context, loop = self._wake, self._context, self._loop
         if wake is None or context is None or asyncio.current_task(loop) is not None:
             self.ring()
             return
@@ -97,11 +97,11 @@ class Doorbell:
 
     def outcome(self) -> DirectFuture[Any]:
         """Return an outcome that one task may wait for."""
-        return DirectFuture(self)
+        return DirectFuture(self, self._loop)
 
     def give(self, outcome: Outcome, value: object) -> None:
         """Give an outcome its result: its task goes on at once, unless another task runs."""
-        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self.loop) is not None:
+        if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
             outcome.set_result(value)
             return
         due, self.due = self.due, []
@@ -110,17 +110,13 @@ class Doorbell:
         try:
             outcome.wake()
         except ENDS_PROGRAM as exc:
-            self.loop.call_soon(_raise, exc)
+            self._loop.call_soon(_raise, exc)
 
     # ------------------------------------------------------------------ for the task's machinery
 
     def __await__(self) -> Generator[Doorbell, None, None]:
         self._asyncio_future_blocking = True
         yield self
-
-    def get_loop(self) -> asyncio.AbstractEventLoop:
-        """Return the loop that the task runs in."""
-        return self.loop
 
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
@@ -132,7 +128,7 @@ class Doorbell:
         """Wake the task, which is then cancelled."""
         wake, self._wake = self._wake, None
         if wake is not None:
-            self.loop.call_soon(wake, self, context=self._context)
+            self._loop.call_soon(wake, self, context=self._context)
         return False
 
     def result(self) -> None:
@@ -147,11 +143,11 @@ class DirectFuture(Generic[T]):
 
     __slots__ = (
         *("_asyncio_future_blocking", "_bell", "_cancelled", "_context", "_done", "_error"),
-        *("_value", "_wake"),
+        *("_loop", "_value", "_wake"),
     )
 
-    def __init__(self, bell: Doorbell) -> None:
-        self._bell = bell
+    def __init__(self, bell: Doorbell, loop: asyncio.AbstractEventLoop) -> None:
+        self._bell, self._loop = bell, loop
         self._asyncio_future_blocking = False
         self._done = self._cancelled = False
         self._value: T | None = None
@@ -207,7 +203,7 @@ class DirectFuture(Generic[T]):
         """Make the task go on in the loop's next turn, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None:
-            self._bell.loop.call_soon(wake, self, context=self._context)
+            self._loop.call_soon(wake, self, context=self._context)
 
     # ------------------------------------------------------------------ for the task's machinery
 
@@ -217,10 +213,6 @@ class DirectFuture(Generic[T]):
             yield self  # an error is raised here
             return self._value  # type: ignore[return-value]
         return self.result()
-
-    def get_loop(self) -> asyncio.AbstractEventLoop:
-        """Return the loop that the task runs in."""
-        return self._bell.loop
 
     def add_done_callback(
         self, wake: Callable[[DirectFuture[T]], None], *, context: contextvars.Context

@@ -152,6 +152,15 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         heard_at: loop time of the last byte received.
     """
 
+    # an object with more than thirty attributes and no slots is slower at each of them
+    __slots__ = (
+        *("_aside", "_beside", "_busy_since", "_busy_with", "_chunks", "_closed", "_closers"),
+        *("_closing", "_datagrams", "_doorbell", "_frames", "_full", "_liveness_timeout"),
+        *("_loss", "_most", "_paused", "_replies", "_room", "_send_all", "_transport"),
+        *("_writable", "deliveries", "heard_at", "host", "loop", "machine", "name", "on_rest"),
+        *("outcome", "port", "wake_in_order"),
+    )
+
     def __init__(
         self,
         machine: LinkMachine,
@@ -173,6 +182,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
+        self._room = machine.room
         # if the machine can send several at once
         each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
         self._send_all = getattr(machine, "send_all", each)
@@ -353,7 +363,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """asyncio: the buffer for the next bytes of a TCP link."""
-        return self.machine.room()
+        return self._room()
 
     def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
@@ -441,7 +451,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return None
 
     def _say_goodbye(self) -> None:
-        if self.machine.state in {State.CONNECTED, State.CONNECTING}:
+        state = self.machine.state
+        if state is State.CONNECTED or state is State.CONNECTING:
             self.machine.send(Disconnect())
             self._flush()
 

@@ -242,7 +242,7 @@ class Requests:
 
     def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
         """Note that Queries went out with a trigger: no task waits for their answers."""
-        self._waits.expect_fences(count)
+        self._waits.fences_open = count
         due = sent_at + self.patience
         # max() takes twenty times as long
         self._due[m.QueryAnswer] = due if due > deadline else deadline  # noqa: FURB136

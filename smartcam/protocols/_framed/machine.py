@@ -223,6 +223,7 @@ class Machine:
             are left, :meth:`adopt` decides.
 
     Attributes:
+        room: function that returns the buffer for a stream's next bytes; call :meth:`filled` next.
         transitions: the next state by state, sender and type of message; all other messages are
             illegal.
     """
@@ -245,7 +246,7 @@ class Machine:
         *("_policy", "_result_head", "_result_id", "_results", "_says", "_sender"),
         *("_sent_data_key", "_sent_frames", "_state", "_status_id", "_status_size", "_statuses"),
         *("_takes_bursts", "_trace", "_unfinished", "_unknown_deliveries", "_volley", "counters"),
-        *("dialect", "error", "kin", "replies", "role", "transport"),
+        *("dialect", "error", "kin", "replies", "role", "room", "transport"),
     )
 
     transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
@@ -272,6 +273,7 @@ class Machine:
         self._bounded = self._policy.bounded
         self._header_size = dialect.header.size
         self._framer = Framer(dialect.header, max_length)
+        self.room: Callable[[], memoryview] = self._framer.room
         self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, and its time
         self._unfinished = frame_age.Unfinished()
         self._trace = trace
@@ -405,10 +407,6 @@ class Machine:
             frames = [self.dialect.to_frame(one) for one in messages]
             if b"".join(map(self.dialect.encode_frame, frames)) == data:
                 self._chunks[data] = messages, frames
-
-    def room(self) -> memoryview:
-        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
-        return self._framer.room()
 
     def filled(self, count: int, now: float = 0.0) -> bool:
         """Accept ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
