@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import warnings
+import weakref
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ import smartcam
 from smartcam.emulator import EmulatedCamera
 from tests.client.clientkit import gone
 from tests.handmade import until
+from tests.insides import inside
 
 COUNTING: list[dict[str, Any]] = [
     {"id": 1, "layout": "n: int32", "generator": "sequence"},
@@ -82,6 +84,24 @@ async def test_client_that_was_closed_or_never_opened_says_nothing() -> None:
             del camera
             smartcam.connect(emulator.url)
             gc.collect()
+
+
+async def test_client_that_was_closed_goes_without_the_collector() -> None:
+    async with EmulatedCamera(COUNTING, builtins=False) as emulator:
+        async with smartcam.connect(emulator.url) as camera:
+            await camera.trigger(1)
+        supervisor = inside(camera)._supervisor
+        parts = [
+            weakref.ref(one)
+            for one in (camera, supervisor, supervisor._dispatch, inside(camera)._requests)
+        ]
+        gc.disable()
+        try:
+            del camera, supervisor
+            await asyncio.sleep(0)  # asyncio itself has what a task was woken by
+            assert [one() for one in parts] == [None] * len(parts)
+        finally:
+            gc.enable()
 
 
 def test_client_of_a_loop_that_is_closed_says_nothing_more() -> None:

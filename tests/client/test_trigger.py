@@ -61,7 +61,7 @@ from tests.client.clientkit import (
     quiet,
     steps,
 )
-from tests.client.inside import Chunk, TriggerRequest
+from tests.client.inside import Chunk, TriggerRequest, _Lock
 from tests.handmade import until
 from tests.insides import inside
 from tests.timed_loop import spend
@@ -603,6 +603,26 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
 
 
 TELLING = (WAITING, RUNNING, BUSY, OVERTRIGGERED, SYSTEM_ERROR)
+
+
+async def test_free_lock_is_not_taken_from_a_task_in_line() -> None:
+    lock, heard = _Lock(), list[str]()
+
+    async def in_line() -> None:
+        async with lock:
+            heard.append("in line")
+
+    assert lock.take()
+    assert not lock.take()
+    task = asyncio.create_task(in_line())
+    await asyncio.sleep(0)
+    lock.release()
+    assert not lock.locked()
+    assert not lock.take()  # the task in line is woken, and has not gone on yet
+    await task
+    assert heard == ["in line"]
+    assert lock.take()
+    lock.release()
 
 
 async def test_triggers_at_once_take_turns() -> None:
