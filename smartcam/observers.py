@@ -179,7 +179,7 @@ class Observers:
         self.see_states: bool = False
         self.see_results: bool = False
         self.see_each: bool = False
-        if observers != ():
+        if type(observers) is not tuple or observers:
             self._take(observers)
 
     def _take(self, observers: Iterable[Observer]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from smartcam.streams import Subscribers
 
@@ -33,7 +33,10 @@ class Listeners:
         events: subscriptions to events.
         observed: True if an observer handles results.
         may_await: True if the next result was requested since the last one.
+        hears_all_changes: True if :meth:`publish` passes events on even without a subscriber.
     """
+
+    hears_all_changes: ClassVar[bool] = False
 
     def __init__(self, name: str, observers: Observers) -> None:
         self.results: Subscribers[Result] = Subscribers()
@@ -101,7 +104,7 @@ class Listeners:
     @property
     def hears_changes(self) -> bool:
         """True if an event about a session or the active application would go to a listener."""
-        return self.sees_events
+        return self.hears_all_changes or self.sees_events
 
     def notes_events(self) -> bool:
         """Return True if an observer or the log needs events, even without a subscriber."""

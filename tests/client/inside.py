@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from smartcam._client import handshake, link, polling
-from smartcam._client.command_lock import _Lock
 from smartcam._client.connection import Connection
 from smartcam._client.correlation import (
     Correlation,

@@ -30,6 +30,7 @@ from smartcam import (
     TriggerTimeoutError,
     WrongApplicationError,
 )
+from smartcam._client.command_lock import _Lock
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
     BUSY,
@@ -61,7 +62,7 @@ from tests.client.clientkit import (
     quiet,
     steps,
 )
-from tests.client.inside import Chunk, TriggerRequest, _Lock
+from tests.client.inside import Chunk, TriggerRequest
 from tests.handmade import until
 from tests.insides import inside
 from tests.timed_loop import spend

@@ -103,6 +103,7 @@ class Tap(NamedTuple):
 class TappedListeners(Listeners):
     """Passes everything to the agent, too."""
 
+    hears_all_changes = True
     tap: Tap | None = None
 
     @property
@@ -119,10 +120,6 @@ class TappedListeners(Listeners):
 
     @property
     def watches_status(self) -> bool:
-        return True
-
-    @property
-    def hears_changes(self) -> bool:
         return True
 
     def publish(self, event: CameraEvent) -> None:
