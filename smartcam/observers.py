@@ -173,7 +173,7 @@ class Observers:
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
         self._all: tuple[Observer, ...] = ()
         self._on_state: tuple[Callable[..., None], ...] = ()
-        self._on_result: tuple[tuple[Callable[..., None], bool], ...] = ()
+        self._on_result: list[tuple[Callable[..., None], bool]] = []
         self._on_picture: tuple[Callable[..., None], ...] = ()
         self.see_pictures: bool = False
         self.see_states: bool = False
