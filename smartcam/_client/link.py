@@ -157,8 +157,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         *("_aside", "_beside", "_busy_since", "_busy_with", "_chunks", "_closed", "_closers"),
         *("_closing", "_datagrams", "_doorbell", "_frames", "_full", "_liveness_timeout"),
         *("_loss", "_most", "_paused", "_replies", "_room", "_send_all", "_transport"),
-        *("_writable", "deliveries", "heard_at", "host", "loop", "machine", "name", "on_rest"),
-        *("outcome", "port", "wake_in_order"),
+        *("_writable", "deliveries", "heard_at", "host", "loop", "machine", "name"),
+        *("outcome", "port", "trace", "wake_in_order"),
     )
 
     def __init__(
