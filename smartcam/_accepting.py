@@ -452,7 +452,7 @@ def _is_last(connection: socket.socket, reserve: int) -> bool:
 def _make_room() -> bool:
     """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
-    open_here = [one.places for one in _here.acceptors if one.loop is loop]
+    open_here = [acceptor.places for acceptor in _here.acceptors if acceptor.loop is loop]
     waiting = [(found[0], one) for one in open_here if (found := one.waits_longest()) is not None]
     if not waiting:
         return False

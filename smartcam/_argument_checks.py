@@ -141,7 +141,7 @@ def each(check: Check, count: int | None = None) -> Check:
         items = a_list(value, what, who)
         if count is not None and len(items) != count:
             raise wrong_argument(what, f"{count} of them", value, who)
-        return tuple(check(one, what, who) for one in items)
+        return tuple(check(item, what, who) for item in items)
 
     return check_each
 

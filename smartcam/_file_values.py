@@ -92,7 +92,9 @@ Patterns = Annotated[
 
 def chosen(patterns: Sequence[str], camera: str) -> bool:
     """Return True if one of the patterns matches the camera's name."""
-    return any(_matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in patterns)
+    return any(
+        _matches(pattern.split("/"), camera.split("/"), "**", _part_fits) for pattern in patterns
+    )
 
 
 def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:

@@ -51,7 +51,9 @@ _PART = (
 
 def object_text(fields: Mapping[str, object]) -> str:
     """Return the text of an object."""
-    return f"{{{','.join([f'{_quoted(name)}:{text_of(one)}' for name, one in fields.items()])}}}"
+    return (
+        f"{{{','.join([f'{_quoted(name)}:{text_of(field)}' for name, field in fields.items()])}}}"
+    )
 
 
 def bytes_text(data: bytes) -> str:
@@ -126,17 +128,17 @@ def _table_text(table: Any) -> str | None:
         return None
     form, texts, numbers = row
     rows: list[tuple[Any, ...]] = table.tolist()
-    if numbers and not math.isfinite(sum([one[place] for one in rows for place in numbers])):
+    if numbers and not math.isfinite(sum([row[place] for row in rows for place in numbers])):
         return None  # the sum is not finite if a value is not
     if texts:
         rows = [
             tuple(
                 _quoted(_text_or_hex(field)) if place in texts else field
-                for place, field in enumerate(one)
+                for place, field in enumerate(row)
             )
-            for one in rows
+            for row in rows
         ]
-    return f"[{','.join([form % one for one in rows])}]"
+    return f"[{','.join([form % row for row in rows])}]"
 
 
 @functools.lru_cache(maxsize=256)
@@ -144,16 +146,16 @@ def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
     """Return the form of a row, the places of its texts and floats; None for other columns."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
-        one.kind not in _FORMS or (one.kind == "f" and one.itemsize > MAX_FLOAT_BYTES)
-        for one in kinds
+        kind.kind not in _FORMS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)
+        for kind in kinds
     ):
         return None
     fields = zip(dtype.names, kinds, strict=True)
     form = ",".join(
         [f"{_quoted(name).replace('%', '%%')}:{_FORMS[one.kind]}" for name, one in fields]
     )
-    texts = frozenset(place for place, one in enumerate(kinds) if one.kind == "S")
-    floats = tuple(place for place, one in enumerate(kinds) if one.kind == "f")
+    texts = frozenset(place for place, kind in enumerate(kinds) if kind.kind == "S")
+    floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")
     return f"{{{form}}}", texts, floats
 
 
@@ -196,7 +198,7 @@ def plain(value: Any) -> Any:
         fields: dict[str, Any] = value._asdict()
         if _PLAIN.issuperset(map(type, fields.values())):
             return fields
-        return {name: plain(one) for name, one in fields.items()}
+        return {name: plain(field) for name, field in fields.items()}
     if _is_table(value):
         rows = _rows(value)
         if rows is not None:

@@ -71,7 +71,7 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
     scores = _scores_by_parts(word, words)
     for one, score in _scores_by_edits(word, words).items():
         scores[one] = max(score, scores.get(one, 0.0))
-    close = (one for one in words if scores.get(one, -1.0) >= least)
+    close = (word for word in words if scores.get(word, -1.0) >= least)
     return max(close, key=scores.__getitem__, default=None)
 
 
@@ -108,10 +108,10 @@ def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
     for one in known:
         by_fold.setdefault(one.lower(), one)
     folded, scores = word.lower(), {}
-    for one in difflib.get_close_matches(folded, by_fold, n=MAX_CANDIDATES):
-        score = _likeness(folded, one)
+    for match in difflib.get_close_matches(folded, by_fold, n=MAX_CANDIDATES):
+        score = _likeness(folded, match)
         if score:
-            scores[by_fold[one]] = score
+            scores[by_fold[match]] = score
     return scores
 
 
@@ -138,7 +138,7 @@ def _parts(word: str) -> list[str]:
 
 def _near(part: str, every: Iterable[str]) -> dict[str, float]:
     """Return the parts that equal a part, begin with it or are a few edits away, with scores."""
-    near = {one: _likeness(part, one) for one in difflib.get_close_matches(part, every, n=10)}
+    near = {match: _likeness(part, match) for match in difflib.get_close_matches(part, every, n=10)}
     if len(part) >= MIN_PREFIX_LETTERS:
         begun = (one for one in every if one.startswith(part))
         near |= {one: max(PREFIX_SCORE, near.get(one, 0.0)) for one in begun}

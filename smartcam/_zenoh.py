@@ -181,8 +181,10 @@ class BusLink:
 def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
     """Return endpoints to listen on, with a free port in place of port 0."""
     return tuple(
-        f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
-        for one in endpoints
+        f"{endpoint.removesuffix(':0')}:{_free_port(endpoint)}"
+        if endpoint.endswith(":0")
+        else endpoint
+        for endpoint in endpoints
     )
 
 
@@ -400,7 +402,7 @@ class ZenohSession:
         """Close lingering connections now, and again before a new one can outlast its lease."""
         self._look = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
         endpoints = (*self._link.listen, *self._link.connect)
-        ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
+        ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in endpoints)
         self._loop.run_in_executor(None, _end_lingering, ports)
 
     async def _why(self, error: Exception) -> str:
@@ -721,8 +723,8 @@ def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     engine's thread while holding the interpreter lock, and that thread may wait for the lock to
     call another session of this process.
     """
-    for one in threads:
-        one.shutdown()
+    for thread in threads:
+        thread.shutdown()
     if router:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()

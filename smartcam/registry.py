@@ -154,7 +154,7 @@ def _distribution(point: EntryPoint) -> str:
 
 def _points(group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group; for a distribution found twice, the first one's."""
-    found = [(one, _entry_points_text(one)) for one in _distributions()]
+    found = [(distribution, _entry_points_text(distribution)) for distribution in _distributions()]
     if not any(text is None or group in text for _, text in found):
         return  # the usual case; names are slow to read
     seen: set[str] = set()

@@ -253,15 +253,15 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         for protocol in known_protocols():
             if scheme in protocol.schemes:
                 return protocol, url
-        schemes = [one for protocol in known_protocols() for one in protocol.schemes]
+        schemes = [scheme for protocol in known_protocols() for scheme in protocol.schemes]
         if is_fleet(url):
-            own = " or ".join(f"{one}://" for one in schemes)
+            own = " or ".join(f"{scheme}://" for scheme in schemes)
             raise UnsupportedError(
                 f"{masked(url)} is of a fleet, whose agent has the session with the camera: this "
                 f"wants the camera's own address, which begins with {own}"
             )
         schemes += FLEET_SCHEMES
-        known = ", ".join(f"{one}://" for one in schemes)
+        known = ", ".join(f"{scheme}://" for scheme in schemes)
         raise ConfigurationError(
             f"camera address {masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
             f"{did_you_mean(scheme, schemes)}"

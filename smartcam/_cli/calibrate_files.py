@@ -153,8 +153,8 @@ async def compare(
             f"{len(second.lenses)}"
         )
     found = [
-        compare_lenses(one, other, distance=distance)
-        for one, other in zip(first.lenses, second.lenses, strict=True)
+        compare_lenses(lens, other, distance=distance)
+        for lens, other in zip(first.lenses, second.lenses, strict=True)
     ]
     for name, comparison in zip(first.names, found, strict=True):
         options.show(_data(name, comparison), _text(name, comparison))
@@ -249,7 +249,7 @@ def _numbers(figures: MapFigures) -> dict[str, float | None]:
 def _row(name: str, figures: MapFigures) -> list[object]:
     return [
         name,
-        *(round(float(f"{one:.3g}"), 6) if math.isfinite(one) else "-" for one in figures),
+        *(round(float(f"{figure:.3g}"), 6) if math.isfinite(figure) else "-" for figure in figures),
     ]
 
 

@@ -130,7 +130,7 @@ async def lens(
     """Calibrate a lens."""
     from smartcam.calibration import calibrate_intrinsics
 
-    sources = [one for one in pictures if is_source(one)]
+    sources = [picture for picture in pictures if is_source(picture)]
     if sources and len(pictures) > 1:
         raise click.UsageError("expected files and folders, or one URL")
     if not sources and (options.count or options.seconds):
@@ -268,7 +268,11 @@ def _report_once(error: CalibrationError, reported: set[str]) -> None:
 def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
     points = 0 if view is None else len(view.ids)
     value = {"picture": name, "used": view is not None, "points": points, "reason": why}
-    found = "; ".join([f"{points} points", *(one.text for one in view.warnings)]) if view else ""
+    found = (
+        "; ".join([f"{points} points", *(warning.text for warning in view.warnings)])
+        if view
+        else ""
+    )
     options.show(value, f"{name}: {found or f'not used: {why}'}")
 
 
@@ -298,7 +302,7 @@ def _value(output: str, found: IntrinsicCalibration) -> dict[str, Any]:
         "deviations": found.deviations,
         "distortion": found.camera.distortion.tolist(),
         "lacking": list(found.coverage.lacking),
-        "remarks": [f"{one.code}: {one.text}" for one in found.warnings],
+        "remarks": [f"{warning.code}: {warning.text}" for warning in found.warnings],
     }
 
 

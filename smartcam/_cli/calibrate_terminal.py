@@ -295,8 +295,8 @@ def _end_text(view: Mapping[str, Any]) -> str:
     result = dict(view["result"])
     use, remarks = result.pop("use", {}), result.pop("remarks", [])
     rows = [f"  {name}: {_result_text(value)}" for name, value in result.items()]
-    for one in remarks:
-        rows += _note_lines(one if isinstance(one, str) else ": ".join(one))
+    for remark in remarks:
+        rows += _note_lines(remark if isinstance(remark, str) else ": ".join(remark))
     for name, text in use.items():
         rows += ["", _USES[name], "", text.rstrip("\n")]
     return "\n".join(["", "done", *_verdict_lines(view), *rows])

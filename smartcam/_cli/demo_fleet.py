@@ -109,12 +109,12 @@ def _show_fleet(fleet: Fleet, steps: Steps) -> None:
     cameras = fleet.cameras()
     steps.step(f"The whole fleet by one URL, {len(cameras)} cameras:", agents=fleet.agents())
     rows = [
-        (one.name, *fleet.agents(one.name), one.active_application, str(one.status))
-        for one in cameras
+        (camera.name, *fleet.agents(camera.name), camera.active_application, str(camera.status))
+        for camera in cameras
     ]
     steps.detail(
         table_text(("camera", "agent", "application", "status"), rows),
-        cameras=[one.url for one in cameras],
+        cameras=[camera.url for camera in cameras],
     )
 
 
@@ -173,7 +173,9 @@ async def _trigger_all(fleet: Fleet, steps: Steps) -> None:
     begin = loop.time()
     outcomes = await fleet.trigger(timeout=PATIENCE_TIMEOUT)
     taken = loop.time() - begin
-    results: list[Result] = [one for one in outcomes.values() if not isinstance(one, SmartCamError)]
+    results: list[Result] = [
+        outcome for outcome in outcomes.values() if not isinstance(outcome, SmartCamError)
+    ]
     steps.step(
         f"All cameras triggered at once: {len(results)} results of {len(outcomes)} cameras after "
         f"{1e3 * taken:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",

@@ -120,7 +120,7 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
         found = await asyncio.to_thread(check.inspect, picture)
         with naming(f"--folder {folder}"):
             await asyncio.to_thread(_draw, folder / "seen" / f"{part.name}.png", found)
-        wrong = [name for name, one in found.findings.items() if not one.ok]
+        wrong = [name for name, finding in found.findings.items() if not finding.ok]
         milliseconds = 1e3 * sum(found.seconds.values())
         rows.append(
             (part.name, part.fault or "none", ", ".join(wrong) or "none", f"{milliseconds:.1f} ms")

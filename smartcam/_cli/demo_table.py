@@ -318,7 +318,7 @@ class TableRobot:
         ``grip``: the true pose of the reference in the part's frame.
         """
         off, part = min(
-            ((self._off(one, found, grip), one) for one in self._table.parts),
+            ((self._off(part, found, grip), part) for part in self._table.parts),
             key=lambda pair: abs(pair[0][0]),
         )
         error, turned = abs(off[0]), off[1]

@@ -159,7 +159,7 @@ def _look(table: TowerTable, colours: ColourRange) -> Seen:
     overview = table.look(OVERVIEW)
     depth = SpatialFilter(delta=EDGE)(overview.depth[0])
     blocks = loose_blocks(overview, depth, colours)
-    reached = [one for one in blocks if REACH[0] <= math.hypot(one.x, one.y) <= REACH[1]]
+    reached = [block for block in blocks if REACH[0] <= math.hypot(block.x, block.y) <= REACH[1]]
     if not reached:
         raise FrameFormatError(
             f"{ARM}: expected a block within {REACH[0]:g} to {REACH[1]:g} m of the robot, got "
@@ -219,10 +219,10 @@ def loose_blocks(
         FrameFormatError: there is no block of the colour; the error describes the largest region.
     """
     lying: list[BlockPose] = []
-    for one in _regions(sight, colours):
-        height = sight.camera[2] - region_depth(depth, one.mask).median
+    for region in _regions(sight, colours):
+        height = sight.camera[2] - region_depth(depth, region.mask).median
         if abs(height - BLOCK[2]) < EDGE:  # it is not on the tower
-            lying.append(_pose(sight, one, height))
+            lying.append(_pose(sight, region, height))
     if not lying:
         raise _nothing(sight, colours)
     return lying
@@ -235,7 +235,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
         FrameFormatError: the block is not there.
     """
     sight = table.look((rough.x, rough.y, NEAR), maps=0)
-    found = [_pose(sight, one, BLOCK[2]) for one in _regions(sight, colours)]
+    found = [_pose(sight, region, BLOCK[2]) for region in _regions(sight, colours)]
     if not found:
         raise _nothing(sight, colours)
     block = min(found, key=lambda one: math.dist(one[:2], rough[:2]))

@@ -160,7 +160,7 @@ def _deviation(values: Sequence[float]) -> float | None:
     mean = _mean(values)
     if mean is None or len(values) < 2:
         return None
-    return math.sqrt(sum((one - mean) ** 2 for one in values) / (len(values) - 1))
+    return math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:

@@ -63,12 +63,13 @@ def address(_context: object, parameter: click.Parameter, text: str | None) -> A
 def names_of(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
     """Return sources by unique names that fit into a URL."""
     named: dict[str, FrameSource] = {}
-    for one in sources:
+    for source in sources:
         plain = (
-            re.sub(r"[^A-Za-z0-9._~-]+", "-", one.name)[:MAX_NAME_LETTERS].strip("-._~") or "camera"
+            re.sub(r"[^A-Za-z0-9._~-]+", "-", source.name)[:MAX_NAME_LETTERS].strip("-._~")
+            or "camera"
         )
         numbered = (f"{plain}-{number}" for number in range(2, len(sources) + 2))
-        named[next(name for name in (plain, *numbered) if name not in named)] = one
+        named[next(name for name in (plain, *numbered) if name not in named)] = source
     return named
 
 

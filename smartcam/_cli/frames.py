@@ -69,7 +69,9 @@ async def list_(scheme: str | None, options: Options) -> None:
 
     known = [info.name for info in FRAMES.available()]
     schemes = known if scheme is None else [scheme]
-    looks = await asyncio.gather(*(_look(one, options.step(FRAME_TIMEOUT)) for one in schemes))
+    looks = await asyncio.gather(
+        *(_look(scheme, options.step(FRAME_TIMEOUT)) for scheme in schemes)
+    )
     shown: set[str] = set()
     searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
     for name, look in zip(schemes, looks, strict=True):

@@ -249,7 +249,7 @@ def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
     played = {} if server is None else server.statistics()
     rows: list[str] = []
     for place, (name, source) in enumerate(names_of(site.sources).items()):
-        who = sorted(one.address for one in site.viewers if one.place == place)
+        who = sorted(viewer.address for viewer in site.viewers if viewer.place == place)
         by_rtsp = played[name].viewers if name in played else 0
         who += [f"{by_rtsp} by RTSP"] if by_rtsp else []
         rows += [f"{source.name}: {', '.join(who)}"] if who else []

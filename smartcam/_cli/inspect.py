@@ -64,7 +64,7 @@ async def inspect(
             f"{did_you_mean(camera, cameras)}"
         )
     program = cameras[camera].program(which)
-    files = [file for one in pictures for file in picture_files(Path(one))]
+    files = [file for picture in pictures for file in picture_files(Path(picture))]
     folder = None if output is None else Path(output)
     if folder is not None:
         with naming(f"--output {output}"):
@@ -126,7 +126,7 @@ def _fields(file: Path, found: Inspection, drawn: Path | None) -> dict[str, Any]
         "ok": found.ok,
         "reason": found.reason,
         "value": found.value,
-        "milliseconds": {name: 1e3 * one for name, one in found.seconds.items()},
+        "milliseconds": {name: 1e3 * seconds for name, seconds in found.seconds.items()},
         **({} if drawn is None else {"drawn": str(drawn)}),
     }
 

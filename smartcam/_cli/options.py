@@ -132,7 +132,7 @@ def runs(
             with importing():
                 from smartcam._cli.running import run
 
-            common = {one.name for one in fields(Options)} & given.keys()
+            common = {field.name for field in fields(Options)} & given.keys()
             options = Options(**{name: given.pop(name) for name in common})
             has_page = "web" in given and given["web"].wanted
             run(

@@ -70,8 +70,8 @@ async def _served(
 
     file, folder = load_fleet(path), Path(path).parent
     sections = {one.name: one.entry.ros2 for one in file.plan()}
-    found = {name: one.load_calibration(folder) for name, one in sections.items()}
-    hand_eyes = {name: one.load_hand_eye(folder) for name, one in sections.items()}
+    found = {name: section.load_calibration(folder) for name, section in sections.items()}
+    hand_eyes = {name: section.load_hand_eye(folder) for name, section in sections.items()}
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_tried()
@@ -82,7 +82,9 @@ async def _served(
             _section(namespace or section.namespace, autostart=section.autostart),
             cameras=sections,
             calibrations={name: one for name, one in found.items() if one is not None},
-            hand_eyes={name: one for name, one in hand_eyes.items() if one is not None},
+            hand_eyes={
+                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
+            },
             wanted=lambda agent, _camera: agent == file.agent_name,
             desks=server.calibrations,
         ) as ros:

@@ -283,7 +283,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
     from smartcam.recording import FleetRecorder
 
     def say(trouble: RecordingError | None) -> None:
-        lost = {name: one.lost for name, one in recorder.accounts.items() if one.lost}
+        lost = {name: account.lost for name, account in recorder.accounts.items() if account.lost}
         value = {
             "recordings": str(recorder.path),
             "recording": trouble is None,

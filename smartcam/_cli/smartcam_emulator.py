@@ -164,7 +164,9 @@ async def command(
     async with AsyncExitStack() as stack:
         for server in servers:
             await stack.enter_async_context(server)
-        emulators = [one if isinstance(one, WireCamera) else one.emulator for one in servers]
+        emulators = [
+            server if isinstance(server, WireCamera) else server.emulator for server in servers
+        ]
         address = await _open_page(web, stack, emulators)
         named = scenario is not None or program is not None
         for emulator in emulators:

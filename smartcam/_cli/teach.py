@@ -75,7 +75,7 @@ async def teach(
         from smartcam.inspection import Teaching
 
     teaching = Teaching(cell, camera, which)
-    files = [file for one in pictures for file in picture_files(Path(one))]
+    files = [file for picture in pictures for file in picture_files(Path(picture))]
     if changes or learn or save:
         await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
         return
@@ -127,7 +127,7 @@ def _change(
         value["learned"] = remarks
     text = [f"{'saved' if save else 'not saved'}: application {teaching.application}"]
     text += [f"  {key}: {settings}" for key, settings in tools.items()]
-    text += [f"learned {one}" for one in remarks]
+    text += [f"learned {remark}" for remark in remarks]
     options.show(value, "\n".join(text))
 
 

@@ -153,7 +153,9 @@ def _options_suggested() -> Iterator[None]:
         from smartcam._suggestions import did_you_mean
 
         known = [
-            name for one in exc.ctx.command.params for name in (*one.opts, *one.secondary_opts)
+            name
+            for parameter in exc.ctx.command.params
+            for name in (*parameter.opts, *parameter.secondary_opts)
         ]
         names = [name for name in known if name.startswith("--")]
         end = did_you_mean(exc.option_name, names) or "."

@@ -440,7 +440,7 @@ class Results:
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if an equal container came before, as when a datagram comes twice."""
         results = pending.results if pending is not None else []
-        return any(one.raw == container.data for one in results)
+        return any(result.raw == container.data for result in results)
 
     def _note_extra(self, count: int = 1) -> None:
         self._counters.note_extra(count)

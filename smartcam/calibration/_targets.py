@@ -347,9 +347,10 @@ def resized(target: T, factor: float, digits: int | None = None) -> T:
         CalibrationError: SHAPE: the factor is not positive.
     """
     lengths = {
-        one.name: factor * value if digits is None else round(factor * value, digits)
-        for one in dataclasses.fields(target)
-        if str(one.type).startswith("float") and (value := getattr(target, one.name)) is not None
+        field.name: factor * value if digits is None else round(factor * value, digits)
+        for field in dataclasses.fields(target)
+        if str(field.type).startswith("float")
+        and (value := getattr(target, field.name)) is not None
     }
     return dataclasses.replace(target, **lengths)
 

@@ -146,7 +146,7 @@ def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]
     """Return values as a list; raise SHAPE unless each is of one of some kinds."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.unexpected(f"{what}: expected a list of such", "a list", described(values))
-    return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
+    return [checked(value, kinds, f"{what} {number}") for number, value in enumerate(values)]
 
 
 def as_covariances(values: Any, count: int, what: str) -> Array:

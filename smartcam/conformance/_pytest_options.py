@@ -71,9 +71,9 @@ def terminal_summary(reporter: Any) -> None:
     found = [
         value
         for reports in reporter.stats.values()
-        for one in reports
-        if getattr(one, "when", None) == "call"
-        for name, value in one.user_properties
+        for report in reports
+        if getattr(report, "when", None) == "call"
+        for name, value in report.user_properties
         if name == PROPERTY
     ]
     if found:

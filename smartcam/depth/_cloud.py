@@ -128,7 +128,7 @@ class Cloud:
                     f"got {len(found)} of {len(parts)}"
                 )
             columns[name] = np.concatenate(found) if found else None
-        points = [np.empty((0, 3), np.float32), *(one.points for one in parts)]
+        points = [np.empty((0, 3), np.float32), *(part.points for part in parts)]
         return cls(np.concatenate(points), **columns)
 
     def transformed(self, pose: Transform) -> Self:

@@ -54,7 +54,7 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
         ConfigurationError: the corners are not (3,), or one is not below the other.
     """
     corners = [np.asarray(one, np.float64) for one in (low, high)]
-    if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
+    if any(corner.shape != (3,) for corner in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
     ends = _as_float32(corners)
     inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)

@@ -59,7 +59,7 @@ class PairClock:
         Each camera's own clock sets its frame rate. Without timestamps of these clocks, and at the
         same nominal rate, the ratio of the frame rates is the ratio of the clocks.
         """
-        left, right = (None if one is None else one.drift for one in clocks)
+        left, right = (None if clock is None else clock.drift for clock in clocks)
         if left is not None and right is not None:
             return (right - left) / (1 + left), "clocks"
         rates = self._rates()

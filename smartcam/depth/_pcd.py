@@ -107,9 +107,9 @@ def _header(data: bytes) -> _PcdHeader:
     width, height, points = (_one(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
         raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
-    if lines["DATA"] not in [[one] for one in READERS]:
+    if lines["DATA"] not in [[reader] for reader in READERS]:
         raise BadTableError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
-    many = [count_of(one, "numbers") for one in counts]
+    many = [count_of(count, "numbers") for count in counts]
     if max(many) > MAX_FIELDS or min(many) < 1:
         raise BadTableError(f"COUNT from 1 to {MAX_FIELDS}", f"{min(many)} to {max(many)}")
     return _PcdHeader(names, types, many, points, lines["DATA"][0], place)

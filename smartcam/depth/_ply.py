@@ -162,10 +162,10 @@ def _add_part(element: _PlyElement, *part: str) -> None:
 
 def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
     """Return the elements before the vertices, and the vertices' element."""
-    for place, one in enumerate(elements):
-        if one.name == "vertex":
-            return elements[:place], one
-    found = ", ".join(shown(one.name) for one in elements) or "none"
+    for place, element in enumerate(elements):
+        if element.name == "vertex":
+            return elements[:place], element
+    found = ", ".join(shown(element.name) for element in elements) or "none"
     raise BadTableError("an element vertex", found)
 
 

@@ -247,7 +247,7 @@ def _judged(
         planes = planes_of(goals, tree, NEIGHBOURS, once).taken(places.reshape(-1))
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
-        reasons += [_described(one, match.moved - centre) for one in steps]
+        reasons += [_described(step, match.moved - centre) for step in steps]
         left_open = steps.copy()
         left_open[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
         rows = slopes(match.arms, planes.normals)

@@ -139,7 +139,7 @@ class TowerTable:
     def tower(self) -> list[WoodenBlock]:
         """Return the blocks of the highest stack, the lowest first."""
         top = max(self.blocks, key=lambda one: one.top)
-        stack = [one for one in self.blocks if _apart(one, top) < BLOCK[0] / 2]
+        stack = [block for block in self.blocks if _apart(block, top) < BLOCK[0] / 2]
         return sorted(stack, key=lambda one: one.z)
 
     def pick(self, x: float, y: float, angle: float) -> Grip:
@@ -148,7 +148,7 @@ class TowerTable:
         Returns the errors from the nearest black block; ``held`` is None if it is missed.
         """
         wanted = WoodenBlock(x, y, angle)
-        loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]
+        loose = [block for block in self.blocks if block.z == 0 and block.colour == "black"]
         block = min(loose, key=lambda one: _apart(one, wanted))
         grip = Grip(_apart(block, wanted), math.remainder(angle - block.angle, math.pi))
         if grip.off < GRIP_TOLERANCE_METRES and block.size == BLOCK:
@@ -330,10 +330,10 @@ def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) 
     for _ in range(100_000):
         x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)
         apart = min(
-            math.hypot(x - one.x, y - one.y)
+            math.hypot(x - block.x, y - block.y)
             - math.hypot(*size[:2]) / 2
-            - math.hypot(*one.size[:2]) / 2
-            for one in table.blocks
+            - math.hypot(*block.size[:2]) / 2
+            for block in table.blocks
         )
         beside = math.hypot(x - tower.x, y - tower.y)
         if apart > MIN_GAP_METRES and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:

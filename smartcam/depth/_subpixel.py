@@ -273,7 +273,7 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     factors = {node: t - np.float32(node) for node in range(-2, 4)}
     value = np.zeros_like(t)
     for node, pixel in zip(factors, pixels, strict=True):
-        others = [one for one in factors if one != node]
+        others = [factor for factor in factors if factor != node]
         weight = pixel * np.float32(1 / np.prod([node - one for one in others]))
         for one in others:
             weight *= factors[one]

@@ -90,10 +90,10 @@ def from_text(
 
     Numbers for integer types must be whole and in range.
     """
-    check_row(np.dtype([(str(place), one) for place, one in enumerate(types)]))
+    check_row(np.dtype([(str(place), kind) for place, kind in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
-    columns = tuple(np.empty(count, one) for one in types)
+    columns = tuple(np.empty(count, kind) for kind in types)
     done, place, left = 0, start, skipped
     while done < count:
         lines: list[list[bytes]] = []

@@ -164,7 +164,7 @@ async def find(exam: Examination) -> None:
         return
     sharing = [(fleet, agent) for fleet, agent, name in cameras if name == address.camera]
     fleets = sorted({fleet for fleet, _ in sharing})
-    details: dict[str, Any] = {"agents": agents, "cameras": len({one[2] for one in cameras})}
+    details: dict[str, Any] = {"agents": agents, "cameras": len({camera[2] for camera in cameras})}
     if not sharing:
         names = sorted({name for _, _, name in cameras})
         listed = ", ".join(names[:MAX_CAMERAS_LISTED]) + (

@@ -150,8 +150,12 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
     """Return an open port with the protocols that fit the received bytes."""
     received = opened.received.lstrip()
-    greeted = [one for one in protocols if one.greeting and received.startswith(one.greeting)]
-    possible = greeted or [one for one in protocols if _may_be(one, opened)]
+    greeted = [
+        protocol
+        for protocol in protocols
+        if protocol.greeting and received.startswith(protocol.greeting)
+    ]
+    possible = greeted or [protocol for protocol in protocols if _may_be(protocol, opened)]
     evidence: Evidence = "silent"
     if greeted:
         evidence = "greeted"
@@ -184,9 +188,9 @@ def is_decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:
     start = received.lstrip()
     if not start:
         return False
-    for one in protocols:
-        if one.greeting is None or (one.greeting and one.greeting.startswith(start)):
+    for protocol in protocols:
+        if protocol.greeting is None or (protocol.greeting and protocol.greeting.startswith(start)):
             return False
-        if one.greeting and start.startswith(one.greeting):
+        if protocol.greeting and start.startswith(protocol.greeting):
             return b"\n" in start
     return True

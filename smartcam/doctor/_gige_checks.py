@@ -165,7 +165,7 @@ async def _find_address(exam: _GigEExamination) -> None:
 
 async def _look_at_networks(exam: _GigEExamination) -> None:
     """Check whether the camera's address is in one of this machine's networks."""
-    own = [one for one in discovery.networks() if one.network is not None]
+    own = [network for network in discovery.networks() if network.network is not None]
     if not own:
         exam.add("hint", "the networks of this machine cannot be listed here")
         return
@@ -219,7 +219,7 @@ async def _ask(exam: _GigEExamination) -> None:
     if taken:
         where = f" at {ipaddress.IPv4Address(other)}" if other else ""
         own = other and str(ipaddress.IPv4Address(other)) in {
-            one.address for one in discovery.networks()
+            network.address for network in discovery.networks()
         }
         raise exam.fail(
             f"another application{where} controls it{', on this machine' if own else ''}: one at a "

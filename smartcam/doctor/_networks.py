@@ -80,11 +80,11 @@ class AddressSet:
                 self._spans[-1] = Span(before.first, max(before.last, span.last))
             else:
                 self._spans.append(span)
-        self._firsts = [_place(one.first) for one in self._spans]
+        self._firsts = [_place(span.first) for span in self._spans]
 
     def __len__(self) -> int:
         """Return the number of addresses."""
-        return sum(one.size for one in self._spans)
+        return sum(span.size for span in self._spans)
 
     def __contains__(self, address: HostAddress) -> bool:
         """Return True if an address is in the set."""

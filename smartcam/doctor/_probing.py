@@ -191,7 +191,7 @@ def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
     """Return the protocol whose greeting a try has received, None without one."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
-    heard = next((one.hex for one in trial.frames if one.direction == "!"), "")
+    heard = next((frame.hex for frame in trial.frames if frame.direction == "!"), "")
     start = bytes.fromhex(heard).lstrip()
     return next((name for name in names if _greets(load_protocol(name), start)), None)
 

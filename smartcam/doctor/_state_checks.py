@@ -93,7 +93,7 @@ async def look_at_status(exam: Examination) -> None:
     camera = exam.connected_camera
     capable = camera.capabilities
     status = await camera.query_status() if capable.get_status else camera.status
-    wrong = [one for one in _CONDITIONS if one.bit in status]
+    wrong = [condition for condition in _CONDITIONS if condition.bit in status]
     for one in wrong:
         sticky = one.bit is Status.OVERTRIGGERED and capable.reset_errors
         cure = one.cure + (_STICKY if sticky else "")

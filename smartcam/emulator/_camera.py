@@ -289,7 +289,9 @@ class EmulatedCamera(WireCamera):
     def table(self) -> TableScene | None:
         """The table that its pages show; None if all applications inspect real pictures."""
         applications = self.device.applications.values()
-        inspects = all(isinstance(one, InspectedApplication) for one in applications)
+        inspects = all(
+            isinstance(application, InspectedApplication) for application in applications
+        )
         return None if inspects else self.scene
 
     @property
@@ -324,7 +326,8 @@ class EmulatedCamera(WireCamera):
             "next_number": device.next_number,
             "queued_inputs": device.queued_inputs,
             "applications": [
-                {key: getattr(one, key) for key in SHOWN} for one in device.applications.values()
+                {key: getattr(application, key) for key in SHOWN}
+                for application in device.applications.values()
             ],
             "quirks": self.quirks,
             "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),

@@ -46,7 +46,7 @@ def applications_of(
     """
     fields = [{"id": one} if isinstance(one, int) else one for one in given]
     try:
-        return [kind(**{**(defaults or {}), **one}) for one in fields]
+        return [kind(**{**(defaults or {}), **field}) for field in fields]
     except TypeError as exc:
         raise ConfigurationError(f"applications: {exc}") from exc
 
@@ -84,7 +84,7 @@ class EvaluatingCamera(LineCamera):
     def __init_subclass__(cls, **given: Any) -> None:
         """Collect the methods that answer requests, in order."""
         super().__init_subclass__(**given)
-        own = {one.form: one for one in vars(cls).values() if hasattr(one, "form")}
+        own = {member.form: member for member in vars(cls).values() if hasattr(member, "form")}
         cls.requests = {**cls.requests, **own}
 
     def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:

@@ -107,7 +107,7 @@ class LineCodec:
 
     def row_of_word(self, word: str) -> int:
         """Return the number of the row with a word, 0 for none."""
-        return next((number for number, one in enumerate(self._rows, 1) if one.word == word), 0)
+        return next((number for number, row in enumerate(self._rows, 1) if row.word == word), 0)
 
     def request_key(self, data: bytes) -> str:
         """Return the word or ticket of the answer to a line, "" if only the order shows it."""

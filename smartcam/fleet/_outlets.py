@@ -109,7 +109,7 @@ class FleetOutlets(Server):
         since = None if asked.since is None else datetime.fromisoformat(asked.since)
         question = self._question(since, asked.failed, asked.camera, asked.most)
         answers = await asyncio.to_thread(self.outlets.stored, question)
-        return {name: {"rows": one.rows, **one.summary} for name, one in answers.items()}
+        return {name: {"rows": answer.rows, **answer.summary} for name, answer in answers.items()}
 
     def reading(self, camera: str) -> Interpretation | None:
         """Return the interpretation of a camera's results; None for a camera that is not known."""
@@ -127,7 +127,7 @@ class FleetOutlets(Server):
                 spec = host.settings.interpret_as
             elif seeing:  # waiting entries of an earlier run may be requested first
                 made = software_camera(camera, entry.software or {}, self._server.folder)
-                spec = {number: one.interpret_as for number, one in made.programs.items()}
+                spec = {number: program.interpret_as for number, program in made.programs.items()}
             read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
             known = self._readings[camera] = of, read
         return known[1]

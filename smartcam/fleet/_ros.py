@@ -200,7 +200,7 @@ class RosFleet(Server):
     @property
     def names(self) -> list[str]:
         """The full names of the nodes."""
-        return sorted(one.node.full_name for one in self.nodes.values())
+        return sorted(node.node.full_name for node in self.nodes.values())
 
     async def stop(self) -> None:
         """Close all nodes. Idempotent, bounded."""

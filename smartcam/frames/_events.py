@@ -72,7 +72,7 @@ class FrameEvents:
     ) -> None:
         if not 0 < len(names) <= MAX_EVENT_NAMES:
             raise wrong_argument("names", f"1 to {MAX_EVENT_NAMES} names", names, "events")
-        self._names = tuple(check_text(one, "name", "events", most=200) for one in names)
+        self._names = tuple(check_text(name, "name", "events", most=200) for name in names)
         self._timeout = check_seconds_or_none(timeout, "timeout", "events")
         size = check_integer(size, "size", 1, MAX_QUEUED_EVENTS, "events")
         self._source = source

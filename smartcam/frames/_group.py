@@ -104,7 +104,7 @@ class FrameGroup:
         timeout: float | None = FRAME_TIMEOUT,
     ) -> None:
         check_kind(sources, Mapping, "group of frame sources", "a mapping from name to source")
-        if not sources or len({id(one) for one in sources.values()}) < len(sources):
+        if not sources or len({id(source) for source in sources.values()}) < len(sources):
             raise ConfigurationError(
                 f"group of frame sources: expected one or more, each once, got {list(sources)}"
             )
@@ -138,7 +138,7 @@ class FrameGroup:
         """
         if self._within is not None:
             return self._within
-        rates = [rate for one in self._sources.values() for rate in one.format.rates[:1]]
+        rates = [rate for source in self._sources.values() for rate in source.format.rates[:1]]
         return 0.5 * (1 / max(rates) if rates else UNKNOWN_PERIOD)
 
     def statistics(self) -> GroupStatistics:

@@ -66,7 +66,7 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
         schemes = [info.name for info in FRAMES.available()]
     else:
         schemes = [check_text(scheme, "scheme", "discover", most=100)]
-    kinds = dict.fromkeys(_driver(one, one) for one in schemes)
+    kinds = dict.fromkeys(_driver(scheme, scheme) for scheme in schemes)
     return [found for kind in kinds for found in await kind.discover()]
 
 

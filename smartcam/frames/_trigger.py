@@ -90,7 +90,7 @@ class TriggerQueue:
         except FrameSourceError:
             raise
         except TimeoutError as exc:
-            notes = "".join(f"; {one}" for one in pending.notes[:MAX_NOTES])
+            notes = "".join(f"; {note}" for note in pending.notes[:MAX_NOTES])
             waits = self._source.driver.waits_for
             raise TriggerTimeoutError(
                 f"{name}: no picture of the trigger within {seconds:g} s, which ran out while "

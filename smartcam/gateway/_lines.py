@@ -180,7 +180,7 @@ class AnswerWriter:
             NotWritableError: the answer has no room for the values.
         """
         style = self._style
-        values = [self._value(one) for one in answer.values]
+        values = [self._value(value) for value in answer.values]
         line = getattr(self, f"_{style.form}")(answer, values, tag)
         data: bytes = line.encode("ascii", "replace")
         end = style.line_end.encode()
@@ -240,4 +240,4 @@ class AnswerWriter:
 
 def plain(words: str) -> str:
     """Return a text on one line, of printable characters."""
-    return " ".join("".join(one if one.isprintable() else " " for one in words).split())
+    return " ".join("".join(word if word.isprintable() else " " for word in words).split())

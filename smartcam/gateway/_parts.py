@@ -88,8 +88,8 @@ class Parts:
             np.array(part.pose.position, dtype=np.float64),
         )
         numbers = pose_to(self._style.pose, pose)
-        position = [self._lengths * one / self._convention.metre for one in numbers[:3]]
-        turned = [one * self._angle_factor for one in numbers[3:]]
+        position = [self._lengths * number / self._convention.metre for number in numbers[:3]]
+        turned = [number * self._angle_factor for number in numbers[3:]]
         return [*position, *turned, *(getattr(part, name) for name in self._settings.also)]
 
     @property

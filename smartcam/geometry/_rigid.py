@@ -44,8 +44,8 @@ class Rigid(NamedTuple):
     def stacked(cls, motions: Iterable[Rigid]) -> Rigid:
         """Return single motions as one array."""
         rows = list(motions)
-        rotations = np.array([one.rotation for one in rows], dtype=np.float64)
-        translations = np.array([one.translation for one in rows], dtype=np.float64)
+        rotations = np.array([row.rotation for row in rows], dtype=np.float64)
+        translations = np.array([row.translation for row in rows], dtype=np.float64)
         return cls(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3))
 
     @property

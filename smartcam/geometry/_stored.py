@@ -153,7 +153,7 @@ class Stored:
     @classmethod
     def __get_pydantic_core_schema__(cls, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         hints = get_type_hints(cls, include_extras=True)
-        attributes = [one.name for one in dataclasses.fields(kind)]
+        attributes = [field.name for field in dataclasses.fields(kind)]
         names: dict[str, str] = {cls._keys.get(name, name): name for name in attributes}
         names.pop("", None)
         types = {key: hint for key, (hint, _) in cls._others.items()}
@@ -301,7 +301,9 @@ def _lists(values: Array) -> Any:
     """Return an array as nested lists, None for NaN."""
     if not np.isnan(values).any():
         return values.tolist()
-    return [_lists(one) for one in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
+    return (
+        [_lists(value) for value in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
+    )
 
 
 Vector2 = Annotated[Array, Form(Pair, as_array, _tolist)]

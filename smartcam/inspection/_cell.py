@@ -159,7 +159,7 @@ class CellCamera:
         for number, program in self.programs.items():
             if application in (number, str(number), program.name):
                 return program
-        known = [f"{number} ({one.name})" for number, one in self.programs.items()]
+        known = [f"{number} ({program.name})" for number, program in self.programs.items()]
         raise ConfigurationError(
             f"{self.name}: no application {application!r:.60}; there are {', '.join(known)}"
         )

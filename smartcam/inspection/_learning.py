@@ -96,11 +96,11 @@ def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspectio
 
 def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     findings = [*seen.values()]
-    counts = [int(one.values.get("count", 0)) for one in findings]
+    counts = [int(finding.values.get("count", 0)) for finding in findings]
     found: dict[str, Any] = {"count": [min(counts), max(counts)]}
     many = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
     remark = f"{many} spots in {_pictures(len(seen))}"
-    each = [one.records or (one.values,) for one in findings]
+    each = [finding.records or (finding.values,) for finding in findings]
     areas = [float(record["area"]) for records in each for record in records if record.get("area")]
     if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
         least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)

@@ -197,11 +197,13 @@ class FollowedApplication(Tool[ToolSettings]):
         findings: dict[str, Finding] = {}
         for step in self._steps:
             findings[step.name] = _finding_of(step.tool, view.picture, view.input, findings)
-        references = [one.reference for one in findings.values() if one.reference is not None]
+        references = [
+            finding.reference for finding in findings.values() if finding.reference is not None
+        ]
         return Finding(
-            ok=all(one.ok for one in findings.values()),
+            ok=all(finding.ok for finding in findings.values()),
             reason=_reason(findings),
-            drawings=[mark for one in findings.values() for mark in one.drawings],
+            drawings=[mark for finding in findings.values() for mark in finding.drawings],
             reference=references[-1] if references else None,
         )
 
@@ -271,8 +273,8 @@ def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, An
     }
     if step.records:
         values[step.name] = [
-            {field.name: one.get(field.name, _empty_value(field)) for field in step.records}
-            for one in found.records
+            {field.name: record.get(field.name, _empty_value(field)) for field in step.records}
+            for record in found.records
         ]
     return values
 
@@ -341,7 +343,7 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
         settings = model.model_validate({} if given is None else given)
     except ValidationError as exc:
         errors = exc.errors(include_url=False)  # a missing key may be a misspelled one
-        first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+        first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
         text = first["msg"].removeprefix("Value error, ") + hint(
             first, _known_settings(model, first["loc"])
         )

@@ -245,7 +245,7 @@ def tool_settings() -> dict[str, dict[str, str]]:
     for info in TOOLS.available():
         kind: Any = TOOLS.load(info.name)
         fields = kind.settings_model.model_fields
-        descriptions[info.name] = {name: one.description or "" for name, one in fields.items()}
+        descriptions[info.name] = {name: field.description or "" for name, field in fields.items()}
     return descriptions
 
 

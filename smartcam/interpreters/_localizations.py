@@ -269,7 +269,7 @@ def _sigma_use(fields: dict[str, Field]) -> _SigmaUse | None:
     if not set(_SIGMAS) <= set(names):
         return None
     units = [UNITS[unit] if (unit := fields[name].unit) else None for name in _SIGMAS]
-    scales = [one.multiply / one.divide if one else 1.0 for one in units]
+    scales = [unit.multiply / unit.divide if unit else 1.0 for unit in units]
     return _SigmaUse(
         tuple((names.index(name), scale) for name, scale in zip(_SIGMAS, scales, strict=True)),
         tuple(names.index(name) if name in fields else None for name in _CORRELATIONS),

@@ -245,7 +245,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; return when the broker has acknowledged all."""
         messages = [_message(entry) for entry in entries]
-        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
+        topics = [self._topic(entry.kind, entry.camera or "all") for entry in entries]
         sizes = [
             len(topic.encode()) + len(message)
             for topic, message in zip(topics, messages, strict=True)

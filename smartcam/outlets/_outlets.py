@@ -197,7 +197,7 @@ class Outlets(Server):
         found = self._chosen.get(camera)
         if found is None:
             pumps = self._pumps.values()
-            found = [one for one in pumps if one.outlet.settings.chooses(camera)]
+            found = [pump for pump in pumps if pump.outlet.settings.chooses(camera)]
             self._chosen[camera] = found
         return found
 

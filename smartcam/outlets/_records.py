@@ -29,9 +29,9 @@ def records_of(value: Any) -> list[dict[str, Any]] | None:
     """Return the records of a value, a mapping of plain values each; None if it has none."""
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
-        lists = [name for name, one in fields.items() if isinstance(one, list)]
+        lists = [name for name, field in fields.items() if isinstance(field, list)]
         if len(lists) == 1 and all(isinstance(one, dict) for one in fields[lists[0]]):
-            head = {name: one for name, one in fields.items() if name != lists[0]}
+            head = {name: field for name, field in fields.items() if name != lists[0]}
             return [_flat({**head, **one}) for one in fields[lists[0]]] or [_flat(head)]
         return [_flat(fields)]
     if isinstance(value, list) and all(isinstance(one, dict) for one in value):

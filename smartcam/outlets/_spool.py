@@ -229,9 +229,9 @@ class Spool:
         names = sorted(
             one for one in self.path.parent.glob(pattern) if one.name[-4:] not in ("-wal", "-shm")
         )
-        for one in names[:-MAX_DAMAGED_FILES]:
+        for name in names[:-MAX_DAMAGED_FILES]:
             for suffix in ("", "-wal", "-shm"):
-                one.with_name(one.name + suffix).unlink(missing_ok=True)
+                name.with_name(name.name + suffix).unlink(missing_ok=True)
 
     @property
     def _there(self) -> sqlite3.Connection:
@@ -263,7 +263,10 @@ class Spool:
             came = sum(entry.kind != "gap" for entry in entries)
             new["results"] = new.get("results", 0) + came
             taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
-            kept, refused = entries[:taken], [one for one in entries[taken:] if one.kind != "gap"]
+            kept, refused = (
+                entries[:taken],
+                [entry for entry in entries[taken:] if entry.kind != "gap"],
+            )
             size = self._write(database, kept)
             for last, count in _by_camera(refused):
                 _add_gap(database, last, count, "the spool was full", self._in_flight)
@@ -307,7 +310,7 @@ class Spool:
             places.append(place)
             dropped.append(OutletEntry(*fields))
             freed += size_of
-        database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+        database.executemany("DELETE FROM entries WHERE place = ?", [(place,) for place in places])
         last_places = {entry.camera: place for entry, place in zip(dropped, places, strict=True)}
         for last, count in _by_camera(dropped):
             place = last_places[last.camera]
@@ -340,7 +343,9 @@ class Spool:
         """Drop damaged entries, and add a gap for them."""
         database, counts = self._there, dict(self._counts)
         with _transaction(database):
-            database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+            database.executemany(
+                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+            )
             lost = _settle(database, counts)
             self._tell_all(database, lost, "entries of the spool were damaged")
             _set(database, counts)
@@ -370,10 +375,12 @@ class Spool:
                 if entry.kind != "gap":
                     counts["dropped.refused"] = self._counts.get("dropped.refused", 0) + 1
                     gone += 1
-            database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+            database.executemany(
+                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+            )
             _set(database, counts)
         self._counts |= counts
-        freed = sum(len(one.body) + ROW_BYTES for one in entries if one.kind != "gap")
+        freed = sum(len(entry.body) + ROW_BYTES for entry in entries if entry.kind != "gap")
         self._bytes -= freed
         self._spooled -= gone
         self._in_flight = 0
@@ -436,7 +443,7 @@ def _check_versions(path: Path) -> None:
     """
     with path.open("rb") as file:
         versions = file.read(20)[18:]
-    if any(one not in {1, 2} for one in versions):
+    if any(version not in {1, 2} for version in versions):
         raise sqlite3.DatabaseError(f"expected the versions 1 or 2, got {versions.hex(' ')}")
 
 
@@ -451,7 +458,7 @@ def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
         sqlite3.DatabaseError: the entries are damaged.
     """
     counts = dict(database.execute("SELECT name, value FROM counts"))
-    if not all(isinstance(one, int) and one >= 0 for one in counts.values()):
+    if not all(isinstance(count, int) and count >= 0 for count in counts.values()):
         raise sqlite3.DatabaseError("a count is none")
     return counts
 

@@ -378,7 +378,7 @@ def _readable(value: Any) -> Any:
         return value if value.isascii() else value.encode(errors="replace").decode()
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
-        return {_readable(name): _readable(one) for name, one in fields.items()}
+        return {_readable(name): _readable(field) for name, field in fields.items()}
     return [*map(_readable, value)] if isinstance(value, list) else value
 
 

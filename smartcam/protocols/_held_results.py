@@ -73,12 +73,12 @@ class HeldResults:
         Raises:
             FrameError: too many events wait for an answer.
         """
-        results = [one for one in messages if isinstance(one, m.ResultContainer)]
+        results = [message for message in messages if isinstance(message, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
         if answers_trigger and self._seen is not None:
             seen, self._seen = self._seen, None
         if results:
-            size = sum(len(one.data) for one in results)
+            size = sum(len(result.data) for result in results)
             self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
             self._size += size
         elif self._waiting:
@@ -150,8 +150,8 @@ def _with_application(held: _Held, named: int | None, *, unknown: bool) -> tuple
         fault = f"the application changed while the result was made: it may be of any of {which}"
     application = m.UNNAMED_APPLICATION if named is None else named
     return tuple(
-        replace(one, application=application, fault=one.fault or fault)
-        if isinstance(one, m.ResultContainer)
-        else one
-        for one in held.messages
+        replace(message, application=application, fault=message.fault or fault)
+        if isinstance(message, m.ResultContainer)
+        else message
+        for message in held.messages
     )

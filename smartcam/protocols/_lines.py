@@ -566,8 +566,8 @@ class LineMachine:
         messages = reported if isinstance(reported, tuple) else (reported,)
         if self._marks:
             messages = tuple(
-                replace(one, asked=asked) if isinstance(one, m.ResultContainer) else one
-                for one in messages
+                replace(message, asked=asked) if isinstance(message, m.ResultContainer) else message
+                for message in messages
             )
         if self._query is None:
             self._held.pass_on(messages)

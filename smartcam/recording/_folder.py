@@ -209,7 +209,7 @@ class RecordingFolder:
     @property
     def bytes(self) -> int:
         """Bytes of the recorder's files together."""
-        return sum(one.size for one in self.files.values())
+        return sum(file.size for file in self.files.values())
 
     def delete(self, name: str) -> None:
         """Delete a file of the recorder; keep one that another program has replaced.

@@ -122,7 +122,12 @@ class PictureMatcher:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
         return next(
-            (one for one in pictures if (one.result_number, one.result_received_at) == key), None
+            (
+                picture
+                for picture in pictures
+                if (picture.result_number, picture.result_received_at) == key
+            ),
+            None,
         )
 
     def _by_time(self, result: Result[Any]) -> Frame | None:
@@ -131,11 +136,13 @@ class PictureMatcher:
         triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
         if self._dropped >= triggered:
             return None
-        for one in self._pictures:
-            began = one.frame.utc - one.frame.duration
-            if one.result_number is None and triggered <= began <= one.frame.utc <= came:
-                missing = one.left_out or one.frame.lost  # a missing picture may be the result's
-                return None if missing else one.frame
+        for picture in self._pictures:
+            began = picture.frame.utc - picture.frame.duration
+            if picture.result_number is None and triggered <= began <= picture.frame.utc <= came:
+                missing = (
+                    picture.left_out or picture.frame.lost
+                )  # a missing picture may be the result's
+                return None if missing else picture.frame
         return None
 
 

@@ -495,7 +495,7 @@ class _Scan:
                 schemas[number] = name
             case Channel(number, schema):
                 name = schemas.get(schema, "")
-                kind = next((one for one in KINDS.values() if one.schema == name), None)
+                kind = next((kind for kind in KINDS.values() if kind.schema == name), None)
                 if kind is not None:
                     kinds[number] = kind
                 elif name in (ANNOTATIONS_SCHEMA, *PICTURE_SCHEMAS):

@@ -304,7 +304,7 @@ class Recorder(Observer):
 
     def on_results(self, results: Sequence[Result]) -> None:
         """Keep results that came together."""
-        self._put_all(results, 4 * sum([len(one.raw) for one in results]), "results")
+        self._put_all(results, 4 * sum([len(result.raw) for result in results]), "results")
 
     def on_picture(self, result: Result, frame: Frame) -> None:
         """Keep the picture of a result, unless ``pictures`` is False."""

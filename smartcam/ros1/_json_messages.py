@@ -103,7 +103,7 @@ def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
     if field.type in _BYTES:
         return Raw(value)
     items = value.tolist() if hasattr(value, "tolist") else list(value)
-    return [_signed(one) for one in items] if field.type == "byte" else items
+    return [_signed(item) for item in items] if field.type == "byte" else items
 
 
 def _signed(value: int) -> int:
@@ -127,7 +127,7 @@ def from_json(kind: MessageType, data: Any) -> Any:
                 f"{kind.name}: expected up to {len(kind.fields)} values, got {len(data)}"
             )
         names = RENAMED.get(kind.name, {})
-        ordered = [names.get(one.name, one.name) for one in kind.fields]
+        ordered = [names.get(field.name, field.name) for field in kind.fields]
         data = dict(zip(ordered, data, strict=False))
     message = kind.new(**_checked_fields(kind, data, "", _MAX_LEVELS))
     return kind.decode(kind.encode(message))  # makes numpy arrays and bytes, as in ROS 2
@@ -172,7 +172,7 @@ def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth
             if type(one) not in allowed:
                 raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {one!r:.80}")
         if field.type == "byte":
-            values = [one + 256 if -128 <= one < 0 else one for one in values]
+            values = [value + 256 if -128 <= value < 0 else value for value in values]
         return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:

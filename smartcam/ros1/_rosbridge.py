@@ -311,7 +311,7 @@ class RosbridgeNode(NamedNode):
             subscription.ask()
         self.begin(self._repeat_shared())
         self.begin(listen_for_subscribers(self, self._publishers))
-        self._new = [one for one in self._services.values() if one.exists]
+        self._new = [service for service in self._services.values() if service.exists]
         self._change()
 
     def _tell_change(self) -> None:

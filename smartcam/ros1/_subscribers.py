@@ -28,7 +28,9 @@ async def listen_for_subscribers(
     for publisher in publishers.values():
         publisher.subscribed = True
     while True:
-        for publisher in [one for one in publishers.values() if one.type.name in LARGE_TYPES]:
+        for publisher in [
+            publisher for publisher in publishers.values() if publisher.type.name in LARGE_TYPES
+        ]:
             answer = await node.ask(SERVICE, {"topic": publisher.name})
             values = answer.get("values") if answer else None
             found = values.get("subscribers") if isinstance(values, dict) else None

@@ -111,8 +111,8 @@ class CloudSite(ThreadedSite):
 
     async def stop(self) -> None:
         """Close the port, and end the viewers."""
-        for one in self.viewers:
-            one.end()
+        for viewer in self.viewers:
+            viewer.end()
         try:
             await super().stop()
         finally:

@@ -187,15 +187,15 @@ class ColourSite(ThreadedSite):
             "part": float(mask.mean()),
             "regions": [
                 {
-                    "area": one.area,
-                    "sides": one.sides,
-                    "ratio": one.ratio,
-                    "fullness": one.fullness,
-                    "orientation": one.orientation,
-                    "centre": one.centre,
-                    "corners": one.corners.tolist(),
+                    "area": region.area,
+                    "sides": region.sides,
+                    "ratio": region.ratio,
+                    "fullness": region.fullness,
+                    "orientation": region.orientation,
+                    "centre": region.centre,
+                    "corners": region.corners.tolist(),
                 }
-                for one in regions
+                for region in regions
             ],
             "jpeg": len(picture),
         }

@@ -212,7 +212,9 @@ def _calls(_site: EmulatorSite, _ask: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/cameras")
 def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
     """All cameras, in short."""
-    return {"cameras": [serialize.camera_row(name, one) for name, one in site.cameras.items()]}
+    return {
+        "cameras": [serialize.camera_row(name, camera) for name, camera in site.cameras.items()]
+    }
 
 
 @CALLS.add("GET", _CAMERA)

@@ -247,7 +247,7 @@ class FleetRow:
         self.mode = self._word(state)
         self.flags = _flags(self.mode, state, bad=self.error_at is not None)
         words = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
-        self.text = "\n".join(str(one) for one in words if one is not None).lower()
+        self.text = "\n".join(str(word) for word in words if word is not None).lower()
 
     def _word(self, state: RowState) -> str:
         if not state.agents or self.camera is None:

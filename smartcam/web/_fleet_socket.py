@@ -144,7 +144,7 @@ class FleetSocket(PageSocket):
         ordered = await view.ordered(sight.query)
         found = len(ordered.names)
         first = max(0, min(sight.first, found - sight.count))
-        names = [one for one in ordered.names[first : first + sight.count] if one in view.rows]
+        names = [name for name in ordered.names[first : first + sight.count] if name in view.rows]
         window = (found, first, names)
         if window != self._window:
             self._window = window

@@ -377,4 +377,4 @@ class FleetView:
 
 
 def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:
-    return wanted in row.flags and all(one in row.text for one in words)
+    return wanted in row.flags and all(word in row.text for word in words)

@@ -170,9 +170,9 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
     with _refused(site, place):
         found = await site.sources[place].features.describe()
     features = [{**dataclasses.asdict(one), "range": one.range} for one in found.values()]
-    for one in features:
-        if isinstance(one["value"], float) and not math.isfinite(one["value"]):
-            one["value"] = None
+    for feature in features:
+        if isinstance(feature["value"], float) and not math.isfinite(feature["value"]):
+            feature["value"] = None
     return {"settable": site.changes, "features": features}
 
 

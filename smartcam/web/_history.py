@@ -184,7 +184,8 @@ class ShiftHistory:
     def as_json(self) -> dict[str, Any]:
         """Return the history for the page: bars, and the failures, the oldest first."""
         failures = [
-            {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
+            {**asdict(failure), "picture": failure.serial in self._pictures}
+            for failure in self._failures
         ]
         return {
             "bars": [*self._bars],

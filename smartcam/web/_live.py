@@ -126,7 +126,7 @@ class LiveReader:
         view = self._view
         if self._serial > view.serial:  # from an earlier process
             self._serial = 0
-        new = [one for one in view.entries if one.serial >= self._serial]
+        new = [entry for entry in view.entries if entry.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial
         shown = new[-MAX_NEWS:]
         missed += len(new) - len(shown)
@@ -186,7 +186,7 @@ def _camera(site: ShowsCamera, _call: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/results")
 def _results(site: ShowsCamera, _call: CallRequest) -> object:
     """The last results, the oldest first."""
-    return {"results": [one.as_json() for one in site.view.entries]}
+    return {"results": [entry.as_json() for entry in site.view.entries]}
 
 
 @CALLS.add("GET", f"{API}/history")

@@ -327,7 +327,7 @@ def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
 def _units_of_lists(value: Any) -> dict[str, Mapping[str, str]]:
     """Return the units of the fields of a record's lists, by the lists' names."""
     fields = value._asdict() if hasattr(value, "_asdict") else {}
-    lists = {name: units_of(one) for name, one in fields.items() if isinstance(one, list)}
+    lists = {name: units_of(field) for name, field in fields.items() if isinstance(field, list)}
     return {name: units for name, units in lists.items() if units}
 
 

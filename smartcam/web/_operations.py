@@ -65,7 +65,7 @@ class OperationsSite(Server):
         if section.place is None:
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
         self._host, self._port = section.place
-        self._names = {socket.gethostname().lower(), *(one.lower() for one in section.names)}
+        self._names = {socket.gethostname().lower(), *(name.lower() for name in section.names)}
         self._each = section.latency == "camera"
         self._tried = False
         self._open: OpenPort | None = None

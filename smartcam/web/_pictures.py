@@ -96,8 +96,8 @@ class SitePictures:
 
     def end_viewers(self) -> None:
         """Tell all viewers that the site ends."""
-        for one in self.viewers:
-            one.end()
+        for viewer in self.viewers:
+            viewer.end()
 
     async def stop(self) -> None:
         """End the threads, once all viewers have left.
@@ -105,8 +105,8 @@ class SitePictures:
         Cancellation: takes effect at once; the threads end by themselves.
         """
         self.end_viewers()
-        for one in tuple(self.viewers):
-            await one.gone.wait()
+        for viewer in tuple(self.viewers):
+            await viewer.gone.wait()
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
@@ -242,7 +242,7 @@ class Viewer(PageSocket):
         finally:
             self._pictures.viewers.discard(self)
             self.gone.set()
-            if not any(one.place == self.place for one in self._pictures.viewers):
+            if not any(viewer.place == self.place for viewer in self._pictures.viewers):
                 self._pictures.press(self.place).forget()
 
     async def _show(self) -> None:

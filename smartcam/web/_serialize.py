@@ -290,7 +290,7 @@ def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
-        "lookers": [one.id for one in applications if _looks(one)],
+        "lookers": [application.id for application in applications if _looks(application)],
         "reported": _reported(emulator, scene),
     }
 
@@ -326,7 +326,8 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
         return None
     records = layout.parse_records(last.result.data, last.byte_order)
     found = [
-        _pose(one, scene, pixels=TABLE_GENERATORS[str(application.generator)]) for one in records
+        _pose(record, scene, pixels=TABLE_GENERATORS[str(application.generator)])
+        for record in records
     ]
     parts = [one for one in found if one is not None]
     return {"application": application.id, "time": round(last.time, 6), "parts": parts}

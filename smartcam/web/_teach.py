@@ -93,11 +93,13 @@ class TeachSite(ThreadedSite):
         super().__init__(CALLS, "teach", host=host, port=port, token=token)
         self.teaching: Teaching = teaching
         self.source: FrameSource | None = source
-        paths = [Path(one) for one in files]
+        paths = [Path(file) for file in files]
         if len(paths) > MAX_PICTURES:
             raise ConfigurationError(f"teach: expected {MAX_PICTURES} pictures at most")
         folder = teaching.path.parent
-        made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
+        made = [
+            NamedPicture(path.name, Picture.read(path), _beside(path, folder)) for path in paths
+        ]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
         # results of the last tools that were tried, by picture
@@ -206,8 +208,13 @@ class TeachSite(ThreadedSite):
             "kinds": tool_settings(),
             "live": self.source is not None,
             "pictures": [
-                {"number": number, "name": one.name, "size": one.picture.size, "file": one.file}
-                for number, one in self.pictures.items()
+                {
+                    "number": number,
+                    "name": picture.name,
+                    "size": picture.picture.size,
+                    "file": picture.file,
+                }
+                for number, picture in self.pictures.items()
             ],
         }
 
@@ -228,7 +235,7 @@ def texts_of(tools: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
 
 def _marks(seen: Inspection) -> list[dict[str, Any]]:
     """Return the marks of the tools, as values for JSON."""
-    drawn = [one for finding in seen.findings.values() for one in finding.drawings]
+    drawn = [drawing for finding in seen.findings.values() for drawing in finding.drawings]
     return [_mark(one) for one in drawn[:MAX_MARKS]]
 
 

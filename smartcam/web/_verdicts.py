@@ -21,15 +21,15 @@ def verdicts(value: Any) -> list[dict[str, Any]]:
     For a list of records, the number of true ones, and of all.
     """
     rows: list[Any] = value if isinstance(value, list) else [value]
-    if not (rows and all(isinstance(one, dict) for one in rows)):
+    if not (rows and all(isinstance(row, dict) for row in rows)):
         return []
     names = [str(name) for name, one in rows[0].items() if isinstance(one, bool)]
-    return [_verdict(name, [one.get(name) is True for one in rows]) for name in names]
+    return [_verdict(name, [row.get(name) is True for row in rows]) for name in names]
 
 
 def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
     good = meaning(name)
-    verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
+    verdict = None if good is None else "pass" if all(value is good for value in values) else "fail"
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
 
 
@@ -55,7 +55,7 @@ def judged(value: Any) -> Outcome:
 
 def failing(value: Any) -> str:
     """Return the truth values that are wrong, in words; "" without any."""
-    bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
+    bad = [verdict for verdict in verdicts(jsonable(value)) if verdict["verdict"] == "fail"]
     texts = []
     for one in bad:
         wanted = "true" if meaning(one["name"]) else "false"

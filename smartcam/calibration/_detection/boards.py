@@ -154,7 +154,7 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
             if len(largest) >= count:
                 break
         if largest:
-            again = any(_shape(one) == _shape(largest) for one in grids)
+            again = any(_shape(grid) == _shape(largest) for grid in grids)
             points = (seen.points[list(largest.values())] + 0.5) * times - 0.5
             yield Board(points, np.array(list(largest), dtype=np.intp), again).trimmed()
 

@@ -175,7 +175,7 @@ class _Grown:
                 for side, fits in enumerate(sides):
                     column, row = _AROUND[side]
                     neighbour = (here[0] + column, here[1] + row)
-                    free = next((one for one in fits if one not in taken), None)
+                    free = next((fit for fit in fits if fit not in taken), None)
                     if free is None or neighbour in places:
                         continue
                     places[neighbour] = free

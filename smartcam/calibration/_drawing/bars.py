@@ -65,7 +65,7 @@ def short_names(names: Sequence[str]) -> list[str]:
     if len(set(names)) < 2:
         return list(names)
     begin = _common(names).rstrip(DIGITS)
-    rest = [one[len(begin) :] for one in names]
+    rest = [name[len(begin) :] for name in names]
     end = _common([one[::-1] for one in rest])[::-1].lstrip(DIGITS)
     shorts = [one[: len(one) - len(end)] for one in rest]
     return [short or name for short, name in zip(shorts, names, strict=True)]
@@ -117,7 +117,7 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
     room = WIDTH / count
     width = min(0.8 * room / len(chart.series), 40.0)
     shorts = short_names(chart.names)
-    longest = max((len(one) for one in shorts), default=1)
+    longest = max((len(label) for label in shorts), default=1)
     # a name at each bar where there is room, else at each second, fifth, tenth, ...
     needed = math.ceil(LETTER_WIDTH_PX * (min(longest, 12) + 1) / room)
     each = next(n for n in (1, 2, 5, 10, 20, 50, 100, 10**9) if n >= needed)

@@ -127,36 +127,38 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     """Draw a scene: cameras in orange, boards in blue, dashed if they were left out."""
     places = np.concatenate(
         [
-            *(one.corners for one in scene.boards),
-            *(np.atleast_2d(one.pose.translation) for one in scene.cameras),
-            *(np.atleast_2d(one.pose.translation) for one in scene.axes),
+            *(board.corners for board in scene.boards),
+            *(np.atleast_2d(camera.pose.translation) for camera in scene.cameras),
+            *(np.atleast_2d(axis.pose.translation) for axis in scene.axes),
         ]
     )
     extent = float(np.ptp(places, axis=0).max()) or 1.0
     length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
-    shapes = [_frustum(one, length) for one in scene.cameras]
-    ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
+    shapes = [_frustum(camera, length) for camera in scene.cameras]
+    ends = [axis.pose.apply(ARROW * extent * np.eye(3)) for axis in scene.axes]
     sight = _ViewerProjection(scene, np.concatenate([places, *shapes, *ends]))
     items = [
         _Drawn(
-            sight.depth(one.corners),
-            polygon(sight.pixels(one.corners), "board-off" if one.off else "board", one.name),
-            one.name,
-            sight.pixels(one.corners.mean(axis=0)),
+            sight.depth(board.corners),
+            polygon(sight.pixels(board.corners), "board-off" if board.off else "board", board.name),
+            board.name,
+            sight.pixels(board.corners.mean(axis=0)),
         )
-        for one in scene.boards
+        for board in scene.boards
     ]
-    items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
+    items += [
+        _camera(sight, camera, shape) for camera, shape in zip(scene.cameras, shapes, strict=True)
+    ]
     items.sort(key=lambda one: -one.depth)  # draw far objects first
     parts = [text((BORDER, 28), title, "title")] if title else []
-    parts += [one.svg for one in items]
+    parts += [item.svg for item in items]
     for one, tips in zip(scene.axes, ends, strict=True):
         start = sight.pixels(one.pose.translation)
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
             items.append(_Drawn(0.0, "", axis, tip))
         items.append(_Drawn(0.0, "", one.name, start + LABEL_OFFSET_PX))
-    parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
+    parts += _labels([(item.label, item.at) for item in items[::-1] if item.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
 

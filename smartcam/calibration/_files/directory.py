@@ -53,7 +53,7 @@ class Folder:
     def names(self) -> list[str]:
         """Return the sorted names of the calibrations in the folder."""
         files = (one for one in self.path.glob("*.json") if one.is_file() and not one.is_symlink())
-        return sorted(one.stem for one in files if _is_name(one.stem))
+        return sorted(file.stem for file in files if _is_name(file.stem))
 
     def calibration(self, name: str) -> Path:
         """Return the file of a calibration.

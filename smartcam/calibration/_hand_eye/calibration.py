@@ -195,7 +195,7 @@ def calibrate_hand_eye(
     check_positive(allowed_error, "allowed_error", "metres")
     check_positive(most_scale, "most_scale", "parts of its size")
     transforms, order, robot = _robot(robot_poses, len(views), "views", setup)
-    if any(one.target != views[0].target for one in views):
+    if any(view.target != views[0].target for view in views):
         raise Code.DIFFERENT_TARGETS.refusal(
             "hand-eye: expected views of one target, got views of several", views[0].target
         )
@@ -208,7 +208,7 @@ def calibrate_hand_eye(
         alone: Sheet = "free" if few else "exact"
         own = calibrate_intrinsics(ordered, sheet="auto" if adjust == "auto" else alone)
         lens = own.camera
-        of_sheet = [one for one in own.warnings if one.code == Code.SHEET_NOT_EXACT]
+        of_sheet = [warning for warning in own.warnings if warning.code == Code.SHEET_NOT_EXACT]
     located = [locate(one, lens) for one in ordered]
     if ordered[0].target.turned_alike:
         ordered = _numbered_alike(ordered, robot, located)
@@ -241,7 +241,7 @@ def calibrate_hand_eye(
     _check_scale(result.target_scale, most_scale)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
-        strays = [one for one in strays if one.code != Code.WRONG_LENS]
+        strays = [outlier for outlier in strays if outlier.code != Code.WRONG_LENS]
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
         warnings=(*result.warnings, *remarks, *of_sheet, *strays),
@@ -315,7 +315,7 @@ def calibrate_hand_eye_from_poses(
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
         robot_poses=tuple(transforms),
-        target_poses=tuple(Transform(CAMERA, TARGET, *one.rigid) for one in target_poses),
+        target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
         allowed_error=allowed_error,
     )
 
@@ -337,14 +337,16 @@ def _robot(
             count,
         )
     transforms = [as_transform(pose, "flange").undated() for pose in robot_poses]
-    for one in transforms:
-        if one.label != transforms[0].label:
+    for transform in transforms:
+        if transform.label != transforms[0].label:
             raise Code.WRONG_FRAME.unexpected(
                 f"hand-eye: expected all poses of the robot to be {transforms[0].label}",
                 transforms[0].label,
-                one.label,
+                transform.label,
             )
-    rows = np.array([[*one.translation, *one.rotation.ravel()] for one in transforms])
+    rows = np.array(
+        [[*transform.translation, *transform.rotation.ravel()] for transform in transforms]
+    )
     order = np.lexsort(rows.T[::-1]).tolist() if len(rows) else []
     ordered = Rigid.stacked(transforms[i].rigid for i in order)
     robot = RobotPoses(ordered, in_hand)
@@ -373,11 +375,13 @@ def _numbered_alike(
     poses = Rigid.stacked(one.transform.rigid for one in located)
     arm = float(np.ptp(target.points, axis=0).max())
     other = other_numbering(robot, poses, half_turn(target), arm).tolist()
-    return [half_turned(one) if turned else one for one, turned in zip(views, other, strict=True)]
+    return [
+        half_turned(view) if turned else view for view, turned in zip(views, other, strict=True)
+    ]
 
 
 def _given(views: Sequence[TargetView]) -> Any:
-    counts = np.array([len(one.ids) for one in views])
+    counts = np.array([len(view.ids) for view in views])
     return np.arange(counts.max())[None] < counts[:, None]
 
 
@@ -386,16 +390,16 @@ def _observations(
 ) -> PixelObservations:
     """Return the views' points, with noise as large as the views themselves show."""
     off = np.concatenate([one.residuals for one in located])
-    noise = np.concatenate([one.covariance for one in views])
+    noise = np.concatenate([view.covariance for view in views])
     more = excess(off, noise, off.size - 6 * len(views))
     given = _given(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))
-    for index, one in enumerate(views):
-        points[index], pixels[index] = one.object_points[0], one.points[0]
+    for index, view in enumerate(views):
+        points[index], pixels[index] = view.object_points[0], view.points[0]
         mask = given[index]
-        points[index, mask], pixels[index, mask] = one.object_points, one.points
-        white[index, mask] = whitening(one.covariance, more)
+        points[index, mask], pixels[index, mask] = view.object_points, view.points
+        white[index, mask] = whitening(view.covariance, more)
     return PixelObservations(white, camera, points, pixels, bends(points, given))
 
 
@@ -576,7 +580,7 @@ def _result(
         candidates={
             one.name: one.held_out if math.isfinite(one.held_out) else None for one in found
         },
-        errors=np.array([math.sqrt(float((one**2).mean())) for one in errors]),
+        errors=np.array([math.sqrt(float((error**2).mean())) for error in errors]),
         mean_error=float(np.concatenate(errors).mean()),
         leave_one_out=held_out,
         held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
@@ -635,7 +639,7 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
     numbers = np.arange(problem.count)
     found = scale_of(problem.robot, problem.poses)
     parts = [problem.taken(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
-    others = [scale_of(one.robot, one.poses) for one in parts]
+    others = [scale_of(part.robot, part.poses) for part in parts]
     if found is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))

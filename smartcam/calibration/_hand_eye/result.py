@@ -160,17 +160,21 @@ class HandEyeCalibration(storage.SavedCalibration):
     @property
     def allowed(self) -> Allowed:
         """Largest allowed error, as the user gave it or from the target's distance."""
-        distances = [float(np.linalg.norm(one.translation)) for one in self.target_poses]
+        distances = [float(np.linalg.norm(pose.translation)) for pose in self.target_poses]
         return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
 
     def judged(self) -> Judgement:
         """Return the verdict and the advice; with few poses the error says nothing."""
-        held_out, codes = self.held_out_error, {one.code for one in self.warnings}
+        held_out, codes = self.held_out_error, {warning.code for warning in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
         several = "s" * (len(left_out) > 1)
         judgement = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
-            [one for one in self.warnings if not (left_out and one.code == Code.BAD_VIEW)],
+            [
+                warning
+                for warning in self.warnings
+                if not (left_out and warning.code == Code.BAD_VIEW)
+            ],
             worst=1 + self.worst,
             allowed=self.allowed,
             cures=VIEW_CURES,
@@ -283,8 +287,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 len(views),
             )
         return tuple(
-            self._errors(as_transform(pose, self._flange).undated(), one)
-            for pose, one in zip(robot_poses, views, strict=True)
+            self._errors(as_transform(pose, self._flange).undated(), view)
+            for pose, view in zip(robot_poses, views, strict=True)
         )
 
     def _errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:

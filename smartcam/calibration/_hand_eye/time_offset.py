@@ -118,13 +118,13 @@ class _Moving:
     ) -> None:
         self._history, self._most = history, most
         self._in_hand = is_in_hand(setup, "time offset")
-        self._seen = Rigid.stacked(one.rigid for one in views)
-        for number, one in enumerate(views):
-            if one.at is None:
+        self._seen = Rigid.stacked(view.rigid for view in views)
+        for number, view in enumerate(views):
+            if view.at is None:
                 raise Code.BAD_TIME.refusal(
                     f"time offset: expected view {number} with a time, got none", got=None
                 )
-        self._times = [one.at for one in views if one.at is not None]
+        self._times = [view.at for view in views if view.at is not None]
         self._arm = float(np.median(np.linalg.norm(self._seen.translation, axis=1)))
         check_motion(self._robot(0.0, np.arange(len(views))))
 

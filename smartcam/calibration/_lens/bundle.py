@@ -93,7 +93,7 @@ class Bundle:
 
     def known(self) -> Bundle:
         """Return the bundle with only the poses to adjust."""
-        lenses = tuple(known_lens(one) for one in self.cameras)
+        lenses = tuple(known_lens(camera) for camera in self.cameras)
         return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
 
     @property
@@ -195,7 +195,7 @@ class AdjustedBundle:
     @property
     def rms(self) -> float:
         """Standard deviation of a coordinate of the residuals, pixels."""
-        squares = sum(float((one**2).sum()) for one in self.residuals)
+        squares = sum(float((residual**2).sum()) for residual in self.residuals)
         return math.sqrt(squares / max(self.freedom, 1))
 
 
@@ -322,15 +322,15 @@ class _Group(NamedTuple):
 
 def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
     views, poses = [one.view for one in sights], [one.pose for one in sights]
-    ends = np.cumsum([0, *(len(one.ids) for one in views)])
+    ends = np.cumsum([0, *(len(view.ids) for view in views)])
     return _Group(
         camera,
         poses,
         bounds=[slice(first, last) for first, last in itertools.pairwise(ends.tolist())],
         pose=np.repeat(poses, np.diff(ends)),
-        ids=np.concatenate([one.ids for one in views]),
-        pixels=np.concatenate([one.points for one in views]),
-        white=whitening(np.concatenate([one.covariance for one in views]), more),
+        ids=np.concatenate([view.ids for view in views]),
+        pixels=np.concatenate([view.points for view in views]),
+        white=whitening(np.concatenate([view.covariance for view in views]), more),
     )
 
 
@@ -434,6 +434,6 @@ def _prior(nominal: Array) -> Array:
     spacing = float(np.linalg.norm(nominal[1:] - nominal[0], axis=1).min())
     near, axes = nominal - nominal.mean(axis=0), np.eye(3)
     moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
-    whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
+    whole = np.linalg.qr(np.column_stack([move.ravel() for move in moves]))[0]
     weights: Array = whole @ whole.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
     return weights + np.eye(3 * len(nominal)) / (LOOSE_SIGMA_RATIO * spacing) ** 2

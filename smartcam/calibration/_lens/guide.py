@@ -147,7 +147,7 @@ def suggest_views(
 
 def _variance(calibration: IntrinsicCalibration) -> float:
     """Return the variance of a coordinate in the views so far, pixels^2."""
-    sigmas = np.concatenate([one.view.sigmas for one in calibration.views if one.used])
+    sigmas = np.concatenate([view.view.sigmas for view in calibration.views if view.used])
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
@@ -167,7 +167,7 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it
     comes from the views' scatter, the rest from the noise of the points times that ratio.
     """
-    used = [one for one in calibration.views if one.used]
+    used = [view for view in calibration.views if view.used]
     points = None
     if calibration.sheet is not None:
         points = used[0].view.target.points + calibration.sheet

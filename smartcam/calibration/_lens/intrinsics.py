@@ -162,7 +162,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(one.view, number) for number, one in enumerate(self.views) if not one.used
+            label(view.view, number) for number, view in enumerate(self.views) if not view.used
         )
 
     def uncertainty(
@@ -192,7 +192,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def target_points(self) -> Array:
         """Places of the target's points in the camera's frame, all used views, (N, 3), metres."""
         return np.concatenate(
-            [one.transform.apply(one.view.object_points) for one in self.views if one.used]
+            [view.transform.apply(view.view.object_points) for view in self.views if view.used]
         )
 
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
@@ -211,7 +211,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
             CalibrationError: ``DIFFERENT_TARGETS``; and those of
                 :func:`~smartcam.calibration.locate`.
         """
-        return tuple(self._errors(one) for one in views)
+        return tuple(self._errors(view) for view in views)
 
     def _errors(self, view: TargetView) -> Array:
         first = self.views[0].view.target
@@ -230,8 +230,8 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def _check(self, found: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
         storage.check_shape(self.covariance, (count, count), called, "covariance")
-        for one in self.views:
-            storage.check_shape(one.residuals, one.view.points.shape, called, "residuals")
+        for view in self.views:
+            storage.check_shape(view.residuals, view.view.points.shape, called, "residuals")
         if self.sheet is not None:
             storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
 
@@ -333,8 +333,8 @@ def _numbered_alike(
     calibration is ``found``.
     """
     # Shape and numbers are fitted in turn, which only lowers the squares: Lloyd, as for flips.
-    views = [one.view for one in found.views]
-    used = [number for number, one in enumerate(found.views) if one.used]
+    views = [view.view for view in found.views]
+    used = [number for number, view in enumerate(found.views) if view.used]
     bad = sorted(set(range(len(views))) - set(used))
     numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
     shaped = found
@@ -349,15 +349,15 @@ def _numbered_alike(
         if not wrong.any():
             break
         turned ^= wrong
-        numbered = [half_turned(one) if turned[i] else one for i, one in enumerate(views)]
+        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
     if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * found.rms:
         return found, []
     if 2 * turned.sum() > len(turned):
         turned = ~turned
-        numbered = [half_turned(one) if turned[i] else one for i, one in enumerate(views)]
+        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
     lens = fit_lens([numbered[i] for i in used], model, held)
     better = _summary(numbered, used, lens, bad, sheet)
-    names = [label(one, i) for i, one in enumerate(views) if turned[i]]
+    names = [label(view, i) for i, view in enumerate(views) if turned[i]]
     return (found, []) if better.sheet is None else (better, names)
 
 
@@ -385,11 +385,11 @@ def check_views(
 def _check_motion(views: Sequence[TargetView]) -> None:
     """Refuse views that are all nearly the same."""
     least, largest = MIN_MOTION_SHARE * max(views[0].size), 0.0
-    for one in views[1:]:
-        common, first, second = np.intersect1d(views[0].ids, one.ids, return_indices=True)
+    for view in views[1:]:
+        common, first, second = np.intersect1d(views[0].ids, view.ids, return_indices=True)
         if not len(common):
             return
-        off = views[0].points[first] - one.points[second]
+        off = views[0].points[first] - view.points[second]
         largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
     if largest < least:
         raise Code.POSES_TOO_SIMILAR.refusal(
@@ -561,6 +561,6 @@ def _remarks(
         )
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{sum(one.used for one in calibration.views)} views are no more than a lens has need "
-            "of: none can be left out to see how good it is"
+            f"{sum(view.used for view in calibration.views)} views are no more than a lens "
+            "has need of: none can be left out to see how good it is"
         )

@@ -149,9 +149,11 @@ class Reduced(NamedTuple):
     def of(cls, equations: Sequence[Equations]) -> Reduced:
         """Return the equations of views after eliminating the pose of each."""
         parts = []
-        for one in equations:
-            rows = one.by_pose.reshape(-1, 6)
-            rest = np.column_stack([one.by_shared.reshape(len(rows), -1), one.residuals.ravel()])
+        for equation in equations:
+            rows = equation.by_pose.reshape(-1, 6)
+            rest = np.column_stack(
+                [equation.by_shared.reshape(len(rows), -1), equation.residuals.ravel()]
+            )
             rest = rest - rows @ solve_scaled(rows.T @ rows, rows.T @ rest)
             parts.append(rest.T @ rest)
         found = np.array(parts)
@@ -226,7 +228,7 @@ class _Misfit:
     def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
         """``free`` (COUNT,): mask of the values that were fitted."""
         self.reduced = Reduced.of(equations)
-        self._count, views = sum(one.residuals.size for one in equations), len(equations)
+        self._count, views = sum(equation.residuals.size for equation in equations), len(equations)
         there = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
         self.usual, bends = free & there, there.copy()
         self.usual[SHEET], bends[: IMAGE.start] = True, False
@@ -311,8 +313,10 @@ def misfit_remarks(
     """
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
-    equations = [[one.equations(more) for one in views] for views in fitted]
-    joined = [Equations(*map(np.concatenate, zip(*one, strict=True))) for one in equations]
+    equations = [[view.equations(more) for view in views] for views in fitted]
+    joined = [
+        Equations(*map(np.concatenate, zip(*equation, strict=True))) for equation in equations
+    ]
     misfit, apart = _Misfit(joined, free), False
     reduced, usual, changes = misfit.reduced, misfit.usual, {ZOOMED: LENS[:4]}
     if len(fitted[0]) > 1:

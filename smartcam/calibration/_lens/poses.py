@@ -247,7 +247,7 @@ def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
 
 
 def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
-    found = [one.taken(0) for one in plane_poses(view, camera)]
+    found = [pose.taken(0) for pose in plane_poses(view, camera)]
     off = (camera.project(one.apply(view.object_points)) - view.points for one in found)
     squares = [float(np.nan_to_num((one**2).sum(), nan=math.inf)) for one in off]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]

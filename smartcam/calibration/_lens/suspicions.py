@@ -111,15 +111,16 @@ def strays(
 def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> list[Equations]:
     """Return the equations after fitting the lens to the kept points."""
     some = [
-        Equations(*(part[rows] for part in one)) for one, rows in zip(equations, kept, strict=True)
+        Equations(*(part[rows] for part in equation))
+        for equation, rows in zip(equations, kept, strict=True)
     ]
     change = Reduced.of(some).best(LENSES)[0]
     left = []
-    for one, rows in zip(equations, kept, strict=True):
-        residuals = one.residuals - one.by_shared @ change
-        by_pose, right = one.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
+    for equation, rows in zip(equations, kept, strict=True):
+        residuals = equation.residuals - equation.by_shared @ change
+        by_pose, right = equation.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
         step = solve_scaled(by_pose.T @ by_pose, by_pose.T @ right)
-        left.append(one._replace(residuals=residuals - one.by_pose @ step))
+        left.append(equation._replace(residuals=residuals - equation.by_pose @ step))
     return left
 
 
@@ -154,7 +155,7 @@ def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list
     of_used = itertools.compress(equations, used)
     # unlike the variance of all points, the median is hardly changed by a few strays
     middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
-    return [squares_off(one, float(middle) / MEDIAN_SQUARED_LENGTH) for one in equations]
+    return [squares_off(equation, float(middle) / MEDIAN_SQUARED_LENGTH) for equation in equations]
 
 
 def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
@@ -204,8 +205,8 @@ def without_strays(
 
     ``given``: the user gave the lens, so it may be another camera's; else these views gave it.
     """
-    off = np.concatenate([one.residuals for one in poses])
-    noise = np.concatenate([one.covariance for one in views])
+    off = np.concatenate([pose.residuals for pose in poses])
+    noise = np.concatenate([view.covariance for view in views])
     more = excess(off, noise, off.size - 6 * len(views))
     fitted = [
         Fitted(view, camera, pose.transform.rigid, view.target.points)
@@ -231,9 +232,9 @@ def examined(
     ``again`` calibrates from other views. ``drop``: whether stray points are left out. Raises
     ``POOR_FIT``: the points are not the target's.
     """
-    views, used = [one.view for one in found.views], [one.used for one in found.views]
+    views, used = [view.view for view in found.views], [view.used for view in found.views]
     points = views[0].target.points + (0.0 if found.sheet is None else found.sheet)
-    fitted = [Fitted(one.view, found.camera, one.transform.rigid, points) for one in found.views]
+    fitted = [Fitted(view.view, found.camera, view.transform.rigid, points) for view in found.views]
     names = [label(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", found.rms, views)
     of_fit = [*view_remarks(views, names), *_remarks_on_middle(found)]
@@ -254,7 +255,7 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
     groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
     for view, name in zip(views, names, strict=True):
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
-    copies = [", ".join(one) for one in groups.values() if len(one) > 1]
+    copies = [", ".join(group) for group in groups.values() if len(group) > 1]
     if copies:
         more = (
             f", and {len(copies) - MAX_POINTS_IN_MESSAGE} more"
@@ -297,6 +298,6 @@ def most_rms(
     views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
 ) -> float:
     """Return the RMS of a coordinate, pixels, above which views are impossible."""
-    noise = float(np.median(np.concatenate([one.sigmas for one in views])))
-    longer = max(max(one.size) for one in views)
+    noise = float(np.median(np.concatenate([view.sigmas for view in views])))
+    longer = max(max(view.size) for view in views)
     return max(worst, part * longer, MAX_RMS_SIGMAS * noise)

@@ -253,7 +253,7 @@ class PlaneCalibration(storage.SavedCalibration):
             more = f"two wrong ones of {points} points can look right: touch {least} or more"
         return judge(
             None if held_out is None else 1e3 * held_out,
-            [one for one in self.warnings if not (out and one.code == Code.OUTLIER)],
+            [warning for warning in self.warnings if not (out and warning.code == Code.OUTLIER)],
             worst=1 + self.worst,
             predicted=None if predicted is None else 1e3 * predicted,
             allowed=Allowed.of(self.allowed_error, extent(self.robot_points[counted])),
@@ -325,7 +325,9 @@ class PlaneCalibration(storage.SavedCalibration):
         if not isinstance(localizations, list):
             localizations = [*localizations]
         found = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
-        with_sigma = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
+        with_sigma = [
+            n for n, localization in enumerate(localizations) if localization.pose.sigma is not None
+        ]
         if with_sigma and self.touch_sigma is not None:
             sigmas = robot_sigmas(
                 [localizations[n] for n in with_sigma],

@@ -121,7 +121,7 @@ def fit_touches(
     touched = np.concatenate(groups)
     check_field(touched)
     ray = np.repeat([0, 1, 2], [len(group) for group in groups])
-    levers = [float(np.linalg.norm(one.mean(0) - groups[0].mean(0))) for one in groups[1:]]
+    levers = [float(np.linalg.norm(group.mean(0) - groups[0].mean(0))) for group in groups[1:]]
     sheet = _fit(touched, ray)
     for lever in levers if touch_sigma is not None else ():
         check_lever(lever, touch_sigma or 0.0)

@@ -177,10 +177,10 @@ def _pdf_circle(x: float, y: float, radius: float) -> str:
 
 def _pdf_texts(shapes: Iterable[Shape]) -> list[str]:
     return [
-        f"BT /F {_number(one.size)} Tf {'0 1 -1 0' if one.turned else '1 0 0 1'} "
-        f"{_pair(*one.place)} Tm {_literal(one.text)} Tj ET"
-        for one in shapes
-        if isinstance(one, Label)
+        f"BT /F {_number(shape.size)} Tf {'0 1 -1 0' if shape.turned else '1 0 0 1'} "
+        f"{_pair(*shape.place)} Tm {_literal(shape.text)} Tj ET"
+        for shape in shapes
+        if isinstance(shape, Label)
     ]
 
 

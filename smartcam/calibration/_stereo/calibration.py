@@ -250,7 +250,7 @@ class StereoCalibration(storage.SavedCalibration):
         ways = [right]
         if right.target.turned_alike:
             ways.append(half_turned(right))
-        found = [pair_errors(self._cameras, left, one) for one in ways]
+        found = [pair_errors(self._cameras, left, way) for way in ways]
         return min(found, key=lambda one: _rms([one.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
@@ -288,7 +288,7 @@ class StereoCalibration(storage.SavedCalibration):
 
 def _target(calibration: StereoCalibration) -> Target:
     pairs = calibration.pairs
-    return next(view.target for one in pairs for view in (one.left, one.right) if view)
+    return next(view.target for pair in pairs for view in (pair.left, pair.right) if view)
 
 
 @takes(
@@ -346,7 +346,7 @@ def calibrate_stereo(
     check_pairs(moments, (left, right))
     check_choice(sheet, get_args(Sheet), "sheet")
     least = MIN_PAIRS if left and right else MIN_VIEWS
-    both = [number for number, one in enumerate(moments) if None not in one]
+    both = [number for number, moment in enumerate(moments) if None not in moment]
     if len(both) < least:
         raise Code.TOO_FEW.unexpected(
             f"stereo: expected {least} pairs or more in which both cameras see the target",
@@ -459,7 +459,7 @@ def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
 
 
 def _rms(parts: Sequence[Array]) -> float:
-    values = np.concatenate([one.ravel() for one in parts]) if parts else np.zeros(0)
+    values = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 

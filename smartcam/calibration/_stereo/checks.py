@@ -135,7 +135,7 @@ def examined(
     says whether stray points are left out. Raises ``COINCIDENT`` if the cameras do not stand apart.
     """
     check_apart(found.transform, found.covariance)
-    sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
+    sides = [[pair.left for pair in found.pairs], [pair.right for pair in found.pairs]]
     seen = list(_seen(found))
     fitted, used = [one.fitted for one in seen], [one.used for one in seen]
     names = [f"{label(one.fitted.view, one.pair)}, {SIDES[one.side]}" for one in seen]

@@ -83,7 +83,7 @@ def as_moments(
             len(right_views),
         )
     for side, views in zip(SIDES, (left_views, right_views), strict=True):
-        check_views([one for one in views if one is not None], f"{side} camera", 1)
+        check_views([view for view in views if view is not None], f"{side} camera", 1)
     moments = list(zip(left_views, right_views, strict=True))
     for one, two in moments:
         if one is not None and two is not None and one.target != two.target:

@@ -130,5 +130,5 @@ def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     matrix = np.linalg.inv(right.matrix).T @ essential @ np.linalg.inv(left.matrix)
     lines = [seen[1] @ matrix, seen[0] @ matrix.T]
     products = np.abs((seen[1] * lines[1]).sum(axis=1))
-    distances = [products / np.linalg.norm(one[:, :2], axis=1) for one in lines]
+    distances = [products / np.linalg.norm(line[:, :2], axis=1) for line in lines]
     return np.column_stack(distances)

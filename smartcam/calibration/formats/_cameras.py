@@ -335,7 +335,9 @@ def compose_opencv(chain: CameraChain) -> str:
         )
     if len(chain.cameras) > len(_MATRICES):
         raise _cannot("opencv", "one camera or two", f"{len(chain.cameras)}")
-    alike, *others = (f"{one.size} pixels and {one.distortion_model}" for one in chain.cameras)
+    alike, *others = (
+        f"{camera.size} pixels and {camera.distortion_model}" for camera in chain.cameras
+    )
     if any(one != alike for one in others):
         raise _cannot("opencv", f"cameras of {alike}", others[0])
     motion = chain.transforms[0]
@@ -417,7 +419,7 @@ def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain 
 def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
     for names in (_MATRIX, _BENT):
         if _first(data, names, end) is None:
-            expected = f"{names[0]}{end} (or {', '.join(f'{one}{end}' for one in names[1:])})"
+            expected = f"{names[0]}{end} (or {', '.join(f'{name}{end}' for name in names[1:])})"
             raise malformed("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
     coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()

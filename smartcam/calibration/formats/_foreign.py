@@ -256,9 +256,9 @@ def parse_basalt(text: str) -> Found:
     cameras = sequence(data["intrinsics"], "intrinsics")
     sizes = sequence(data["resolution"], "resolution", len(cameras)) if "resolution" in data else []
     lenses = []
-    for place, one in enumerate(cameras):
+    for place, camera in enumerate(cameras):
         where = f"cam{place}"
-        part = mapping(one, where, ["camera_type", "intrinsics"])
+        part = mapping(camera, where, ["camera_type", "intrinsics"])
         parameters = MODELS["basalt"].get(str(part["camera_type"]), _LensParameters(_FXFY))
         names = [*parameters.focal.split(), *parameters.coefficients.split()]
         given = mapping(part["intrinsics"], where, names)

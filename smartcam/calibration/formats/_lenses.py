@@ -78,7 +78,7 @@ def read_lenses(
     for form, mark in FORMAT_PATTERNS.items():
         if mark.search(head):
             found = read_cameras(path, form, size=size, unit=unit)
-            lenses = tuple(Lens(one) for one in found.cameras)
+            lenses = tuple(Lens(camera) for camera in found.cameras)
             return StoredLenses(found.names, lenses, found.transforms)
     if head.lstrip().startswith(b"{"):
         return _ours(path)
@@ -94,10 +94,10 @@ def _of_pair(pair: StereoCalibration) -> StoredLenses:
     sides = []
     for number, camera in enumerate((pair.left, pair.right)):
         seen = [
-            one.transform.apply(view.object_points)
-            for one in pair.pairs
-            for view in ((one.left, one.right)[number],)
-            if one.used[number] and one.transform is not None and view is not None
+            pair.transform.apply(view.object_points)
+            for pair in pair.pairs
+            for view in ((pair.left, pair.right)[number],)
+            if pair.used[number] and pair.transform is not None and view is not None
         ]
         points = np.concatenate(seen) if seen else None
         if points is not None and number:

@@ -83,9 +83,9 @@ def _from_launch(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
     nodes = [one.attrib for one in load_xml(text.strip()).iter("node")]
     found = [
-        one["args"]
-        for one in nodes
-        if _COMMAND in (one.get("type"), one.get("exec")) and "args" in one
+        node["args"]
+        for node in nodes
+        if _COMMAND in (node.get("type"), node.get("exec")) and "args" in node
     ]
     if len(found) != 1:
         raise malformed("launch file", f"one node of type {_COMMAND}", str(len(found)))
@@ -99,16 +99,16 @@ def _from_python(text: str) -> list[str]:
     except (SyntaxError, ValueError, MemoryError, RecursionError) as exc:
         raise malformed("launch file", f"Python ({exc})") from exc
     calls = [
-        {one.arg: one.value for one in node.keywords}
+        {keyword.arg: keyword.value for keyword in node.keywords}
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
     ]
     found = [
-        one["arguments"]
-        for one in calls
-        if "arguments" in one
-        and isinstance(one.get("executable"), ast.Constant)
-        and getattr(one["executable"], "value", None) == _COMMAND
+        call["arguments"]
+        for call in calls
+        if "arguments" in call
+        and isinstance(call.get("executable"), ast.Constant)
+        and getattr(call["executable"], "value", None) == _COMMAND
     ]
     if len(found) != 1:
         raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(found)))
@@ -149,7 +149,7 @@ def _from_options(words: Sequence[str]) -> Transform:
         if option not in options or option in given or value is None:
             raise malformed("arguments", f"options {', '.join(options)}, each once", option)
         given[option] = value
-    missing = [one for one in _FRAMES if one not in given]
+    missing = [frame for frame in _FRAMES if frame not in given]
     if missing or (given.keys() & _QUATERNION and given.keys() & _ANGLES):
         raise malformed(
             "arguments",
@@ -159,7 +159,7 @@ def _from_options(words: Sequence[str]) -> Transform:
     return _transform(
         _values(_POSITION, given),
         _values(_ANGLES if given.keys() & _ANGLES else _QUATERNION, given),
-        [given[one] for one in _FRAMES],
+        [given[frame] for frame in _FRAMES],
     )
 
 
@@ -205,7 +205,7 @@ def _is_number(word: str) -> bool:
 def _transform(
     position: Sequence[float], turn: Sequence[float], frames: Sequence[str]
 ) -> Transform:
-    frame, child = (frame_name(one, "frame") for one in frames)
+    frame, child = (frame_name(frame, "frame") for frame in frames)
     if len(turn) == 4:
         return Transform.from_quaternion(frame, child, position, turn)
     check_angles(turn, "yaw, pitch and roll")

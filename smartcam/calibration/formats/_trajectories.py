@@ -164,10 +164,10 @@ def compose_euroc(transforms: Sequence[Transform]) -> str:
 def _timed(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
     same_frames(transforms)
     found: list[tuple[int, Transform]] = []
-    for index, one in enumerate(transforms):
-        if one.at is None or one.at < _EPOCH:
+    for index, transform in enumerate(transforms):
+        if transform.at is None or transform.at < _EPOCH:
             raise Code.BAD_TIME.unexpected(
-                f"number {index}: expected a time since 1970", got=one.at
+                f"number {index}: expected a time since 1970", got=transform.at
             )
-        found.append(((one.at - _EPOCH) // timedelta(microseconds=1), one))
+        found.append(((transform.at - _EPOCH) // timedelta(microseconds=1), transform))
     return found

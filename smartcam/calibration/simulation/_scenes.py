@@ -203,7 +203,9 @@ class HandEyeScene:
         count = len(self.target.points)
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
         transforms = [self.seen(pose) for pose in self.robot_poses]
-        pixels = [self.camera.project(one.apply(self.target.points)) for one in transforms]
+        pixels = [
+            self.camera.project(transform.apply(self.target.points)) for transform in transforms
+        ]
         flat = np.zeros((len(points), count, 0))
         seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels), flat)
         poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)

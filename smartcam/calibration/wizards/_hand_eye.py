@@ -148,7 +148,9 @@ async def _ask_setup(
     robot = Option(
         name="robot",
         label="How the robot shows the pose of its flange",
-        options={name: f"{', '.join(one.numbers)}; {one.title}" for name, one in ROBOTS.items()},
+        options={
+            name: f"{', '.join(robot.numbers)}; {robot.title}" for name, robot in ROBOTS.items()
+        },
     )
     label = "Largest error that is good enough; empty: a hundredth of the sheet's distance"
     allowed = replace(ALLOWED, label=label)
@@ -232,7 +234,7 @@ class _Views:
             touched = np.array([1e-3 * answer[axis] for axis in "xyz"])
             off.append(1e3 * float(np.linalg.norm(touched - places[number])))
         note = f"the tip touched the sheet {', '.join(f'{one:.2f}' for one in off)} mm off"
-        others = tuple(one for one in calibration.warnings if one.code != Code.REFUTED)
+        others = tuple(warning for warning in calibration.warnings if warning.code != Code.REFUTED)
         allowed = calibration.allowed
         if max(off) > allowed.error:
             others = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *others)
@@ -335,7 +337,9 @@ class _Views:
 
     def _views(self) -> list[TargetView]:
         """Return the views, named by their numbers."""
-        views = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
+        views = [
+            TargetView.from_data(sample["view"], target=self._target) for sample in self._samples
+        ]
         return [replace(view, name=f"view {number}") for number, view in enumerate(views, 1)]
 
     def preview(self) -> dict[str, Any] | None:
@@ -357,14 +361,14 @@ class _Views:
             worst, code = len(self._samples), Code(found["code"])
             judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
             return None, (f"{code}: {found['text']}",), judgement
-        views = [one.to_data() for one in self._views()]
+        views = [view.to_data() for view in self._views()]
         calibration = HandEyeCalibration.from_data({**found, "views": views})
         _, _, notes, judgement = _outcome(calibration)
         return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
         """Return the calibration without the samples' views, or the reason why there is none."""
-        poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
+        poses = [motion_from_data(sample["pose"], *sample["frames"]) for sample in self._samples]
         work = partial(
             calibrate_hand_eye,
             poses,
@@ -430,7 +434,7 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
 
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
-    remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
+    remarks = [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()
     figures = {
         **judgement.figures,

@@ -123,7 +123,7 @@ def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, An
         {"at": [mark.x, mark.y], "label": str(number), "answers": answer}
         for number, (mark, answer) in enumerate(zip(marks, answers, strict=True), 1)
     ]
-    return {"points": [], "marks": [one["at"] for one in choices], "choices": choices}
+    return {"points": [], "marks": [choice["at"] for choice in choices], "choices": choices}
 
 
 async def choose(marks: list[Mark], unit: str) -> list[Mark]:

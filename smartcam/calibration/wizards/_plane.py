@@ -165,7 +165,9 @@ class _MarkSource(PointSource):
         """Ask for a picture; remember the direction of its y axis."""
         rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
         directions = [row.get("y_down") for row in rows]
-        self.y_down = next((one for one in directions if one is not None), self.y_down)
+        self.y_down = next(
+            (direction for direction in directions if direction is not None), self.y_down
+        )
         return rows
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
@@ -174,7 +176,7 @@ class _MarkSource(PointSource):
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_plane(
-            [(one.mark.x, one.mark.y) for one in self.touches],
+            [(touch.mark.x, touch.mark.y) for touch in self.touches],
             self.places,
             touch_sigma=self.sigma,
             nominal_scale=1.0 if self.camera_unit == "m" else None,

@@ -134,11 +134,11 @@ class PointSource(Touches, ABC):
             "method": about["method"],
             "samples": [
                 {
-                    **self.sample(one),
-                    "robot": list(one.robot),
-                    "tool_z": None if one.tool_z is None else list(one.tool_z),
+                    **self.sample(touch),
+                    "robot": list(touch.robot),
+                    "tool_z": None if touch.tool_z is None else list(touch.tool_z),
                 }
-                for one in self.touches
+                for touch in self.touches
             ],
         }
         preview = self._preview(plane)
@@ -209,8 +209,8 @@ class PointSource(Touches, ABC):
                     again.clear()  # the numbers of points have changed
                 case "reorder" if order is not None:
                     self.touches = [
-                        replace(one, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
-                        for one, i in zip(self.touches, order.order, strict=True)
+                        replace(touch, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
+                        for touch, i in zip(self.touches, order.order, strict=True)
                     ]
                 case "side":
                     await self._ask_side()
@@ -221,7 +221,7 @@ class PointSource(Touches, ABC):
         """Ask where the tool pointed at all touches."""
         step = Step(id="side", title="Where the tool points", inputs=(SIDE,))
         self.side = (await ask(step))["side"]
-        self.touches = [replace(one, tool_z=SIDES[self.side]) for one in self.touches]
+        self.touches = [replace(touch, tool_z=SIDES[self.side]) for touch in self.touches]
 
     def _try_fit(
         self, *, robust: bool
@@ -243,7 +243,7 @@ class PointSource(Touches, ABC):
         """Return the order of touches that explains them far better, if there is exactly one."""
         touched = np.array(self.places)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
-        marks = np.array([(one.mark.x, one.mark.y) for one in self.touches])
+        marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
         return better_order(marks, touched, sigma)
 
     def _blamed(self, error: CalibrationError) -> Judgement:
@@ -264,7 +264,7 @@ class PointSource(Touches, ABC):
         rest = copy.copy(self)
         rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
-            codes = {one.code for one in rest.fit(robust=False).warnings}
+            codes = {warning.code for warning in rest.fit(robust=False).warnings}
         except CalibrationError:
             return False
         return len(rest.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
@@ -294,7 +294,9 @@ class PointSource(Touches, ABC):
             options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
         if judgement.option == "side" and self._read_robot is None:
             options["side"] = "say where the tool points"
-        doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
+        doubtful = plane is None or any(
+            warning.code in _SIGNS_OF_OUTLIERS for warning in plane.warnings
+        )
         if robust:
             options["all"] = "count all points, also those that do not agree with the others"
         elif len(self.touches) >= MIN_POINTS and doubtful:
@@ -322,7 +324,9 @@ class PointSource(Touches, ABC):
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
         """Return the touches as clickable choices, at the places where they are drawn."""
-        places = [one["at"][:2] for one in points] or [[t.mark.x, t.mark.y] for t in self.touches]
+        places = [point["at"][:2] for point in points] or [
+            [t.mark.x, t.mark.y] for t in self.touches
+        ]
         return [
             {"at": place, "label": str(number), "answers": {"point": number}}
             for number, place in enumerate(places, 1)
@@ -469,7 +473,7 @@ def calibrated_plane(
         f"{what} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
     )
-    notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
+    notes += [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()
     figures = {
         **judgement.figures,
@@ -479,6 +483,6 @@ def calibrated_plane(
         "residual_mm": residual,
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "predicted_mm": predicted,
-        "remarks": [[one.code.value, one.text] for one in calibration.warnings],
+        "remarks": [[warning.code.value, warning.text] for warning in calibration.warnings],
     }
     return Calibrated(calibration, figures, tuple(notes), judgement)

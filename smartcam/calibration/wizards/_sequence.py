@@ -304,7 +304,7 @@ class WizardSession:
     def samples(self) -> list[dict[str, Any]]:
         """Answers and outcomes that were not undone, in order: ``step, answers, outcome, at``."""
         names = ("step", "answers", "outcome", "at")
-        return [{name: copy.deepcopy(one[name]) for name in names} for one in self._log.entries]
+        return [{name: copy.deepcopy(entry[name]) for name in names} for entry in self._log.entries]
 
     @property
     def token(self) -> str:

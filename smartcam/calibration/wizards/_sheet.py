@@ -254,7 +254,7 @@ class _SheetSource(PointSource):
         return int(ids[int(np.argmax(nearest))])
 
     def _touched(self) -> list[int]:
-        return [one.mark.number or 0 for one in self.touches]
+        return [touch.mark.number or 0 for touch in self.touches]
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_corners(
@@ -298,8 +298,8 @@ class _SheetSource(PointSource):
                 f"predicted error from pixel to robot {predicted:.3f} mm rms where the target was "
                 f"seen{unknown}"
             )
-        notes += [f"{one.code}: {one.text}" for one in found.remarks]
-        remarks = [[one.code.value, one.text] for one in found.warnings]
+        notes += [f"{remark.code}: {remark.text}" for remark in found.remarks]
+        remarks = [[warning.code.value, warning.text] for warning in found.warnings]
         judgement = found.judged()
         more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
         return Calibrated(found, figures | more | judgement.figures, tuple(notes), judgement)

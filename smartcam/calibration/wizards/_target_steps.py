@@ -33,19 +33,19 @@ def _length(name: str, label: str, *, optional: bool = False) -> Number:
 
 _INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
     "checkerboard": (
-        *(replace(one, label=f"{one.label} of inner corners") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of inner corners") for count in _COUNTS),
         _length("square", "Side of a square"),
         Flag(name="origin_mark", label="A black dot marks the origin", default=True),
     ),
     "charuco": (
-        *(replace(one, label=f"{one.label} of squares") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of squares") for count in _COUNTS),
         _length("square", "Side of a square"),
         _length("marker", "Side of a marker"),
         Text(name="dictionary", label="Dictionary of the markers", default="DICT_5X5_250"),
         Flag(name="legacy_pattern", label="Printed by an OpenCV before 4.6"),
     ),
     "circles": (
-        *(replace(one, label=f"{one.label} of dots") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of dots") for count in _COUNTS),
         _length("spacing", "Distance of two dots of a row"),
         _length("diameter", "Diameter of a dot"),
         Flag(name="asymmetric", label="Every other row is shifted"),

@@ -101,12 +101,12 @@ class Touches:
     @property
     def places(self) -> list[Vector]:
         """Positions of the tip at the touches, metres."""
-        return [one.robot for one in self.touches]
+        return [touch.robot for touch in self.touches]
 
     @property
     def tool_z(self) -> Array | None:
         """Mean direction of the tool's axis; None if it is not known."""
-        axes = [one.tool_z for one in self.touches if one.tool_z is not None]
+        axes = [touch.tool_z for touch in self.touches if touch.tool_z is not None]
         return np.mean(axes, axis=0) if axes else None
 
     @property

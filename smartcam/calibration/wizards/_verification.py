@@ -199,7 +199,7 @@ class _DriftCheck(Touches):
                 return {"name": self.name, **figures, **choice.outcome}
 
     def _seen(self) -> Array:
-        return np.array([(one.mark.x, one.mark.y) for one in self.touches])
+        return np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
         self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
@@ -305,12 +305,12 @@ class _DriftCheck(Touches):
                     **figures,
                     "samples": [
                         {
-                            "feature_id": one.mark.feature,
-                            "camera": [one.mark.x, one.mark.y],
-                            "robot": list(one.robot),
+                            "feature_id": touch.mark.feature,
+                            "camera": [touch.mark.x, touch.mark.y],
+                            "robot": list(touch.robot),
                             "offset": offset,
                         }
-                        for one, offset in zip(self.touches, drift.offsets.tolist(), strict=True)
+                        for touch, offset in zip(self.touches, drift.offsets.tolist(), strict=True)
                     ],
                 }
             )

@@ -174,9 +174,9 @@ def no_id(camera: CameraUnderTest) -> bool:
     if camera.dialect != "b16":
         return False
     first = [
-        int.from_bytes(one.results[0].body[: camera.wire.word], "little")
-        for one in inspections(camera)
-        if one.results
+        int.from_bytes(inspection.results[0].body[: camera.wire.word], "little")
+        for inspection in inspections(camera)
+        if inspection.results
     ]
     found = camera.application not in first
     if not found and len(set(first)) > 1:
@@ -294,7 +294,7 @@ def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> Non
     """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
     words = camera.wire.statuses(client.received[mark:])
-    if busy and any(one & busy for one in words) and words[-1] & busy:
+    if busy and any(word & busy for word in words) and words[-1] & busy:
         client.until(
             lambda one: (
                 one.message_id == MessageId.STATUS and not camera.wire.numbers(one.body)[0] & busy

@@ -67,7 +67,7 @@ class Allow(enum.Flag):
             if name == "all":
                 allowed |= ~cls.NOTHING
             elif name.upper() not in cls.__members__:
-                known = ", ".join([*(one.lower() for one in cls.__members__), "all"])
+                known = ", ".join([*(member.lower() for member in cls.__members__), "all"])
                 raise ConfigurationError(f"--camera-allow: {name!r} is unknown; known are {known}")
             else:
                 allowed |= cls[name.upper()]

@@ -90,12 +90,12 @@ def waiting_before_result(camera: CameraUnderTest) -> bool:
 def busy_while_processing(camera: CameraUnderTest) -> bool:
     """BUSY is set during an inspection (BVS ID: Ready is not)."""
     bits, seen = camera.wire.bits, set[bool]()
-    for one in inspections(camera):
-        if one.under_way is not None:
-            words = [one.under_way]
+    for inspection in inspections(camera):
+        if inspection.under_way is not None:
+            words = [inspection.under_way]
         else:
-            end = one.places()[2]
-            words = camera.wire.statuses(one.came[:end])
+            end = inspection.places()[2]
+            words = camera.wire.statuses(inspection.came[:end])
         words = [word for word in words if not word & bits.waiting]
         if words and camera.wire.is_bid:
             seen.add(not words[0] & bits.ready)
@@ -112,8 +112,8 @@ def busy_while_processing(camera: CameraUnderTest) -> bool:
 def hidden_triggers(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger stays set during an inspection."""
     seen = set[bool]()
-    for one in inspections(camera):
-        fell, result, _ = one.places()
+    for inspection in inspections(camera):
+        fell, result, _ = inspection.places()
         if result is None:
             raise NotObserved("no result came")
         seen.add(fell is None)
@@ -229,7 +229,7 @@ def switch_while_running(camera: CameraUnderTest) -> str:
 def _switch_answers(client: RawClient, mark: int) -> list[int]:
     """Return the codes of the answers to a switch."""
     answers = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
-    return [(*client.wire.numbers(one.body), -1)[0] for one in answers]
+    return [(*client.wire.numbers(answer.body), -1)[0] for answer in answers]
 
 
 def _was_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> bool:
@@ -320,7 +320,7 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
         answers = of_kind(client.received[mark:], MessageId.DISCONNECT)
         if not answers:
             return "silent"
-        if [camera.wire.numbers(one.body) for one in answers] != [(0,)]:
+        if [camera.wire.numbers(answer.body) for answer in answers] != [(0,)]:
             raise Undescribed("the code 0, once", client.words(mark))
         return "code"
 

@@ -56,15 +56,15 @@ def trigger_gives_one_result(camera: CameraUnderTest) -> str:
     """A trigger gives one result container, of the active application."""
     inspection_time(camera)  # raises if there are no results
     word = camera.wire.word
-    for one in inspections(camera):
-        if len(one.results) != 1:
-            raise Differs("one result for each trigger", f"{len(one.results)} results")
-        body = one.results[0].body
+    for inspection in inspections(camera):
+        if len(inspection.results) != 1:
+            raise Differs("one result for each trigger", f"{len(inspection.results)} results")
+        body = inspection.results[0].body
         named = int.from_bytes(body[:word], "little")
         if camera.dialect != "b16" and named != camera.application:
             raise Differs(
                 f"the id {camera.application} in front of the result",
-                camera.wire.spell(one.results[0]),
+                camera.wire.spell(inspection.results[0]),
             )
     return f"{len(inspections(camera))} triggers"
 
@@ -72,27 +72,31 @@ def trigger_gives_one_result(camera: CameraUnderTest) -> str:
 @check("ID-b 221, published", needs=Allow.TRIGGER, dialects=("bid",))
 def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
-    for one in inspections(camera):
-        answers = of_kind(one.came, MessageId.TRIGGER)
+    for inspection in inspections(camera):
+        answers = of_kind(inspection.came, MessageId.TRIGGER)
         if [camera.wire.numbers(heard.body) for heard in answers] != [(0,)]:
-            shown = "; ".join(map(camera.wire.spell, one.came)) or "nothing"
+            shown = "; ".join(map(camera.wire.spell, inspection.came)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", shown)
 
 
 @check({"": "SC-A30, SC-C50, published", "bid": "ID-b 210, published"}, needs=Allow.TRIGGER)
 def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
     """Waiting for Trigger falls with a trigger and rises when the next would be taken."""
-    for one in inspections(camera):
-        if one.under_way is not None:
-            fell = not one.under_way & one.waiting
-            if not fell and one.results and one.results[0].at - one.sent_at < camera.options.quiet:
+    for inspection in inspections(camera):
+        if inspection.under_way is not None:
+            fell = not inspection.under_way & inspection.waiting
+            if (
+                not fell
+                and inspection.results
+                and inspection.results[0].at - inspection.sent_at < camera.options.quiet
+            ):
                 continue  # the inspection was over before the status came
             rose = True  # the observation has waited for it
         else:
-            places = one.places()
+            places = inspection.places()
             fell, rose = places[0] is not None, places[2] is not None
         if not (fell and rose):
-            shown = "; ".join(map(camera.wire.spell, one.came)) or "nothing"
+            shown = "; ".join(map(camera.wire.spell, inspection.came)) or "nothing"
             raise Differs("Waiting for Trigger falls with a trigger and rises again", shown)
 
 

@@ -151,7 +151,7 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
         came = client.listen(takes + camera.options.quiet)
         grace = max(TRANSIT_TIME, 2 * camera.measured.get("query", 0.0))
         results = of_kind(came, MessageId.RESULT_CONTAINER)
-        if any(one.at - ended_at > grace for one in results):
+        if any(result.at - ended_at > grace for result in results):
             raise Differs("no result after Disconnect", client.words(mark))
     if results:
         raise NotObserved("the result was on its way already")

@@ -43,7 +43,7 @@ class Heard(NamedTuple):
 
 def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
     """Return the frames that have an id."""
-    return [one for one in frames if one.message_id == message_id]
+    return [frame for frame in frames if frame.message_id == message_id]
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,7 +82,7 @@ def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """
     reporter.section("smartcam: the client")
     for grade in Grade:
-        some = [one for one in findings if one.grade == grade.value]
+        some = [finding for finding in findings if finding.grade == grade.value]
         if not some:
             continue
         reporter.write_line(f"{grade.value}: {len(some)}")

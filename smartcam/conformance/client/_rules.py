@@ -95,15 +95,15 @@ def sends_whole_messages(run: ClientRun) -> str | None:
 def connects_first(run: ClientRun) -> str | None:
     """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
     answered: set[str] = set()
-    for one in run.messages:
-        if isinstance(one.message, m.ConnectAnswer):
-            answered.add(one.peer)
+    for message in run.messages:
+        if isinstance(message.message, m.ConnectAnswer):
+            answered.add(message.peer)
         elif (
-            one.sender is Sender.CLIENT
-            and one.peer not in answered
-            and not isinstance(one.message, (m.Connect, m.Disconnect))
+            message.sender is Sender.CLIENT
+            and message.peer not in answered
+            and not isinstance(message.message, (m.Connect, m.Disconnect))
         ):
-            return f"{_name(one)} came before Connect was answered"
+            return f"{_name(message)} came before Connect was answered"
     if not answered:
         return "it did not connect"
     return None
@@ -112,9 +112,9 @@ def connects_first(run: ClientRun) -> str | None:
 def disconnects(run: ClientRun) -> str | None:
     """The client's last word is Disconnect."""
     last: dict[str, RecordedMessage] = {}
-    for one in run.messages:
-        if one.sender is Sender.CLIENT:
-            last[one.peer] = one
+    for message in run.messages:
+        if message.sender is Sender.CLIENT:
+            last[message.peer] = message
     if not last:
         return "it did not connect"
     left = [one for one in last.values() if not isinstance(one.message, m.Disconnect)]
@@ -182,26 +182,28 @@ def stops_first(run: ClientRun) -> str | None:
 def waits_for_switch(run: ClientRun) -> str | None:
     """The client gives no command between SwitchApplication and its answer."""
     switching: RecordedMessage | None = None
-    for one in run.messages:
-        if isinstance(one.message, m.SwitchApplication):
-            switching = one
-        elif isinstance(one.message, m.SwitchAnswer):
+    for message in run.messages:
+        if isinstance(message.message, m.SwitchApplication):
+            switching = message
+        elif isinstance(message.message, m.SwitchAnswer):
             return None
-        elif switching is not None and _is_command(one):
-            seconds = one.time - switching.time
-            return f"{_name(one)} came {seconds:.3f} s after SwitchApplication, before its answer"
+        elif switching is not None and _is_command(message):
+            seconds = message.time - switching.time
+            return (
+                f"{_name(message)} came {seconds:.3f} s after SwitchApplication, before its answer"
+            )
     return None if switching is not None else "it did not send SwitchApplication"
 
 
 def is_quiet_while_busy(run: ClientRun) -> str | None:
     """The client gives no command while the last status that was sent has BUSY."""
     since: float | None = None
-    for one in run.messages:
-        if isinstance(one.message, m.StatusReport) and not one.lost:
-            busy = Status.BUSY in one.message.status
-            since = None if not busy else one.time if since is None else since
-        elif since is not None and _is_command(one) and one.time - since > GRACE:
-            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was sent"
+    for message in run.messages:
+        if isinstance(message.message, m.StatusReport) and not message.lost:
+            busy = Status.BUSY in message.message.status
+            since = None if not busy else message.time if since is None else since
+        elif since is not None and _is_command(message) and message.time - since > GRACE:
+            return f"{_name(message)} came {message.time - since:.3f} s after BUSY was sent"
     return None
 
 

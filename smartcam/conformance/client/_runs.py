@@ -72,31 +72,35 @@ class ClientRun:
     @property
     def requests(self) -> Iterator[tuple[int, RecordedMessage]]:
         """The client's messages, with their places in ``messages``."""
-        return ((n, one) for n, one in enumerate(self.messages) if one.sender is Sender.CLIENT)
+        return (
+            (n, message)
+            for n, message in enumerate(self.messages)
+            if message.sender is Sender.CLIENT
+        )
 
     @property
     def sent_turns(self) -> list[int]:
         """Turns of the results that really came from the application, in order."""
         found: list[int] = []
-        for one in self.messages:
-            if isinstance(one.message, ResultContainer) and not one.lost:
-                content = read_container(one.message.data)
+        for message in self.messages:
+            if isinstance(message.message, ResultContainer) and not message.lost:
+                content = read_container(message.message.data)
                 if content is not None and content[0] == self.scene.application:
                     found.append(content[1])
         return found
 
     def status_before(self, place: int) -> Status | None:
         """Return the last status that the camera had sent before a place, None for none."""
-        for one in reversed(self.messages[:place]):
-            if isinstance(one.message, StatusReport) and not one.lost:
-                return one.message.status
+        for message in reversed(self.messages[:place]):
+            if isinstance(message.message, StatusReport) and not message.lost:
+                return message.message.status
         return None
 
     @property
     def lines(self) -> list[str]:
         """The last messages on the wire as lines, for people."""
         left_out = len(self.messages) - MAX_LINES
-        lines = [str(one) for one in self.messages[-MAX_LINES:]]
+        lines = [str(message) for message in self.messages[-MAX_LINES:]]
         return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
 
 

@@ -175,7 +175,7 @@ class EmulatedInSight(LineCamera):
     def shown(self) -> dict[str, Any]:
         """Return the state of the camera that its page shows."""
         device, job = self.device, self.device.job
-        jobs = [one for one in device.jobs.values() if one.id is not None]
+        jobs = [job for job in device.jobs.values() if job.id is not None]
         return {
             **super().shown(),
             "mode": device.mode,
@@ -188,13 +188,13 @@ class EmulatedInSight(LineCamera):
             "applications": [
                 {
                     **dict.fromkeys(SHOWN),
-                    "id": one.id,
-                    "name": one.file,
-                    "rate": one.rate,
-                    "load_time": one.load_time,
-                    "processing_time": one.processing_time,
+                    "id": job.id,
+                    "name": job.file,
+                    "rate": job.rate,
+                    "load_time": job.load_time,
+                    "processing_time": job.processing_time,
                 }
-                for one in jobs
+                for job in jobs
             ],
             "cells": dict(device.cells),
             "quirks": self.quirks,
@@ -378,7 +378,7 @@ class EmulatedInSight(LineCamera):
         return None
 
     def _by_number(self) -> list[TelnetClient]:
-        clients = [one for one in self._clients.values() if isinstance(one, TelnetClient)]
+        clients = [client for client in self._clients.values() if isinstance(client, TelnetClient)]
         return sorted(clients, key=lambda one: one.number)
 
     def _after_start(self) -> None:

@@ -52,7 +52,7 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
         scenarios = file.each()
         if dialect is None:
             return scenarios
-        return tuple(one.model_copy(update={"dialect": dialect}) for one in scenarios)
+        return tuple(scenario.model_copy(update={"dialect": dialect}) for scenario in scenarios)
 
     def mistake(file: ScenarioFile) -> Mistake | None:
         for index, scenario in enumerate(each(file)):

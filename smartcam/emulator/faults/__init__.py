@@ -525,9 +525,9 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
     """
     made: list[Fault] = []
     faults = check_all(given, "faults", "a list of faults", "emulator")
-    for number, one in enumerate(faults, start=1):
+    for number, fault in enumerate(faults, start=1):
         try:
-            made.append(_ADAPTER.validate_python(one))
+            made.append(_ADAPTER.validate_python(fault))
         except ValidationError as exc:
             raise ConfigurationError(f"fault {number}: {validation_text(exc)}") from exc
     return tuple(made)

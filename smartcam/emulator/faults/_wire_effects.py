@@ -277,5 +277,5 @@ def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage
 def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
     """Return a datagram as a message, with its frame if it is exactly one."""
     messages = cut(data, dialect.framer(len(data)), dialect)
-    whole = [one.original for one in messages] == [data]
+    whole = [message.original for message in messages] == [data]
     return messages[0] if whole else WireMessage.of(data, data)

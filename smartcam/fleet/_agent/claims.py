@@ -154,7 +154,9 @@ class Claims:
         self._watch = bus.watch(keys.camera("*", "**"), self._on_presence)
         if self._standby is None:
             await self._refuse()
-        await self.refuse_taken({n: one for n, one in cameras.items() if not self._others.get(n)})
+        await self.refuse_taken(
+            {n: camera for n, camera in cameras.items() if not self._others.get(n)}
+        )
         for name, settings in cameras.items():
             if self._others.get(name):
                 self._consider(name)
@@ -197,7 +199,7 @@ class Claims:
         """
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
-        ports = {one.address.port for one in cameras.values()}
+        ports = {camera.address.port for camera in cameras.values()}
         listed_cameras: list[tuple[str, str, Address]] = []
         for _, payload in answers:
             try:
@@ -207,13 +209,13 @@ class Claims:
                     listed_cameras.append((str(listed["camera"]), str(listed["agent"]), address))
             except (ValueError, TypeError, KeyError, SmartCamError) as exc:
                 logger.warning("! an agent's message about a camera cannot be read: %s", exc)
-        hosts = {one.address.host for one in cameras.values()}
+        hosts = {camera.address.host for camera in cameras.values()}
         hosts |= {address.host for _, _, address in listed_cameras}
-        hosts |= {one.settings.address.host for one in self._agent.hosts.values()}
+        hosts |= {host.settings.address.host for host in self._agent.hosts.values()}
         addresses = await _places_of(hosts)
         listed_cameras += [
-            (name, self._agent.name, one.settings.address)
-            for name, one in self._agent.hosts.items()
+            (name, self._agent.name, host.settings.address)
+            for name, host in self._agent.hosts.items()
         ]
         taken: dict[tuple[str, int], list[tuple[str, str]]] = {}
         for camera, agent, address in listed_cameras:
@@ -449,10 +451,10 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
             addresses = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             return  # the client reports an unknown host
-        found[host] |= {str(one[4][0]) for one in addresses}
+        found[host] |= {str(address[4][0]) for address in addresses}
 
     if names:
-        tasks = [asyncio.create_task(resolve(one)) for one in names]
+        tasks = [asyncio.create_task(resolve(name)) for name in names]
         try:
             await asyncio.wait(tasks, timeout=RESOLVE_TIMEOUT)
         finally:

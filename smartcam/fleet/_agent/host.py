@@ -457,7 +457,7 @@ class Host:
                 first.received_at.timestamp(),
                 timestamp(first.triggered_at),
                 timestamp(None) if first.latency is None else first.latency,
-                [one.raw for one in results],
+                [result.raw for result in results],
                 cells,
             ),
         )

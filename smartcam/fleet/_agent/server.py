@@ -292,8 +292,10 @@ class FleetServer(Server):
             from smartcam.fleet._ros import RosFleet
         file, own = self.file, self.file.agent_name
         cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        calibrations = {name: one.load_calibration(self.folder) for name, one in cameras.items()}
-        hand_eyes = {name: one.load_hand_eye(self.folder) for name, one in cameras.items()}
+        calibrations = {
+            name: camera.load_calibration(self.folder) for name, camera in cameras.items()
+        }
+        hand_eyes = {name: camera.load_hand_eye(self.folder) for name, camera in cameras.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -303,8 +305,14 @@ class FleetServer(Server):
             settings=self._settings,
             frames=self._ros_frames,
             controls=self._controls,
-            calibrations={name: one for name, one in calibrations.items() if one is not None},
-            hand_eyes={name: one for name, one in hand_eyes.items() if one is not None},
+            calibrations={
+                name: calibration
+                for name, calibration in calibrations.items()
+                if calibration is not None
+            },
+            hand_eyes={
+                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
+            },
             wanted=lambda agent, _camera: agent == own,
             desks=self.calibrations,
         )
@@ -359,9 +367,11 @@ class FleetServer(Server):
             if entry.software is not None:
                 device, frames = await self._start_software_camera(planned, folder, stack)
                 url = device.url
-                names = {one.name: number for number, one in device.camera.programs.items()}
+                names = {program.name: number for number, program in device.camera.programs.items()}
                 defaults = {"interpret_as": device.interpret_as, "application_names": names}
-                update = {name: one for name, one in defaults.items() if not getattr(entry, name)}
+                update = {
+                    name: default for name, default in defaults.items() if not getattr(entry, name)
+                }
                 entry = entry.model_copy(update=update)
             else:
                 url = entry.url or await self._emulate(planned, stack)

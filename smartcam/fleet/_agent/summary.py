@@ -102,9 +102,9 @@ class Summaries:
         """Answer in parts, so that a thousand cameras do not block the event loop."""
         key = self._keys.summary(self._agent.name)
         try:
-            hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
+            hosts = [host for host in self._agent.hosts.values() if meets(pattern, host.name)]
             for begin in range(0, len(hosts), IN_A_TURN):
-                cameras = [_row(one) for one in hosts[begin : begin + IN_A_TURN]]
+                cameras = [_row(host) for host in hosts[begin : begin + IN_A_TURN]]
                 summary = {
                     "agent": self._agent.name,
                     "standby": self._agent.stands_by,
@@ -169,8 +169,8 @@ def by_name(
 ) -> dict[str, Any]:
     """Return one camera for each name: if two agents have it for a moment, the better one."""
     found: dict[str, ReportedCamera] = {}
-    for one in cameras:
-        known = found.get(one.summary.camera)
-        if known is None or better(one) > better(known):
-            found[one.summary.camera] = one
+    for camera in cameras:
+        known = found.get(camera.summary.camera)
+        if known is None or better(camera) > better(known):
+            found[camera.summary.camera] = camera
     return found

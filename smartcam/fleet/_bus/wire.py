@@ -88,7 +88,7 @@ def decode_state(data: bytes) -> dict[str, Any]:
 def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
     """Return a message as bytes."""
     if blobs:
-        fields = {**fields, "blobs": [len(one) for one in blobs]}
+        fields = {**fields, "blobs": [len(blob) for blob in blobs]}
     head = _as_json(fields).encode()
     return b"".join((_LENGTH.pack(len(head)), head, *blobs))
 

@@ -530,7 +530,7 @@ def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
         text = "an agent without cameras is a router for others: expected listen, which it lacks"
         yield ("cameras",), text
     if file.record is not None:
-        seeing = [name for name, one in file.cameras.items() if one.frames or one.software]
+        seeing = [name for name, camera in file.cameras.items() if camera.frames or camera.software]
         yield from mistakes_of(file.record, folder, seeing)
     if file.outlets is not None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):

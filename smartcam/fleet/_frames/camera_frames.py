@@ -394,7 +394,7 @@ class SharedFrames:
                 f"{self.name}: a frame of {size} bytes, expected {MAX_FRAME_BYTES} at most",
                 source=self.name,
             )
-        data = frames[0].data if len(frames) == 1 else b"".join(one.data for one in frames)
+        data = frames[0].data if len(frames) == 1 else b"".join(frame.data for frame in frames)
         self.sender.send(order.program, order.call, data)
 
     def _frame_fields(self, frame: Frame, took: float) -> dict[str, Any]:

@@ -64,11 +64,11 @@ class _Window:
 
     @property
     def under_way(self) -> int:
-        return sum(one.under_way for one in self.transfers.values())
+        return sum(transfer.under_way for transfer in self.transfers.values())
 
     @property
     def waiting(self) -> int:
-        return sum(len(one.data) for one in self.transfers.values())
+        return sum(len(transfer.data) for transfer in self.transfers.values())
 
 
 class FrameSender:
@@ -135,14 +135,16 @@ class FrameSender:
     def _push(self, program: str, window: _Window) -> None:
         """Send parts while there is room, the oldest frame's first."""
         room = WINDOW_BYTES - window.under_way
-        for one in window.transfers.values():
-            while one.sent < len(one.data):
-                part = one.data[one.sent : one.sent + PART_BYTES]
+        for transfer in window.transfers.values():
+            while transfer.sent < len(transfer.data):
+                part = transfer.data[transfer.sent : transfer.sent + PART_BYTES]
                 if len(part) > room:
                     return
                 room -= len(part)
-                self._put(program, FramePart(one.call, one.sent, len(one.data)), part)
-                one.sent += len(part)
+                self._put(
+                    program, FramePart(transfer.call, transfer.sent, len(transfer.data)), part
+                )
+                transfer.sent += len(part)
 
     def _put(self, program: str, part: FramePart, data: Data) -> None:
         self._bus.put_part(self._keys.frames(program), encode_part(part), data)

@@ -205,7 +205,7 @@ async def triggered(
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
     runs = await outcomes(work.host, work.owner, request, application, work.timeout)
-    return [one for run in runs for one in singles(decode_own_run(run))]
+    return [single for run in runs for single in singles(decode_own_run(run))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
@@ -225,9 +225,9 @@ async def _trigger(work: Work) -> dict[str, Any]:
     answer: dict[str, Any] = {"result": results[0]}
     if request.results_per_trigger is not None:
         answer = {"results": results}
-    for one in results:
-        if one["error"]:
-            return {**answer, "error": one["error"], "kind": one["kind"]}
+    for result in results:
+        if result["error"]:
+            return {**answer, "error": result["error"], "kind": result["kind"]}
     return answer
 
 
@@ -256,7 +256,7 @@ async def _results(work: Work) -> dict[str, Any]:
     first = max(1, kept.following - most) if work.request.first is None else work.request.first
     part = kept.part(first, MAX_REPLY_BYTES)
     runs = map(decode_own_run, part.data)
-    found = (one for run in runs for one in singles(run) if one.number >= part.first)
+    found = (single for run in runs for single in singles(run) if single.number >= part.first)
     results = [work.topics.result(one) for one in itertools.islice(found, most)]
     return {"first": part.first, "next_result": part.following, "results": results}
 

@@ -272,8 +272,8 @@ class CameraTopics:
         """Publish received containers."""
         out = self._topics.heard("results", self._host.name)
         if out is not None:
-            for one in singles(run):
-                out.put(as_json(self.result(one)))
+            for single in singles(run):
+                out.put(as_json(self.result(single)))
         if self.results_out is not None:
             self.results_out.offer(singles(run), self)
 
@@ -284,7 +284,7 @@ class CameraTopics:
         if out is None and self.status_out is None:
             return
         outs = [out, self.status_out]
-        hearing = [one for one in outs if one is not None and one.heard]
+        hearing = [topic for topic in outs if topic is not None and topic.heard]
         if hearing:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})

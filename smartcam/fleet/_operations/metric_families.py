@@ -69,7 +69,7 @@ async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes
             parts.append(_text(client, family))
             await asyncio.sleep(0)
         for kind in _KINDS if each else (*_KINDS[:-1], _SUMMARY):
-            chosen = [one for one in numbers.cameras if kind.chosen(one)]
+            chosen = [camera for camera in numbers.cameras if kind.chosen(camera)]
             size = max(1, MAX_LINES_PER_TURN // kind.lines)
             for begin in range(0, len(chosen), size):
                 family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
@@ -136,7 +136,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         yield family
     labels = ["agent", "state"]
     family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
-    connected = sum(one.connected for one in numbers.cameras)
+    connected = sum(camera.connected for camera in numbers.cameras)
     family.add_metric([*own, "connected"], connected)
     family.add_metric([*own, "not_connected"], len(numbers.cameras) - connected)
     yield family
@@ -225,9 +225,9 @@ class _MetricKind(NamedTuple):
         """Return the family of some cameras."""
         kind = getattr(core, f"{self.type}MetricFamily")
         family = kind(self.name, self.text, labels=["agent", "camera", *self.labels])
-        for one in cameras:
-            for labels, number in self.values(one):
-                family.add_metric([agent, one.name, *labels], *number)
+        for camera in cameras:
+            for labels, number in self.values(camera):
+                family.add_metric([agent, camera.name, *labels], *number)
         return family
 
 

@@ -83,7 +83,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     totals = Totals(agent.past)
     totals.add(host.camera.statistics() for host in agent.leaving)
     for begin in range(0, len(cameras), 4 * CAMERAS_PER_SLICE):
-        totals.add(one.account for one in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
+        totals.add(camera.account for camera in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
         await asyncio.sleep(0)
     return AgentNumbers(
         agent.name,

@@ -87,8 +87,8 @@ class Totals:
 
 
 def _sum(histograms: list[Histogram]) -> Histogram:
-    counts = tuple(map(sum, zip(*(one.counts for one in histograms), strict=True)))
-    return Histogram(HISTOGRAM_BOUNDS, counts, sum(one.total for one in histograms))
+    counts = tuple(map(sum, zip(*(histogram.counts for histogram in histograms), strict=True)))
+    return Histogram(HISTOGRAM_BOUNDS, counts, sum(histogram.total for histogram in histograms))
 
 
 def cumulative(histogram: Histogram) -> list[tuple[str, float]]:

@@ -403,7 +403,7 @@ class Caller:
 
     def report_leases_lost(self) -> None:
         """Report that this program's reservations are lost, unless that was reported before."""
-        unreported = [one for one in self.leases.values() if not one.reported]
+        unreported = [lease for lease in self.leases.values() if not lease.reported]
         for one in unreported:
             one.reported = True
         if unreported:

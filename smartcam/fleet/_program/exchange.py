@@ -194,10 +194,10 @@ class Exchange(Bus):
         while agent in self._lacking:
             self._lacking.discard(agent)
             cameras = await ask_cameras(bus, keys, agent, "**", ASK_AGAIN)
-            for one in cameras:
+            for camera in cameras:
                 places = self._places.get("results", {})
-                for place in tuple(places.get(keys.results(one.summary.camera), ())):
-                    place.call(place.key, encode_runs(one.epoch, one.following, []))
+                for place in tuple(places.get(keys.results(camera.summary.camera), ())):
+                    place.call(place.key, encode_runs(camera.epoch, camera.following, []))
             if not cameras and await bus.present(keys.agent(agent), ASK_AGAIN):
                 self._lacking.add(agent)
                 await asyncio.sleep(ASK_AGAIN)

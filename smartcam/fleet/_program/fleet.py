@@ -237,7 +237,7 @@ def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
     *_, last = accounts
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
-        last, **{name: sum(getattr(one, name) for one in accounts) for name in counts}
+        last, **{name: sum(getattr(account, name) for account in accounts) for name in counts}
     )
 
 
@@ -337,7 +337,7 @@ class Fleet:
         await asyncio.gather(*self._opening.values(), return_exceptions=True)
         cameras = [*self._cameras.values()]
         for begin in range(0, len(cameras), MAX_CAMERAS_AT_ONCE):
-            await close_all(one.close for one in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
+            await close_all(camera.close for camera in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
         for results in self._subscribed("**"):
             results.end()
         for stream in self._events:
@@ -460,7 +460,7 @@ class Fleet:
         """
         cameras = self.cameras(pattern)
         self._require_open()
-        meeting = [self._opening[one.name] for one in cameras if one.name in self._opening]
+        meeting = [self._opening[camera.name] for camera in cameras if camera.name in self._opening]
         await self._met(meeting)
         self._require_open()
         return cameras
@@ -725,7 +725,7 @@ class Fleet:
             except SmartCamError as error:
                 return error
 
-        doing = {one.name: do(one) for one in cameras}
+        doing = {camera.name: do(camera) for camera in cameras}
         try:
             async with asyncio.TaskGroup() as group:
                 tasks = {name: group.create_task(outcome(one)) for name, one in doing.items()}
@@ -733,7 +733,7 @@ class Fleet:
             for one in doing.values():
                 one.close()  # its task may never have begun
         outcomes = {name: task.result() for name, task in tasks.items()}
-        if all(isinstance(one, ConfigurationError) for one in outcomes.values()):
+        if all(isinstance(outcome, ConfigurationError) for outcome in outcomes.values()):
             raise next(iter(outcomes.values()))
         return outcomes
 
@@ -768,7 +768,7 @@ class Fleet:
             return stream
 
         results = FleetResults[Any](subscribe)
-        self._results = [one for one in self._results if one[1]() is not None]
+        self._results = [result for result in self._results if result[1]() is not None]
         self._results.append((pattern, weakref.ref(results)))
         names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):
@@ -782,4 +782,4 @@ class Fleet:
     def _subscribed(self, name: str) -> list[FleetResults[Any]]:
         """Return the streams whose pattern has a name in common with a name or pattern."""
         streams = [results() for pattern, results in self._results if meets(pattern, name)]
-        return [one for one in streams if one is not None]
+        return [stream for stream in streams if stream is not None]

@@ -81,7 +81,7 @@ class FleetListeners(Listeners):
 
     def unmarked(self) -> list[asyncio.Future[Result]]:
         """Return the waiters whose start is not known yet."""
-        return [one for one in self._next_results if one not in self._since]
+        return [result for result in self._next_results if result not in self._since]
 
     def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
         """Note that a waiter for the next result needs one from ``clock`` on."""
@@ -89,7 +89,9 @@ class FleetListeners(Listeners):
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
         horizon = self.results.horizon
-        late = [one for one in self._next_results if self._since.get(one, -math.inf) > horizon]
+        late = [
+            result for result in self._next_results if self._since.get(result, -math.inf) > horizon
+        ]
         taken = super()._take_next_results()
         if late:
             self._next_results.update(late)
@@ -324,7 +326,7 @@ class Receiver:
             known = 0  # states that came with replies
             if epoch == self.epoch:
                 known = max(0, self._states.expected - following + len(message.blobs))
-            states = [state(one) for one in message.blobs[known:]]
+            states = [state(blob) for blob in message.blobs[known:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
             logger.warning("%s ! %s: %s", self._name, what, exc)
             return
@@ -432,16 +434,16 @@ class Receiver:
                 return
             if listeners.streams_results and self._take_burst(run, now):
                 return
-            for one in singles(run):
+            for single in singles(run):
                 fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
-                        one, self._interpretation()
+                        single, self._interpretation()
                     )
                 except InterpretationError as error:
                     outcome, fate = error, "late" if fate == "late" else "uninterpretable"
                 self._counters.count(fate)
-                self._offer(one, outcome, now, owned=False)
+                self._offer(single, outcome, now, owned=False)
         finally:
             listeners.results.horizon = math.inf
 
@@ -501,7 +503,7 @@ class Receiver:
 
 def _things(kind: str, reply: BusMessage) -> list[Any]:
     if kind == "states":
-        return [state(one) for one in reply.blobs]
+        return [state(blob) for blob in reply.blobs]
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 

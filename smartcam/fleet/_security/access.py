@@ -52,7 +52,7 @@ class Right(NamedTuple):
 
 
 _ANY = Keys("*")  # keys of any fleet, since an authority is for one plant
-_LOOKING = tuple(name for name, one in SERVICES.items() if not one.command)
+_LOOKING = tuple(name for name, service in SERVICES.items() if not service.command)
 _LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 
 RIGHTS: tuple[Right, ...] = (

@@ -363,7 +363,7 @@ def _write_key(place: Path, key: Any) -> None:
 
 def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
     """Return a text on how to use a certificate."""
-    host = next((one for one in reversed(hosts) if one not in HERE), "HOST")
+    host = next((host for host in reversed(hosts) if host not in HERE), "HOST")
     if role == ROUTER:
         return f"zenohd --config {place / ROUTER_FILE}\n"
     if role == AGENT:

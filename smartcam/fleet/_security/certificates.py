@@ -185,7 +185,7 @@ def read_identity(folder: Path) -> Identity:
         _named(own, oid.COMMON_NAME),
         _named(own, oid.ORGANIZATIONAL_UNIT_NAME),
         own.not_valid_after_utc,
-        max(one.not_valid_after_utc for one in authorities),
+        max(authority.not_valid_after_utc for authority in authorities),
         hashlib.sha256(b"\0".join(bodies)).digest(),
     )
 

@@ -353,7 +353,9 @@ def attach(found: socket.socket, steps: list[_Instruction]) -> None:
     Raises:
         OSError: the system refuses the filter.
     """
-    packed = b"".join(struct.pack("HBBI", one.code, one.yes, one.no, one.value) for one in steps)
+    packed = b"".join(
+        struct.pack("HBBI", step.code, step.yes, step.no, step.value) for step in steps
+    )
     kept = ctypes.create_string_buffer(packed, len(packed))
     program = struct.pack("HP", len(steps), ctypes.addressof(kept))
     found.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy

@@ -200,7 +200,7 @@ class Assembler:
         return wanted
 
     def _open_blocks(self) -> list[Block]:
-        return [one for one in self._blocks.values() if not (one.complete or one.dead)]
+        return [block for block in self._blocks.values() if not (block.complete or block.dead)]
 
     def _deadline(self, block: Block) -> float:
         if block.missing_since < math.inf:

@@ -66,11 +66,11 @@ class Element:
 
     def all(self, *kinds: str) -> list[Element]:
         """Return the children of these kinds."""
-        return [one for one in self.children if one.kind in kinds]
+        return [child for child in self.children if child.kind in kinds]
 
     def first(self, *kinds: str) -> Element | None:
         """Return the first child of these kinds."""
-        return next((one for one in self.children if one.kind in kinds), None)
+        return next((child for child in self.children if child.kind in kinds), None)
 
     def text_of(self, kind: str, default: str = "") -> str:
         """Return the text of the first child of a kind."""
@@ -206,7 +206,7 @@ def _nodes(root: Element) -> dict[str, Element]:
         if element.kind in ("RegisterDescription", "Group"):
             waiting += element.children
         elif element.kind == "StructReg":
-            shared = [one for one in element.children if one.kind != "StructEntry"]
+            shared = [child for child in element.children if child.kind != "StructEntry"]
             for entry in element.all("StructEntry"):
                 copies += len(shared)
                 if copies > MAX_ELEMENTS:
@@ -214,7 +214,7 @@ def _nodes(root: Element) -> dict[str, Element]:
                         f"the description: expected at most {MAX_ELEMENTS} elements, those of a "
                         f"StructReg counted for each entry, got {copies} such ones"
                     )
-                own = {one.kind for one in entry.children}
+                own = {child.kind for child in entry.children}
                 entry.children += [one for one in shared if one.kind not in own]
                 found[entry.name] = entry
         elif element.name:

@@ -124,7 +124,7 @@ async def find(
         for opened in transports:
             opened.close()
     answers = sorted((one for it in asked for one in it.found), key=lambda one: one.reachable)
-    found = {(one.info.mac, one.info.serial, one.address): one for one in answers}
+    found = {(answer.info.mac, answer.info.serial, answer.address): answer for answer in answers}
     return sorted(found.values(), key=lambda one: (one.info.label, one.address))
 
 

@@ -286,7 +286,7 @@ class GenicamFeatures:
         """Return a node's value in the user's form."""
         value = await self._get(node, 0)
         if node.kind == "Enumeration":
-            return next((name for name, one in _entries(node).items() if one == value), value)
+            return next((name for name, entry in _entries(node).items() if entry == value), value)
         if node.kind == "Boolean":
             return value == _on(node)
         return value
@@ -347,11 +347,11 @@ class GenicamFeatures:
         self, node: Element, kind: str, depth: int, default: float | None = None
     ) -> int | float:
         """Return the number in ``<kind>``, or of the node named in ``<pKind>``."""
-        for one in node.children:
-            if one.kind == kind:
-                return _number(one.text)
-            if one.kind == "p" + kind:
-                return await self._numbered(one.text, depth + 1)
+        for child in node.children:
+            if child.kind == kind:
+                return _number(child.text)
+            if child.kind == "p" + kind:
+                return await self._numbered(child.text, depth + 1)
         if default is None:
             raise MessageError(f"{node.kind} {node.name}: it has no <{kind}>")
         return default
@@ -448,14 +448,14 @@ class GenicamFeatures:
         """Evaluate a formula with the node's variables."""
         whole = node.kind.startswith("Int")
         self._spend(node, len(formula))
-        for one in node.children:
-            if one.kind == "pVariable":
-                variables[one.name] = await self._variable(one, depth)
-            elif one.kind == "Constant":
-                variables[one.name] = _number(one.text)
-            elif one.kind == "Expression":
-                self._spend(node, len(one.text))
-                variables[one.name] = evaluate(one.text, variables, whole=whole)
+        for child in node.children:
+            if child.kind == "pVariable":
+                variables[child.name] = await self._variable(child, depth)
+            elif child.kind == "Constant":
+                variables[child.name] = _number(child.text)
+            elif child.kind == "Expression":
+                self._spend(node, len(child.text))
+                variables[child.name] = evaluate(child.text, variables, whole=whole)
         return evaluate(formula, variables, whole=whole)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
@@ -637,15 +637,15 @@ class GenicamFeatures:
         if not 0 < length <= MAX_REGISTER_BYTES:
             raise MessageError(f"{node.kind} {node.name}: impossible length {length}")
         address = 0
-        for one in node.children:
-            if one.kind == "Address":
-                address += _whole(one.text)
-            elif one.kind == "pAddress":
-                address += int(await self._numbered(one.text, depth + 1))
-            elif one.kind == "IntSwissKnife":
-                address += int(await self._get(one, depth + 1))
-            elif one.kind == "pIndex":
-                address += await self._index(one, length, depth)
+        for child in node.children:
+            if child.kind == "Address":
+                address += _whole(child.text)
+            elif child.kind == "pAddress":
+                address += int(await self._numbered(child.text, depth + 1))
+            elif child.kind == "IntSwissKnife":
+                address += int(await self._get(child, depth + 1))
+            elif child.kind == "pIndex":
+                address += await self._index(child, length, depth)
         if not 0 <= address <= 0xFFFFFFFF - length:
             raise MessageError(f"{node.kind} {node.name}: impossible address {address:#x}")
         return address, length

@@ -137,7 +137,7 @@ async def _set_format(session: GigESession, name: str) -> None:
     for entry, number in entries.items():
         known = _format_of_code(number)
         names = [entry] if known is None else [entry, known.name, known.fourcc]
-        if name.upper() in (one.upper() for one in names):
+        if name.upper() in (name.upper() for name in names):
             await session.features.set("PixelFormat", entry)
             return
     raise FrameFormatError(
@@ -191,7 +191,9 @@ async def read_shape(session: GigESession) -> StreamShape:
     number = int(await features.number("PixelFormat") or 0)
     pixels = _format_of_code(number)
     if pixels is None:
-        fitting = tuple(name for name, one in entries.items() if _format_of_code(one) is not None)
+        fitting = tuple(
+            name for name, entry in entries.items() if _format_of_code(entry) is not None
+        )
         raise FrameFormatError(
             f"{session.label}: it is set to {entry}, {number:#010x}, which is unknown; of "
             f"its formats, smartcam knows {', '.join(fitting) or 'none'}",
@@ -223,7 +225,7 @@ async def read_exposure(features: GenicamFeatures) -> Exposure:
     if "ExposureAuto" in features:
         with contextlib.suppress(FrameSourceError):
             is_auto = await features.get("ExposureAuto") != "Off"
-            for name in (one for one in _EXPOSURES if is_auto and one in features):
+            for name in (exposure for exposure in _EXPOSURES if is_auto and exposure in features):
                 longest = (await features.describe(name)).maximum
                 if longest is not None and longest < MAX_NUMBER:
                     exposure = max(exposure, longest)

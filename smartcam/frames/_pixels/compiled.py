@@ -91,7 +91,7 @@ def planes_to_rgb(
             interleaved = cv2.merge(parts)
             parts = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
         band = slice(top * down, (top + step) * down)
-        merged = cv2.merge([y[band], *(one[: height - band.start, :width] for one in parts)])
+        merged = cv2.merge([y[band], *(part[: height - band.start, :width] for part in parts)])
         if spare:  # bits above the depth have no meaning
             cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
         found = cv2.transform(merged, weights)

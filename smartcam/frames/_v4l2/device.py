@@ -312,7 +312,7 @@ class CaptureDevice:
         got = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
         if wanted is not None and (got is None or abs(got - wanted) > wanted * MAX_RATE_DEVIATION):
             there = tuple(
-                f"{one:g}/s" for one in self.rates(layout.fourcc, layout.width, layout.height)
+                f"{rate:g}/s" for rate in self.rates(layout.fourcc, layout.width, layout.height)
             )
             raise FrameFormatError(
                 f"{self.path}: expected {wanted:g} frames/s of {_named(layout.fourcc)} "

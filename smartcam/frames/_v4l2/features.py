@@ -205,10 +205,10 @@ class V4L2Features(DeviceFeatures):
     async def _found(self, name: str) -> ControlFeature:
         features = await self._all()
         wanted = spelled(name)
-        for one in features:
-            if wanted in one.spellings:
-                return one
-        names = [one.name for one in features]
+        for feature in features:
+            if wanted in feature.spellings:
+                return feature
+        names = [feature.name for feature in features]
         raise FrameFeatureError(
             f"{self._driver.name}: it has no feature {name!r}{did_you_mean(name, names)}; it has "
             f"{', '.join(names) or 'none'}",

@@ -234,7 +234,11 @@ def converted(video: Any, name: str) -> Any:
     """
     kind, width = video.format, video.width
     wide = -(-width // RIGHT_WIDTH) * RIGHT_WIDTH
-    padded = wide != width and not kind.has_palette and max(one.bits for one in kind.components) > 8
+    padded = (
+        wide != width
+        and not kind.has_palette
+        and max(component.bits for component in kind.components) > 8
+    )
     try:
         made = (_resized(video, wide) if padded else video).reformat(format=name)
     except (OSError, ValueError) as exc:

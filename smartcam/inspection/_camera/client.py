@@ -58,7 +58,9 @@ class SoftwareCamera(SmartCamera[ValueT]):
         usual = {
             "name": camera.name,
             "interpret_as": self._device.interpret_as,
-            "application_names": {one.name: number for number, one in camera.programs.items()},
+            "application_names": {
+                program.name: number for number, program in camera.programs.items()
+            },
         }
         given = {
             **usual,

@@ -169,7 +169,7 @@ class SoftwareDevice(Server):
     @property
     def interpret_as(self) -> dict[int, str]:
         """Layout of the results of each application."""
-        return {number: one.interpret_as for number, one in self.camera.programs.items()}
+        return {number: program.interpret_as for number, program in self.camera.programs.items()}
 
     def last_sent(self) -> tuple[int, LastReport | None]:
         """Return the session's number (0: no session), and the last report of a run.

@@ -355,7 +355,7 @@ def _followed(
     turns = np.array([-1.0, 0.0, 1.0]) * step
     sizes = np.array([1 - step, 1.0, 1 + step]) if ranges.scales[1] > ranges.scales[0] else [1.0]
     ways = np.array([(turn, size) for turn in turns for size in sizes])
-    start = np.array([(one.x, one.y, one.angle, one.scale) for one in places])
+    start = np.array([(place.x, place.y, place.angle, place.scale) for place in places])
     angles = (start[:, 2, None] + ways[:, 0]).ravel()
     scales = (start[:, 3, None] * ways[:, 1]).ravel()
     at = np.rint(start[:, :2] / 2**level).astype(int).repeat(len(ways), axis=0)
@@ -400,7 +400,7 @@ def _scores(
     ahead = (cos * u - sin * v).astype(np.float32)
     down = (sin * u + cos * v).astype(np.float32)
     found = np.empty((len(at), len(OFFSETS)), np.float32)
-    flat = [np.pad(one, ((0, 1), (0, 0))).ravel() for one in units]  # nothing behind the last row
+    flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]  # nothing behind the last row
     nothing = height * width
     for number, (dx, dy) in enumerate(OFFSETS.tolist()):
         column, row = columns + dx, rows + dy
@@ -421,15 +421,15 @@ def _best(
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places without duplicates, and the best place with too low a score."""
     kept: list[RoughPlace] = []
-    for one in sorted(places, key=lambda one: -one.score):
-        if one.score < least:
-            if refused is None or one.score > refused.score:
-                refused = one
+    for place in sorted(places, key=lambda one: -one.score):
+        if place.score < least:
+            if refused is None or place.score > refused.score:
+                refused = place
             break
         if len(kept) == most:
             break
-        if not any(_alike(one, other, pixel) for other in kept):
-            kept.append(one)
+        if not any(_alike(place, other, pixel) for other in kept):
+            kept.append(place)
     return kept, refused
 
 

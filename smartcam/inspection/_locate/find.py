@@ -320,7 +320,7 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
         blur=fine.blur,
         chi_square=fine.chi_square,
         hull=fine.pose.to_picture(model.hull),
-        contours=tuple(fine.pose.to_picture(one) for one in model.contours),
+        contours=tuple(fine.pose.to_picture(contour) for contour in model.contours),
     )
 
 
@@ -384,9 +384,9 @@ def _is_near(one: RoughPlace, other: LocatedPart) -> bool:
 def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
     """Return the best parts whose overlaps are at most as large as allowed."""
     kept: list[LocatedPart] = []
-    for one in sorted(parts, key=lambda one: (-one.score, one.chi_square)):
-        if all(_covered(one.hull, other.hull) <= overlap for other in kept):
-            kept.append(one)
+    for part in sorted(parts, key=lambda one: (-one.score, one.chi_square)):
+        if all(_covered(part.hull, other.hull) <= overlap for other in kept):
+            kept.append(part)
     return kept
 
 

@@ -210,7 +210,7 @@ class PartModel:
             check_choice(unit, "unit", tuple(MM), who)
         if isinstance(layers, str | bytes) or not isinstance(layers, Sequence):
             raise wrong_argument("layers", "a sequence of names", layers, who)
-        layers = [check_text(one, "layers", who, least=1) for one in layers]
+        layers = [check_text(layer, "layers", who, least=1) for layer in layers]
         picture, (x, y) = drawn_outline(read_outline(path, scale, unit, layers), bright=bright)
         model = _taught(Picture.of(picture), None, name, None)
         return replace(model, reference=(model.reference[0] + x, model.reference[1] + y))
@@ -284,7 +284,7 @@ class PartModel:
     @cached_property
     def coarse(self) -> CoarseModel:
         """The points for the coarse search."""
-        some = [self.segments.selected(one) for one in self.levels]
+        some = [self.segments.selected(level) for level in self.levels]
         return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
 
     def bands_at(self, scale: float) -> Bands:
@@ -318,7 +318,7 @@ class PartModel:
         outer = [one for one, (_, _, _, parent) in zip(found, tree, strict=True) if parent < 0]
         outer.sort(key=len, reverse=True)
         polygons = [_simpler(one) for one in outer[:MAX_CONTOURS] if len(one) >= MIN_CONTOUR_PX]
-        return tuple(one.astype(np.float64) + low for one in polygons)
+        return tuple(polygon.astype(np.float64) + low for polygon in polygons)
 
 
 def _simpler(contour: NDArray[Any]) -> NDArray[Any]:
@@ -573,7 +573,7 @@ class _ModelFile(BaseModel):
             about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
             moves=one.moves.round(5).tolist(),
-            levels=[one.tolist() for one in model.levels],
+            levels=[level.tolist() for level in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )
 
@@ -586,7 +586,7 @@ class _ModelFile(BaseModel):
             name=self.name,
             segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
-            levels=tuple(np.array(one, np.intp) for one in self.levels),
+            levels=tuple(np.array(level, np.intp) for level in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
             reference=self.reference,
             border=self.border,

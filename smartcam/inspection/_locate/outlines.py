@@ -227,10 +227,12 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
             f'{path}: its width and height have no unit, such as width="50mm": set unit to one of '
             f"{', '.join(MM)}",
         )
-    millimetres = [(one[0] * MM[one[1]], one[1]) for one in sizes if one is not None]
+    millimetres = [(size[0] * MM[size[1]], size[1]) for size in sizes if size is not None]
     if not box:
         return MM["px"]
-    across, down = (one[0] / side for one, side in zip(millimetres, box[2:], strict=True))
+    across, down = (
+        millimetre[0] / side for millimetre, side in zip(millimetres, box[2:], strict=True)
+    )
     if not (across > 0 and abs(down / across - 1) < 1e-3):
         raise TeachingError(
             TeachingTrouble.UNIT,
@@ -373,7 +375,9 @@ def _curve(corners: Array, flat: float) -> list[Any]:
     part = np.linspace(0, 1, count + 1)[1:, None]
     order = len(corners) - 1
     weights = [math.comb(order, k) * part**k * (1 - part) ** (order - k) for k in range(order + 1)]
-    return [*np.sum([one * corner for one, corner in zip(weights, corners, strict=True)], axis=0)]
+    return [
+        *np.sum([weight * corner for weight, corner in zip(weights, corners, strict=True)], axis=0)
+    ]
 
 
 _TRANSFORM: Final = re.compile(r"\s*(\w+)\s*\(([^)]*)\)\s*,?")

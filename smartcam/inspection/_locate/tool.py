@@ -67,7 +67,7 @@ class Locate(Tool[LocateSettings]):
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
         load("scipy.special", "locate needs")  # saves the first picture the import
-        self.models = [PartModel.read(setup.folder / one) for one in settings.models]
+        self.models = [PartModel.read(setup.folder / model) for model in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
             model = PartModel.teach(Picture.read(file), settings.part, name=file.stem)

@@ -240,7 +240,7 @@ def find_edges(
     candidates, counts = _candidates(profiles(image, part), part, settings, noise)
     steps = _steps(image, part, candidates, settings, noise, tilted=tilted)
     for index, owner in enumerate(crossed.tolist()):
-        mine = [one for one in steps if one.owner == index]
+        mine = [step for step in steps if step.owner == index]
         crowded = sum(map(len, candidates[index : index + 1])) > len(mine)
         found[owner] = _of_strip(mine, settings, noise, crowded=crowded, count=counts[index])
     return found
@@ -253,10 +253,10 @@ def _of_strip(
     if crowded:
         text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be separated"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
-    judged = [one for one in steps if wanted(one.edge, settings) or not one.settled]
+    judged = [step for step in steps if wanted(step.edge, settings) or not step.settled]
     too_many = None
     # if a fitted edge has too little contrast, the weaker edges have, too
-    if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
+    if count > MAX_EDGES and all(abs(step.edge.height) >= settings.contrast for step in steps):
         text = f"{count} edges in one strip, {MAX_EDGES} at most can be separated"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
     if not judged and too_many is not None:
@@ -387,12 +387,12 @@ def _steps(
     near, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
     blurs = np.ones(number)
     groups = _groups(candidates, half, near, reach)
-    for one in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
-        if one.settled:
-            seen = _seen_blur(min(one.edge.blur, settings.most_blur))
-            near[one.owner] = max(near[one.owner], MAX_GROUP_GAP_BLURS * seen)
-            reach[one.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
-            blurs[one.owner] = one.edge.blur
+    for group in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
+        if group.settled:
+            seen = _seen_blur(min(group.edge.blur, settings.most_blur))
+            near[group.owner] = max(near[group.owner], MAX_GROUP_GAP_BLURS * seen)
+            reach[group.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
+            blurs[group.owner] = group.edge.blur
     groups = _groups(candidates, half, near, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
@@ -414,8 +414,8 @@ def _fit_groups(
 ) -> list[_FittedStep]:
     """Return the fitted steps of all groups; ``blurs`` (N,) of the strips; None: unknown."""
     found = []
-    for count in sorted({len(one.places) for one in groups}):
-        some = [one for one in groups if len(one.places) == count]
+    for count in sorted({len(group.places) for group in groups}):
+        some = [group for group in groups if len(group.places) == count]
         owners = np.array([one.owner for one in some])
         low, high = (np.array([one[end] for one in some]) for end in (2, 3))
         pixels = cut(image, strips.selected(owners), low, high)
@@ -637,6 +637,6 @@ def sound(found: JudgedEdge) -> Edge:
 
 
 def _several(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
-    places = ", ".join(f"{one.edge.place:.1f}" for one in edges[:4])
+    places = ", ".join(f"{edge.edge.place:.1f}" for edge in edges[:4])
     text = f"{len(edges)} edges where {expected} expected, {places} px from the region's middle"
     return NotMeasuredError(NoValueReason.TWO_EDGES, text)

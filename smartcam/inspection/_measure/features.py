@@ -164,26 +164,26 @@ def _collected(
     number = len(edges) + len(troubles)
     if len(edges) < MIN_FOUND_SHARE * number:
         raise _few(troubles, number)
-    places = np.array([one.place for one in edges])
-    noises = np.array([one.noise for one in edges])
+    places = np.array([edge.place for edge in edges])
+    noises = np.array([edge.noise for edge in edges])
     noise = float(np.median(noises))
     noises = np.where(noises > OWN_NOISE_FACTOR * noise, noises, noise)
-    blur = math.sqrt(float(np.median([one.blur for one in edges])) ** 2 + PIXEL_VARIANCE)
+    blur = math.sqrt(float(np.median([edge.blur for edge in edges])) ** 2 + PIXEL_VARIANCE)
     some, middle = strips.selected(np.array(owners)), np.zeros(len(owners))
     if isinstance(strips, Sectors):
         # blur moves the rim of a disc inwards by s^2 / (2 r)
         places = places + blur**2 / (2 * (strips.radius + places))
-    unit = np.array([one.unit_sigma for one in edges])
+    unit = np.array([edge.unit_sigma for edge in edges])
     seen = Edges(some.points(places, middle), np.array(some.ahead(middle)), unit * noises)
-    misfit = float(np.median([one.misfit for one in edges]))
+    misfit = float(np.median([edge.misfit for edge in edges]))
     return FoundShape(seen, tuple(troubles), blur, misfit)
 
 
 def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
     """Return the error for a line or a circle with too few strips with an edge."""
-    kinds = [one.why for one in troubles]
+    kinds = [trouble.why for trouble in troubles]
     most = max(kinds, key=kinds.count)
-    example = next(one for one in troubles if one.why is most)
+    example = next(trouble for trouble in troubles if trouble.why is most)
     text = f"{len(troubles)} of {number} strips have no edge: {example.text}"
     return NotMeasuredError(most, text)
 

@@ -108,8 +108,8 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
         return _with_variants(calibration, calibration, _plane_variants(calibration), robot=robot)
     if kind == "sheet":
         variants = [
-            dataclasses.replace(calibration, plane=one)
-            for one in _plane_variants(calibration.plane)
+            dataclasses.replace(calibration, plane=variant)
+            for variant in _plane_variants(calibration.plane)
         ] + [
             dataclasses.replace(calibration, sheet=one)
             for one in (*_view_variants(calibration.sheet), *calibration.lens_planes)
@@ -139,7 +139,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
     return Plane(
         "mm",
         mapped(calibration),
-        tuple(mapped(one) for one in variants),
+        tuple(mapped(variant) for variant in variants),
         _remark(calibration, plane),
     )
 

@@ -291,10 +291,10 @@ class _EdgeFinder:
     def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:
         """Return the marks to draw."""
         role: Role = "wrong" if wrong else "found"
-        marks = [Drawing("polygon", _corners(one), "region") for one in self._regions]
-        marks += [Drawing("points", _corners(one), role) for one in self._edges]
+        marks = [Drawing("polygon", _corners(region), "region") for region in self._regions]
+        marks += [Drawing("points", _corners(edge), role) for edge in self._edges]
         marks += [Drawing("points", _corners(one), "hint") for one in self._left_out if len(one)]
-        marks += [Drawing("line", _corners(one), role) for one in self._shapes]
+        marks += [Drawing("line", _corners(shape), role) for shape in self._shapes]
         if text and self._edges:
             marks.append(Drawing("text", _corners(self._edges[0][:1]), role, text))
         return marks

@@ -115,7 +115,9 @@ def read_codes(
         binarizer=getattr(zxing.Binarizer, binarizer),
     )
     is_gs1 = zxing.ContentType.GS1
-    return [_code(one, back, prepared, gs1=one.content_type == is_gs1) for one in barcodes]
+    return [
+        _code(barcode, back, prepared, gs1=barcode.content_type == is_gs1) for barcode in barcodes
+    ]
 
 
 def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:

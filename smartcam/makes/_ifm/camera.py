@@ -237,7 +237,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def _apps(self, call: IfmClient) -> str:
         """Return the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
-        return "\t".join([*numbers, *(f"{one:02}" for one in self.applications)])
+        return "\t".join([*numbers, *(f"{application:02}" for application in self.applications)])
 
     @request(r"a(\d\d)")
     def _a(self, call: IfmClient, number: str) -> str:
@@ -256,7 +256,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def _stats(self, call: IfmClient) -> str:
         """Return the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
-        return "\t".join(f"{one:010}" for one in counts) if self.active else "!"
+        return "\t".join(f"{count:010}" for count in counts) if self.active else "!"
 
     @request(r"G\?")
     def _who(self, call: IfmClient) -> str:
@@ -279,7 +279,9 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         if kind != ("01" if application.jpeg else "02"):
             return "!"
         counts = range(self.results, self.results + application.images)
-        data = b"".join(application.picture(one, now).encoded for one in counts).decode("latin-1")
+        data = b"".join(application.picture(count, now).encoded for count in counts).decode(
+            "latin-1"
+        )
         return _counted(data) if data else "!"
 
     @request(r"c(\d{9})(.*)")

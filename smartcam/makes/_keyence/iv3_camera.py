@@ -46,7 +46,7 @@ class EmulatedIv3(EvaluatingCamera):
         **options: Any,
     ) -> None:
         some = tuple(parts) or ((),)
-        numbers = [check_integer(one, "programs", 0, LAST_PROGRAM) for one in programs]
+        numbers = [check_integer(program, "programs", 0, LAST_PROGRAM) for program in programs]
         self.set_up(dict.fromkeys(numbers, some), active)
         self.processing_time: float = check_seconds(processing_time, "processing_time")
         self.count: int = 0

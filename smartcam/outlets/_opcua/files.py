@@ -119,7 +119,7 @@ class TransferFiles:
         def guarded(do: Any) -> Any:
             async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
                 file = self._files.get(number)
-                values = [one.Value for one in arguments]
+                values = [argument.Value for argument in arguments]
                 if file is None or not values or values[0] != number:
                     return _status(ua.StatusCodes.BadInvalidArgument)
                 file.timer.cancel()

@@ -54,12 +54,12 @@ class VisionStates:
     def _find(self, target: str, cause: str) -> Transition | None:
         """Return the transition from the present state, one that stays within its machine."""
         here = {VISION: self.vision, AUTOMATIC: self.automatic}
-        own = {(one.machine, one.source) for one in transitions()}
-        for one in transitions():
-            if here[one.machine] != one.source or one.cause != cause:
+        own = {(transition.machine, transition.source) for transition in transitions()}
+        for transition in transitions():
+            if here[transition.machine] != transition.source or transition.cause != cause:
                 continue
-            if (one.machine, one.target) not in own:
+            if (transition.machine, transition.target) not in own:
                 continue  # Preoperational to Initialized leads into the other machine
-            if target in ("", one.target):
-                return one
+            if target in ("", transition.target):
+                return transition
         return None

@@ -138,7 +138,7 @@ class Methods:
             codes = ua.StatusCodes
             return ua.StatusCode(codes.BadArgumentsMissing if few else codes.BadTooManyArguments)
         try:
-            given = [_argument(one, of) for one, of in zip(arguments, types, strict=True)]
+            given = [_argument(argument, of) for argument, of in zip(arguments, types, strict=True)]
         except MethodArgumentError:
             return _wrong_arguments(arguments, types)
         try:
@@ -394,10 +394,10 @@ def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> u
     """Return the answer to a call with wrong types of arguments, with a status for each."""
     result = ua.CallMethodResult()
     result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-    for one, of in zip(arguments, types, strict=True):
+    for argument, of in zip(arguments, types, strict=True):
         status = ua.StatusCode()
         try:
-            _argument(one, of)
+            _argument(argument, of)
         except MethodArgumentError:
             status = ua.StatusCode(ua.StatusCodes.BadTypeMismatch)
         result.InputArgumentResults.append(status)

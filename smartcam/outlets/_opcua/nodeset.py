@@ -67,15 +67,15 @@ def node_ids() -> Mapping[str, int]:
     """Return the numeric ids of all types of the nodeset, by their names."""
     kinds = ("UAObjectType", "UAVariableType", "UADataType")
     wanted = {_NODE + kind for kind in kinds}
-    return {_name(one): _number(key) for key, one in _nodes().items() if one.tag in wanted}
+    return {_name(node): _number(key) for key, node in _nodes().items() if node.tag in wanted}
 
 
 @functools.cache
 def state_ids() -> Mapping[tuple[str, str], int]:
     """Return the numeric ids of states, by the names of their machine's type and their own."""
     found: dict[tuple[str, str], int] = {}
-    for one in transitions():
-        for name, key in _ends(_nodes()[f"ns=1;i={one.node}"]):
+    for transition in transitions():
+        for name, key in _ends(_nodes()[f"ns=1;i={transition.node}"]):
             found[_machine(_nodes()[key]), name] = _number(key)
     return found
 
@@ -88,8 +88,8 @@ def transitions() -> tuple[Transition, ...]:
         ends = [name for name, _ in _ends(node)]
         machine = _machine(node)
         if len(ends) == 2 and machine in (VISION, AUTOMATIC):
-            causes = [_name(_nodes()[one]) for one in _refers(node, "HasCause")]
-            effects = tuple(_name(_nodes()[one]) for one in _refers(node, "HasEffect"))
+            causes = [_name(_nodes()[reference]) for reference in _refers(node, "HasCause")]
+            effects = tuple(_name(_nodes()[reference]) for reference in _refers(node, "HasEffect"))
             source, target = ends
             cause = causes[0] if causes else ""
             made = Transition(machine, _name(node), _number(key), source, target, cause, effects)

@@ -84,7 +84,7 @@ class Users:
 
     def __init__(self, settings: OpcUaSettings, folder: Path) -> None:
         self._anonymous = settings.anonymous
-        self._passwords = {name: one.read(folder) for name, one in settings.users.items()}
+        self._passwords = {name: user.read(folder) for name, user in settings.users.items()}
         for name, password in self._passwords.items():
             if not password:
                 raise ConfigurationError(f"users.{name}: the password is empty")

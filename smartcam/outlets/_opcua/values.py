@@ -209,7 +209,7 @@ class VisionValues:
 
         So a client never decodes a new structure by an earlier one.
         """
-        versions = sum(one[:2] == (camera, application) for one in self._structures)
+        versions = sum(structure[:2] == (camera, application) for structure in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
         digest = hashlib.sha256(repr(columns).encode()).hexdigest()[:16]
         key = f"types.{camera}.App{application}.{digest}"

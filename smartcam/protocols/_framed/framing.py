@@ -147,7 +147,7 @@ class Framer:
         ``lengths``: allowed lengths of a message's payload, by its id; others are not limited.
         """
         self._lengths = lengths
-        self._always = min((self._max_length, *(one.stop - 1 for one in lengths.values())))
+        self._always = min((self._max_length, *(length.stop - 1 for length in lengths.values())))
 
     @property
     def buffered(self) -> int:

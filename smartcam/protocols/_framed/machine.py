@@ -387,9 +387,9 @@ class Machine:
         self._receive(data)
         if state is not self._state or self._framer.buffered:
             return
-        messages = [one for one in self._events[before:] if isinstance(one, m.Message)]
+        messages = [event for event in self._events[before:] if isinstance(event, m.Message)]
         if len(self._chunks) < MAX_KNOWN_CHUNKS and messages:
-            frames = [self.dialect.to_frame(one) for one in messages]
+            frames = [self.dialect.to_frame(message) for message in messages]
             if b"".join(map(self.dialect.encode_frame, frames)) == data:
                 self._chunks[data] = messages, frames
 
@@ -598,8 +598,11 @@ class Machine:
 
     def _note_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
         """Store a delivery that consisted of familiar frames only, each of them an event."""
-        framer, events = self._framer, [one for one in self._events if isinstance(one, m.Message)]
-        results = [at for at, one in enumerate(events) if isinstance(one, m.ResultContainer)]
+        framer, events = (
+            self._framer,
+            [event for event in self._events if isinstance(event, m.Message)],
+        )
+        results = [at for at, event in enumerate(events) if isinstance(event, m.ResultContainer)]
         self._unknown_deliveries -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
             return

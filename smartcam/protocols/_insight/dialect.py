@@ -73,7 +73,10 @@ _MNEMONICS: Mapping[type[m.Message], str] = {
 
 _REQUESTS = frozenset({m.Connect, m.Disconnect, Command, *_MNEMONICS})
 _REPORTS = frozenset(
-    {m.ResultContainer, *(one.answer for one in _REQUESTS if issubclass(one, m.Request))}
+    {
+        m.ResultContainer,
+        *(request.answer for request in _REQUESTS if issubclass(request, m.Request)),
+    }
 ) - {None}
 
 

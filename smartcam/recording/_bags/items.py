@@ -306,7 +306,7 @@ def parts_from_json(value: object) -> list[Localization] | None:
         return None
     items: list[Any] = value
     try:
-        return [_part(one) for one in items]
+        return [_part(item) for item in items]
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 

@@ -29,7 +29,7 @@ class Specs:
             except (ValueError, SyntaxError, MemoryError, RecursionError):
                 spec = ""
         specs: Any = spec if hasattr(spec, "items") else {None: spec}
-        self._known = {key: _resolved(one) for key, one in specs.items()}
+        self._known = {key: _resolved(spec) for key, spec in specs.items()}
         self._pixels = pixels
         self._with_parts: set[int] = set()  # applications that had localizations
 

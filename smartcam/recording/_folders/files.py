@@ -213,7 +213,7 @@ class FolderFiles:
         """Delete the oldest files until the rest is within the bound."""
         folder = self._folder
         while folder.bytes > self._limits.keep:
-            found = [one for one in folder.files.values() if one.name not in self._stuck]
+            found = [file for file in folder.files.values() if file.name not in self._stuck]
             if not found:
                 return
             oldest = min(found)

@@ -100,19 +100,19 @@ def annotations_message(frame: Frame) -> bytes:
     thick = stroke_width(frame.width, frame.height)
     stamp = timestamp(frame.utc)
     parts: dict[str, list[bytes]] = {"points": [], "texts": []}
-    for place, one in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
-        points = one.points[:MAX_POINTS]
+    for place, drawing in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
+        points = drawing.points[:MAX_POINTS]
         if not points or not all(math.isfinite(x) and math.isfinite(y) for x, y in points):
             continue
-        marked = {"timestamp": stamp, "place": place, "role": one.role}
-        text = one.text[:MAX_TEXT_CHARACTERS]
-        if one.kind != "text":
+        marked = {"timestamp": stamp, "place": place, "role": drawing.role}
+        text = drawing.text[:MAX_TEXT_CHARACTERS]
+        if drawing.kind != "text":
             values = {
                 **marked,
-                "type": _TYPE_OF[one.kind],
+                "type": _TYPE_OF[drawing.kind],
                 "points": [_point(*point) for point in points],
-                "outline_color": _colour(one.role),
-                "thickness": thick * (3.0 if one.kind == "points" else 1.0),
+                "outline_color": _colour(drawing.role),
+                "thickness": thick * (3.0 if drawing.kind == "points" else 1.0),
                 "word": text,
             }
             parts["points"].append(message(_MESSAGES["PointsAnnotation"], values))
@@ -123,7 +123,7 @@ def annotations_message(frame: Frame) -> bytes:
                 "position": _point(*points[0]),
                 "text": text,
                 "font_size": 14.0 * thick,
-                "text_color": _colour(one.role),
+                "text_color": _colour(drawing.role),
                 "background_color": _colour(None),
             }
             parts["texts"].append(message(_MESSAGES["TextAnnotation"], values))
@@ -179,7 +179,7 @@ def _number(values: dict[str, Any]) -> int:
 
 def _role(values: dict[str, Any]) -> Role:
     came = _text(values, "role")
-    role: Role | None = next((one for one in get_args(Role) if one == came), None)
+    role: Role | None = next((argument for argument in get_args(Role) if argument == came), None)
     if role is None:
         raise ValueError(f"role: {came!r:.60} came, expected {', '.join(get_args(Role))}")
     return role

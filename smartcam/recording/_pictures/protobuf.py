@@ -112,7 +112,7 @@ def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
     Raises:
         ValueError: the message is not valid, has too many fields, or a field of another type.
     """
-    known = {one.number: (name, one) for name, one in fields.items()}
+    known = {field.number: (name, field) for name, field in fields.items()}
     found: dict[str, Any] = {}
     for count, (number, wire_type, value) in enumerate(_pieces(data)):
         if count >= most:

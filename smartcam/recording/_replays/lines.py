@@ -86,7 +86,7 @@ class LineAnswers:
         nearest = min(
             self.moments, key=lambda one: ((one - moment) % 2, one > moment, abs(one - moment))
         )
-        of_moment = [at for at, one in enumerate(self.moments) if one == nearest]
+        of_moment = [at for at, moment in enumerate(self.moments) if moment == nearest]
         found = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
         self.asked += 1
         return found
@@ -177,16 +177,18 @@ def _forget_silence(lines: list[_AskedLine]) -> None:
 
 def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
     """Add the answer of each line to a plan."""
-    triggers = [one for one in lines if isinstance(one.line, bytes) and is_trigger(codec, one.line)]
+    triggers = [
+        line for line in lines if isinstance(line.line, bytes) and is_trigger(codec, line.line)
+    ]
     plan.triggers = len(triggers)
-    for one in lines:
+    for line in lines:
         answers = (
-            plan.answers.setdefault(one.line, LineAnswers())
-            if isinstance(one.line, bytes)
-            else plan.secrets.setdefault(one.line, LineAnswers())
+            plan.answers.setdefault(line.line, LineAnswers())
+            if isinstance(line.line, bytes)
+            else plan.secrets.setdefault(line.line, LineAnswers())
         )
-        answers.given.append(one.pieces)
-        answers.moments.append(_moment(one.begin, triggers))
+        answers.given.append(line.pieces)
+        answers.moments.append(_moment(line.begin, triggers))
 
 
 def _moment(place: int, triggers: list[_AskedLine]) -> int:
@@ -307,7 +309,9 @@ class ReplayedLines(LineCamera):
     def remaining(self) -> int:
         """Number of triggers that are left, in this round."""
         return sum(
-            one.left for line, one in self.plan.answers.items() if is_trigger(self.lines, line)
+            answer.left
+            for line, answer in self.plan.answers.items()
+            if is_trigger(self.lines, line)
         )
 
     def begins_session(self, message: HeardLine) -> bool:

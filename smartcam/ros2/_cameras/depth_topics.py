@@ -121,8 +121,8 @@ class DepthTopics:
             if stream is not None:
                 await stream.close()
         finally:
-            for one in self._publishers.values():
-                one.close()
+            for publisher in self._publishers.values():
+                publisher.close()
             self._publishers.clear()
             await self._transforms.close()
             thread, self._thread = self._thread, None
@@ -150,7 +150,11 @@ class DepthTopics:
             self._transforms.replace([found])
 
     async def _publish(self, frame: DepthFrame) -> None:
-        heard = {name: one for name, one in self._publishers.items() if getattr(one, "heard", True)}
+        heard = {
+            name: publisher
+            for name, publisher in self._publishers.items()
+            if getattr(publisher, "heard", True)
+        }
         if self._thread is None or not heard:
             return
         loop = asyncio.get_running_loop()

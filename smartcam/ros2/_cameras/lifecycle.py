@@ -100,7 +100,7 @@ class CameraLifecycle(Lifecycle):
 
             return answer
 
-        states = {"available_states": [one._asdict() for one in STATES]}
+        states = {"available_states": [state._asdict() for state in STATES]}
         ways = "GetAvailableTransitions"
         return {
             "change_state": ("ChangeState", self._on_change_state),
@@ -195,4 +195,4 @@ def is_managed(node: Any) -> bool:
 
 
 def _described(transitions: Any) -> dict[str, Any]:
-    return {"available_transitions": [one.fields for one in transitions]}
+    return {"available_transitions": [transition.fields for transition in transitions]}

@@ -140,7 +140,7 @@ class ResultMessages:
             RosMessageError: the poses are in several frames.
         """
         header = self.header(result.received_at, self.frame_of(result))
-        return self._cls.PoseArray(header, [self._pose(one) for one in parts])
+        return self._cls.PoseArray(header, [self._pose(part) for part in parts])
 
     def detections(self, result: Result, parts: Sequence[Localization]) -> Any:
         """Return the ``Detection3DArray`` of a result: one hypothesis for each part.
@@ -155,10 +155,10 @@ class ResultMessages:
         header = self.header(result.received_at, self.frame_of(result))
         no_size = cls.Vector3(0.0, 0.0, 0.0)
         found = list[Any]()
-        for one in parts:
-            pose = self._pose(one)
+        for part in parts:
+            pose = self._pose(part)
             hypothesis = cls.ObjectHypothesisWithPose(
-                cls.ObjectHypothesis(one.feature_id, one.quality),
+                cls.ObjectHypothesis(part.feature_id, part.quality),
                 cls.PoseWithCovariance(pose, self._no_covariance),
             )
             found.append(
@@ -169,11 +169,11 @@ class ResultMessages:
     def localizations(self, parts: Sequence[Localization]) -> list[Any]:
         """Return the thesis' ``Localization`` of each part."""
         cls, made = self._cls, list[Any]()
-        for one in parts:
-            stamped = one.pose.header
+        for part in parts:
+            stamped = part.pose.header
             header = self.header(stamped.stamp, self._frame(stamped.frame_id))
-            pose = cls.PoseStamped(header, self._pose(one))
-            made.append(cls.Localization(one.feature_id, one.quality, one.photo_index, pose))
+            pose = cls.PoseStamped(header, self._pose(part))
+            made.append(cls.Localization(part.feature_id, part.quality, part.photo_index, pose))
         return made
 
     def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:

@@ -59,7 +59,7 @@ class SubscribedPictures(Generic[Item]):
     def start(self) -> None:
         """Start to check for subscribers."""
         if self._task is None:
-            watches = [getattr(one, "watch", None) for one in self._publishers]
+            watches = [getattr(publisher, "watch", None) for publisher in self._publishers]
             if None not in watches:
                 self._watches = [watch(self._woken.set) for watch in watches if watch]
             self._task = asyncio.get_running_loop().create_task(
@@ -87,7 +87,7 @@ class SubscribedPictures(Generic[Item]):
     @property
     def has_subscriber(self) -> bool:
         """True if one of the topics has a subscriber, as far as is known."""
-        return any(getattr(one, "heard", True) for one in self._publishers)
+        return any(getattr(publisher, "heard", True) for publisher in self._publishers)
 
     async def _run(self) -> None:
         while True:

@@ -127,8 +127,8 @@ class CameraPictures:
         )
         kind = "smartcam_msgs/srv/RequestImage"
         self._ends.append(node.serve("~/request_image", kind, self._requests.serve))
-        for one in self._streams:
-            one.start()
+        for stream in self._streams:
+            stream.start()
 
     async def close(self) -> None:
         """Withdraw topics and services; a source of the caller's stays open. Idempotent.
@@ -136,11 +136,11 @@ class CameraPictures:
         Cancellation: everything is still closed.
         """
         streams, self._streams = self._streams, []
-        for one in streams:
-            one.end()
+        for stream in streams:
+            stream.end()
         try:
-            for one in streams:
-                await one.close()
+            for stream in streams:
+                await stream.close()
         finally:
             for end in self._ends:
                 end.close()

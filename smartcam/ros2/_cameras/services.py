@@ -198,7 +198,7 @@ class CameraServices:
             results_per_trigger=wanted,
         )
         make = self._results.messages.result
-        found = [make(one, localizations_in_metres(camera, one, spec)) for one in results]
+        found = [make(result, localizations_in_metres(camera, result, spec)) for result in results]
         return {"results": found}
 
     def _check(self, request: Any, wanted: int, spec: str | None) -> None:

@@ -50,7 +50,9 @@ RISING: Mapping[str, str] = {
 }
 """Counters that are a warning if they have risen since the last diagnostics."""
 
-COUNTERS = tuple(one.name for one in dataclasses.fields(Statistics) if one.type in {"int", int})
+COUNTERS = tuple(
+    field.name for field in dataclasses.fields(Statistics) if field.type in {"int", int}
+)
 MEANS = ("round_trip", "processing")
 
 
@@ -189,8 +191,8 @@ class CameraStatus:
         """Return the fields of ``diagnostic_msgs/msg/DiagnosticStatus``."""
         counted = self._camera.statistics()
         counts = {name: int(getattr(counted, name)) for name in COUNTERS}
-        streams = [one for one in counted.subscribers if one.name == "results"]
-        counts["dropped"] = sum(one.dropped for one in streams)
+        streams = [subscriber for subscriber in counted.subscribers if subscriber.name == "results"]
+        counts["dropped"] = sum(stream.dropped for stream in streams)
         known = KnownState.of(self._camera)
         how = health(known, heard=self._is_heard(counted))
         before, self._before = self._before, counts

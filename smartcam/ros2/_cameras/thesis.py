@@ -190,7 +190,7 @@ class ThesisServices:
             return self._encodable(await service.answer(call))
 
     def _request(self, name: str, service: ThesisService, message: Any) -> Any:
-        known = [one for one in service.request.model_fields if hasattr(message, one)]
+        known = [field for field in service.request.model_fields if hasattr(message, field)]
         fields = {one: getattr(message, one) for one in known}
         return validated(service.request, fields, f"{self._face.name}: {name}")
 

@@ -187,8 +187,8 @@ class TransformListener:
 
     async def _take(self, heard: Any, *, static: bool) -> None:
         async for message in heard:
-            for one in message.transforms:
-                self._add(one, static=static)
+            for transform in message.transforms:
+                self._add(transform, static=static)
             self._news.set()
 
     def _add(self, message: Any, *, static: bool) -> None:
@@ -293,7 +293,7 @@ class TransformListener:
         return Transform(base, frame, found.rotation, found.translation, when)
 
     def _strange(self, frame: str, base: str = "") -> CalibrationError:
-        known = sorted({*self._links, *(one.parent for one in self._links.values())})
+        known = sorted({*self._links, *(link.parent for link in self._links.values())})
         some = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
         way = f" to {base!r}" if base and base != frame else ""
         return Code.WRONG_FRAME.refusal(

@@ -172,22 +172,25 @@ class StaticTransforms:
 
     def _publish(self) -> None:
         now = time.time()
-        self._publisher.publish(transforms=[transform_fields(one, now) for one in self._transforms])
+        self._publisher.publish(
+            transforms=[transform_fields(transform, now) for transform in self._transforms]
+        )
 
 
 def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
     kept: dict[str, Transform] = {}
-    for one in transforms:
-        for name in (one.target, one.source):
+    for transform in transforms:
+        for name in (transform.target, transform.source):
             if not name or name.startswith("/"):
                 raise ConfigurationError(
-                    f"tf: {one.label}: expected names of frames without / in front, got {name!r}"
+                    f"tf: {transform.label}: expected names of frames without / in front, "
+                    f"got {name!r}"
                 )
-        if one.target == one.source or one.source in kept:
-            other = kept[one.source].target if one.source in kept else one.target
+        if transform.target == transform.source or transform.source in kept:
+            other = kept[transform.source].target if transform.source in kept else transform.target
             raise ConfigurationError(
-                f"tf: {one.source}: expected one parent that is another frame, got {one.target} "
-                f"and {other}"
+                f"tf: {transform.source}: expected one parent that is another frame, "
+                f"got {transform.target} and {other}"
             )
-        kept[one.source] = one
+        kept[transform.source] = transform
     return tuple(kept.values())

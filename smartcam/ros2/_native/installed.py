@@ -86,7 +86,7 @@ def checked_service(kind: ServiceType) -> Any:
 
 def _compare(kind: MessageType, found: Any) -> None:
     ours = [field.name for field in kind.fields]
-    theirs = [one for one in found.get_fields_and_field_types() if one != EMPTY_FIELD]
+    theirs = [kind for kind in found.get_fields_and_field_types() if kind != EMPTY_FIELD]
     if ours != theirs:
         raise ConfigurationError(
             f"{kind.name}: the ROS that is installed has the fields {', '.join(theirs)}: expected "

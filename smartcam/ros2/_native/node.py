@@ -164,14 +164,14 @@ class NativeNode(NamedNode):
         if spun is None:
             return
         self._tell_missing()
-        services = [one for one in self._ends if isinstance(one, NativeService)]
+        services = [endpoint for endpoint in self._ends if isinstance(endpoint, NativeService)]
         for end in tuple(self._ends):
             end.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await self.parameters.close()
-                for one in services:
-                    await one.wait_closed()
+                for service in services:
+                    await service.wait_closed()
                 await asyncio.to_thread(self.outbox.close, CLOSE_TIMEOUT / 2)
         except TimeoutError:
             pass  # the handler's author must end it at cancellation

@@ -136,7 +136,7 @@ class NativeParameters(RosParameters):
         if getattr(self._own, "now", False):
             return result(successful=True)
         try:
-            self._carry_out({one.name: one for one in parameters})
+            self._carry_out({parameter.name: parameter for parameter in parameters})
         except concurrent.futures.CancelledError:
             return result(successful=False, reason=f"{self._native.full_name} is closed")
         except TimeoutError:

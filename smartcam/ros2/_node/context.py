@@ -113,7 +113,7 @@ class RosContext:
         self._long: collections.Counter[object] = collections.Counter()
         self._in_lane: collections.Counter[str] = collections.Counter()
         self._calm_since, self._direct_messages, self._crowded = 0.0, 0, 0.0
-        self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
+        self._slots = itertools.cycle(NewestSlot(priority) for priority in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:

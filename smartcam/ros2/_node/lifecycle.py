@@ -139,7 +139,7 @@ class Lifecycle:
     @property
     def available(self) -> list[LifecycleTransition]:
         """The transitions that begin at the current state."""
-        return [one for one in TRANSITIONS if one.start is self.state]
+        return [transition for transition in TRANSITIONS if transition.start is self.state]
 
     def listen(self, heard: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
         """Call ``heard`` after each step; return a function that ends this."""

@@ -139,15 +139,15 @@ class Node(NamedNode):
         token, self._token = self._token, None
         if token is None:
             return
-        services = [one for one in self._ends if isinstance(one, RosService)]
+        services = [endpoint for endpoint in self._ends if isinstance(endpoint, RosService)]
         for end in tuple(self._ends):
             end.close()
         token.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await self.parameters.close()
-                for one in services:
-                    await one.wait_closed()
+                for service in services:
+                    await service.wait_closed()
         except TimeoutError:
             pass  # the handler's author must end it at cancellation
         finally:

@@ -157,8 +157,8 @@ class ParameterServices:
             refused = {"successful": False, "reason": why}
             return {"results": [refused] * len(request.parameters)}
         results = []
-        for one in request.parameters:
-            results.append(await self._result([one]))
+        for parameter in request.parameters:
+            results.append(await self._result([parameter]))
             await asyncio.sleep(0)
         return {"results": results}
 
@@ -179,7 +179,7 @@ class ParameterServices:
 
     async def _result(self, parameters: Sequence[Any]) -> dict[str, Any]:
         try:
-            values = {one.name: decode_value(one.value) for one in parameters}
+            values = {parameter.name: decode_value(parameter.value) for parameter in parameters}
             await self._parameters.carry_out(values)
         except SmartCamError as exc:
             return {"successful": False, "reason": reason(exc)}

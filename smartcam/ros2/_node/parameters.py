@@ -301,7 +301,7 @@ class RosParameters:
             raise
         for change in changes:
             change.declared.value = change.new
-        self._tell(changed=[one for one in values if one in self._declared])
+        self._tell(changed=[value for value in values if value in self._declared])
 
     async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
         """Undo changes; a change that cannot be undone stays, and is published and logged."""

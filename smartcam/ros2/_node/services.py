@@ -242,7 +242,7 @@ class RosClient(RosEnd):
     def served(self) -> bool:
         """True if there is a server, as far as is known."""
         ends = self._context.graph.ends(self.name, SERVICE)
-        return not self._closed and any(one.key == self.entity.key for one in ends)
+        return not self._closed and any(endpoint.key == self.entity.key for endpoint in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until there is a server.
@@ -258,7 +258,9 @@ class RosClient(RosEnd):
                     self._check_open()
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
-            others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
+            others = [
+                endpoint.ros_type for endpoint in self._context.graph.ends(self.name, SERVICE)
+            ]
             what = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} {self.type.hash} within "

@@ -108,11 +108,11 @@ class Entity:
                 f"{' '.join(KINDS)}, of 9 parts for a node and 13 else"
             )
         domain, zid, node_id, number = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
-        enclave, namespace, node = (_demangled(one) for one in parts[6:9])
+        enclave, namespace, node = (_demangled(part) for part in parts[6:9])
         made = cls(parts[5], domain, zid, node_id, number, namespace, node, enclave=enclave)  # type: ignore[arg-type]
         if made.kind == NODE:
             return made
-        name, kind, hashed = (_demangled(one) for one in parts[9:12])
+        name, kind, hashed = (_demangled(part) for part in parts[9:12])
         return cls(
             made.kind,
             domain,

@@ -66,7 +66,7 @@ class TypeDescriptions:
     def _sources(self, described: Any) -> list[dict[str, str]]:
         """Return the texts of the files of a type and of all nested types."""
         types = (described.type_description, *described.referenced_type_descriptions)
-        return [self._source(one.type_name) for one in types]
+        return [self._source(kind.type_name) for kind in types]
 
     def _source(self, name: str) -> dict[str, str]:
         encoding, text = self._node.types.source(name)

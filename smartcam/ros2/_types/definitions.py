@@ -92,7 +92,9 @@ class Definition:
         Args:
             defaults: whether fields have their defaults behind them.
         """
-        constants = (f"{self.kinds[name]} {name}={one}\n" for name, one in self.constants.items())
+        constants = (
+            f"{self.kinds[name]} {name}={constant}\n" for name, constant in self.constants.items()
+        )
         fields = (
             f"{field} {field.name}{_default_text(field.default) if defaults else ''}\n"
             for field in self.fields
@@ -175,7 +177,7 @@ def bare(definition: Any) -> Any:
     """Return the fields of a message, or of a service's two, without defaults."""
     if isinstance(definition, tuple):
         return [bare(one) for one in definition]
-    return [one._replace(default=None) for one in definition.fields]
+    return [field._replace(default=None) for field in definition.fields]
 
 
 def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:

@@ -33,10 +33,10 @@ class RosMessage:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RosMessage) or other.__msgtype__ != self.__msgtype__:
             return NotImplemented
-        return all(_same(getattr(self, one), getattr(other, one)) for one in self.__slots__)
+        return all(_same(getattr(self, slot), getattr(other, slot)) for slot in self.__slots__)
 
     def __repr__(self) -> str:
-        parts = (f"{one}={_shown(getattr(self, one))}" for one in self.__slots__)
+        parts = (f"{slot}={_shown(getattr(self, slot))}" for slot in self.__slots__)
         return f"{type(self).__name__}({', '.join(parts)})"
 
 

@@ -116,7 +116,9 @@ class InterpreterSuite(SaysWhatWasExpected):
         for name in ("spec", "samples"):
             if not getattr(own, name, None):
                 raise pytest.UsageError(f"{own.__name__}.{name}: expected one, got none")
-        labels = [one.name or one.layout or f"sample {i}" for i, one in enumerate(self.samples)]
+        labels = [
+            sample.name or sample.layout or f"sample {i}" for i, sample in enumerate(self.samples)
+        ]
         metafunc.parametrize("sample", self.samples, ids=labels)
 
     def make(self, layout: str | None = None) -> Interpreter:
@@ -230,7 +232,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         from smartcam.testing._suites import strategies
 
         interpreter = self.make(sample.layout)
-        contents = strategies.noise([one.data for one in self.samples])
+        contents = strategies.noise([sample.data for sample in self.samples])
         orders = strategies.st.sampled_from(["little", "big"])
 
         def check(data: DataObject) -> None:
@@ -398,18 +400,18 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _poses(value: object) -> Iterator[Pose]:
-    return (one for one in _parts(value) if isinstance(one, Pose))
+    return (part for part in _parts(value) if isinstance(part, Pose))
 
 
 def _mutable(value: object) -> list[object]:
     """Return the mutable objects in a value."""
     kinds = (list, dict, set, bytearray)
     return [
-        one
-        for one in _parts(value)
-        if isinstance(one, kinds)
-        or bool(getattr(getattr(one, "flags", None), "writeable", False))
-        or _is_open(one)
+        part
+        for part in _parts(value)
+        if isinstance(part, kinds)
+        or bool(getattr(getattr(part, "flags", None), "writeable", False))
+        or _is_open(part)
     ]
 
 

@@ -48,7 +48,7 @@ def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
     some: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE_BYTES)
     if not any(samples):
         return some
-    sample = st.sampled_from([one for one in samples if one])
+    sample = st.sampled_from([sample for sample in samples if sample])
     return st.one_of(
         some,
         sample,

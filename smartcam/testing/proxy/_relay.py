@@ -73,7 +73,7 @@ class Relay(ABC, Generic[C]):
 
     def chosen(self, connection: int | None) -> list[C]:
         """Return one connection, if it is open, or all."""
-        return [one for one in self.members.values() if connection in {None, one.number}]
+        return [member for member in self.members.values() if connection in {None, member.number}]
 
     def add(self, rules: Sequence[Rule]) -> None:
         """Apply rules from here on."""

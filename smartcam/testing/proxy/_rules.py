@@ -90,10 +90,10 @@ class Rule:
         cls.name = name or cls.__name__.lower()
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            if one.name in self._bounds:
-                text, holds = self._bounds[one.name]
-                _check(self, holds(getattr(self, one.name)), text)
+        for field in fields(self):
+            if field.name in self._bounds:
+                text, holds = self._bounds[field.name]
+                _check(self, holds(getattr(self, field.name)), text)
 
     def concerns(self, connection: int, direction: Direction) -> bool:
         """Return True if the rule is for this direction of this connection."""

@@ -149,7 +149,7 @@ class UnitDecoding:
         """Queue encoded frames for the decoder: all, or none if there are too many."""
         source = self._source
         assert source is not None  # noqa: S101 - set by begin
-        self._units += [(one, source.utc(one.timestamp)) for one in units]
+        self._units += [(unit, source.utc(unit.timestamp)) for unit in units]
         if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
             self._skipped += len(self._units)

@@ -73,7 +73,7 @@ class Audience:
         if new and len(self._heard) >= MAX_RECEIVERS:
             return False
         known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
-        block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
+        block = next((block for block in report.blocks if block.ssrc == self._nothing.ssrc), None)
         if block is not None:  # urgent requests have no report block
             known = _HeardReceiver(address, block, _round_trip(block), now)
         self._heard[report.ssrc] = known._replace(at=now)

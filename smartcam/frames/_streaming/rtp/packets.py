@@ -152,7 +152,7 @@ class ReceiverReport(NamedTuple):
 
     def pack(self) -> bytes:
         """Return the report's bytes."""
-        body = self.ssrc.to_bytes(4, "big") + b"".join(one.pack() for one in self.blocks)
+        body = self.ssrc.to_bytes(4, "big") + b"".join(block.pack() for block in self.blocks)
         return _packet(RR, len(self.blocks), body)
 
 
@@ -177,7 +177,7 @@ class Goodbye(NamedTuple):
 
     def pack(self) -> bytes:
         """Return the packet's bytes; a reason is cut after 255 bytes."""
-        body = b"".join(one.to_bytes(4, "big") for one in self.ssrcs)
+        body = b"".join(ssrc.to_bytes(4, "big") for ssrc in self.ssrcs)
         if self.reason:
             reason = self.reason.encode()[:255]
             body += bytes((len(reason),)) + reason
@@ -228,7 +228,7 @@ Report: TypeAlias = (
 
 def compound(*reports: Report) -> bytes:
     """Return one datagram of RTCP; the first should be a sender's or a receiver's report."""
-    return b"".join(one.pack() for one in reports)
+    return b"".join(report.pack() for report in reports)
 
 
 def parse_rtcp(data: bytes) -> list[Report]:

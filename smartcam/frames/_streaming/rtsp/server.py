@@ -186,7 +186,9 @@ class RtspServer(Server):
             options = {"keyint": self._keyint, "crf": self._crf, "bitrate": self._bitrate}
             encoder = H264Encoder(StreamRuns(codecs), fps=rate, **options)  # type: ignore[arg-type]
             shared[id(source)] = SharedH264(source, encoder), rate
-        return {name: RtspStream(name, *shared[id(one)]) for name, one in self._sources.items()}
+        return {
+            name: RtspStream(name, *shared[id(source)]) for name, source in self._sources.items()
+        }
 
 
 def _rate(source: FrameSource) -> float:

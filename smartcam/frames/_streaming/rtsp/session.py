@@ -116,9 +116,9 @@ class RtspSession:
             reports = parse_rtcp(data)
         except MessageError:
             return
-        if any(isinstance(one, ReceiverReport | SenderReport) for one in reports):
+        if any(isinstance(report, ReceiverReport | SenderReport) for report in reports):
             self.keep_alive()
-        if any(isinstance(one, PictureLost) and one.media == self.ssrc for one in reports):
+        if any(isinstance(report, PictureLost) and report.media == self.ssrc for report in reports):
             self.stream.shared.key_frame()
 
     # called by the stream

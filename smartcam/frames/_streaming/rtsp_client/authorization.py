@@ -49,7 +49,7 @@ class Challenge(NamedTuple):
 
 def challenge_of(headers: Sequence[str]) -> Challenge | None:
     """Return the preferred supported challenge of an answer; None: there is none."""
-    read = [_read(one) for one in headers[:MAX_CHALLENGES]]
+    read = [_read(header) for header in headers[:MAX_CHALLENGES]]
     best = max(read, key=lambda one: one.rank, default=None)
     return best if best is not None and best.rank else None
 

@@ -279,10 +279,13 @@ class RtspConversation:
     def _none_of(
         self, tracks: tuple[VideoTrack, ...], others: tuple[str, ...], answer: ServerAnswer
     ) -> FrameFormatError:
-        got = [f"{'encrypted ' * one.secure}{one.encoding or one.payload_type}" for one in tracks]
+        got = [
+            f"{'encrypted ' * track.secure}{track.encoding or track.payload_type}"
+            for track in tracks
+        ]
         shown = ", ".join((*got, *others)) or f"{len(answer.body)} bytes without a stream"
         kind = FrameFormatError
-        if any(one.encoding and not one.secure for one in tracks):
+        if any(track.encoding and not track.secure for track in tracks):
             kind = OtherEncodingError
         text = f"{self._plan.name}: expected video in H264, H265 or JPEG, got {shown[:200]}"
         return kind(text, source=self._plan.name)

@@ -72,7 +72,7 @@ class StreamDescription(NamedTuple):
 
     def chosen(self) -> VideoTrack | None:
         """Return the first supported stream of video; None: there is none."""
-        ours = (one for one in self.tracks if one.coding is not None and not one.secure)
+        ours = (track for track in self.tracks if track.coding is not None and not track.secure)
         return next(ours, None)
 
 
@@ -96,7 +96,7 @@ def described(body: bytes) -> StreamDescription:
 def _track(kind: list[str], lines: list[str]) -> VideoTrack:
     numbers = [int(one) for one in kind[3:] if re.fullmatch(r"[0-9]{1,3}", one)] or [-1]
     names = {number: _encoding(number, lines) for number in numbers}
-    number = next((one for one in numbers if names[one] in CODINGS), numbers[0])
+    number = next((number for number in numbers if names[number] in CODINGS), numbers[0])
     secure = len(kind) > 2 and kind[2].upper().startswith("RTP/SAVP")
     parameters = _parameters(_of_type(lines, "fmtp", number))
     encoding = names[number]
@@ -121,7 +121,7 @@ def _attribute(lines: list[str], name: str) -> str:
 def _of_type(lines: list[str], name: str, number: int) -> str:
     """Return the texts of an attribute for a payload type, joined."""
     matches = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
-    return ";".join(one[2] for one in matches if one is not None and int(one[1]) == number)
+    return ";".join(match[2] for match in matches if match is not None and int(match[1]) == number)
 
 
 def _parameters(text: str) -> dict[str, str]:

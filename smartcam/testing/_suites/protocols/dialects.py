@@ -237,9 +237,9 @@ class DialectChecks(Parameters):
         """Check that a URL with everything pinned is read back, and has no password."""
         parameters: list[tuple[tuple[str, str], ...]] = [()]
         parameters += [
-            tuple(one.parameters.items())
-            for one in self.conversations
-            if one.dialect == dialect.name and one.parameters
+            tuple(conversation.parameters.items())
+            for conversation in self.conversations
+            if conversation.dialect == dialect.name and conversation.parameters
         ]
         for scheme in self.protocol.schemes:
             for host in ("192.0.2.7", "2001:db8::7"):

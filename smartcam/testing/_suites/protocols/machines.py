@@ -66,7 +66,7 @@ class MachineChecks(Parameters):
     def test_conversation_goes_as_written(self, conversation: Conversation) -> None:
         """Check that each request is the written bytes, and each answer the written message."""
         Player(self.protocol, conversation).play()
-        kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
+        kinds = [type(step.message) for step in conversation.steps if isinstance(step, Sent)]
         assert m.Connect in kinds, f"{conversation}: no step sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
@@ -122,7 +122,7 @@ class MachineChecks(Parameters):
         places = range(len(conversation.steps) + 1)
         comes = strategies.noise(_samples(conversation))
         dialect = conversation.group(self.protocol)[0]
-        says = strategies.st.sampled_from([example(one, dialect) for one in REQUESTS])
+        says = strategies.st.sampled_from([example(request, dialect) for request in REQUESTS])
         actions = strategies.st.lists(strategies.st.one_of(comes, says), max_size=8)
 
         def check(data: DataObject) -> None:
@@ -170,7 +170,7 @@ class MachineChecks(Parameters):
         for _ in range(4 * self.max_waiting // len(chunk)):
             machine.receive_data(chunk)
             events = machine.events()
-            failed = any(isinstance(one, LinkFailed) for one in events)
+            failed = any(isinstance(event, LinkFailed) for event in events)
             messages += len(events)
             waiting = len(machine.pending)
             assert waiting <= self.max_waiting, f"{where}: {waiting} bytes are kept"
@@ -234,7 +234,7 @@ class MachineChecks(Parameters):
         for place, answer, data in _answers(conversation):
             player = Player(self.protocol, conversation).play(place)
             events = [event for one in data for event in player.deliver(one)]
-            found = [one for one in events if isinstance(one, answer)]
+            found = [event for event in events if isinstance(event, answer)]
             assert not found, f"at step {place}, no request was open, but it reported {found}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
@@ -246,7 +246,7 @@ class MachineChecks(Parameters):
                 continue
             machine.send(m.Disconnect())
             player.written()
-            later = [one.data for one in conversation.steps[place:] if isinstance(one, Came)]
+            later = [step.data for step in conversation.steps[place:] if isinstance(step, Came)]
             for data in (b"", *later):
                 machine.receive_data(data)
                 machine.events()
@@ -303,7 +303,7 @@ class MachineChecks(Parameters):
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
         """Check the counter of bytes, which is in an attempt's error."""
         player = Player(self.protocol, conversation).play()
-        came = sum(len(one.data) for one in conversation.steps if isinstance(one, Came))
+        came = sum(len(step.data) for step in conversation.steps if isinstance(step, Came))
         counted = player.machine.counters.bytes_received
         assert counted == came, f"counters.bytes_received is {counted}, {came} came"
 
@@ -325,7 +325,7 @@ class MachineChecks(Parameters):
         spoken = {
             sender
             for sender, frames in (
-                (m.Sender.CLIENT, [one.wire for one in conversation.steps]),
+                (m.Sender.CLIENT, [step.wire for step in conversation.steps]),
                 (m.Sender.CAMERA, [*_samples(conversation)]),
             )
             if any(frames)
@@ -452,7 +452,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
         yield place, []
         if isinstance(step, Came):
             yield place, [step.data[: len(step.data) // 2]]
-            failed = any(isinstance(one, type) for one in step.events)
+            failed = any(isinstance(event, type) for event in step.events)
     if not failed:
         yield len(conversation.steps), []
 

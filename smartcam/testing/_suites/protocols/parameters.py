@@ -50,9 +50,9 @@ class Parameters(SaysWhatWasExpected):
         if name == "dialect":
             return dialects_of(self.protocol)
         found = [
-            one
-            for one in self.conversations
-            if name == "conversation" or one.transport is Transport.TCP
+            conversation
+            for conversation in self.conversations
+            if name == "conversation" or conversation.transport is Transport.TCP
         ]
         return found or _nothing(
             f"{own.__name__}.conversations has none"

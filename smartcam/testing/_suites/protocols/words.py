@@ -22,7 +22,9 @@ MESSAGES: tuple[type[m.Message], ...] = tuple(
 )
 """Every message that a dialect may have."""
 
-REQUESTS: tuple[type[m.Request], ...] = tuple(one for one in MESSAGES if issubclass(one, m.Request))
+REQUESTS: tuple[type[m.Request], ...] = tuple(
+    message for message in MESSAGES if issubclass(message, m.Request)
+)
 """The types of all messages that a client sends."""
 
 NEEDED: tuple[type[m.Message], ...] = (
