@@ -428,9 +428,9 @@ def check_frames(localizations: Sequence[Localization], frame: str | None, what:
     """
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
-        got = ", ".join(sorted(frames - {frame}))
+        others = ", ".join(sorted(frames - {frame}))
         raise Code.WRONG_FRAME.refusal(
-            f"{what}expected poses in the frame {frame!r}, got some in {got!r}", frame, got
+            f"{what}expected poses in the frame {frame!r}, got some in {others!r}", frame, others
         )
 
 

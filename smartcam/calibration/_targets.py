@@ -299,8 +299,8 @@ class MarkerGrid:
         lower_left = 4 * self.columns * row + 2 * column
         up = 2 * self.columns
         clockwise = np.array([up, up + 1, 1, 0])
-        found: NDArray[np.intp] = lower_left[:, None] + np.roll(clockwise, 2 * self.kalibr)
-        return found
+        corner_indices: NDArray[np.intp] = lower_left[:, None] + np.roll(clockwise, 2 * self.kalibr)
+        return corner_indices
 
 
 Target: TypeAlias = Checkerboard | Charuco | CircleGrid | MarkerGrid

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 IDS = storage.Form(
     list[storage.Count],
-    read=lambda ids, _: np.array([min(one, MAX_POINTS) for one in ids], dtype=np.intp),
+    read=lambda ids, _: np.array([min(ident, MAX_POINTS) for ident in ids], dtype=np.intp),
     write=lambda ids: ids.tolist(),
 )
 
@@ -106,7 +106,7 @@ class TargetView(storage.Stored):
         # Source: Hotelling, Relations Between Two Sets of Variates (1936).
         flat, seen = self.object_points[:, :2], self.points
         both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
-        spread = math.prod(float(np.linalg.det(one.T @ one)) for one in both)
+        spread = math.prod(float(np.linalg.det(rotation.T @ rotation)) for rotation in both)
         turn = float(np.linalg.det(both[0].T @ both[1]))
         return turn / math.sqrt(spread) if spread > 0 else math.nan
 
@@ -126,7 +126,7 @@ def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
     """Return a value if it is of one of some kinds; otherwise raise SHAPE, which describes it."""
     if isinstance(value, kinds):
         return value
-    names = [one.__name__ for one in (kinds if isinstance(kinds, tuple) else (kinds,))]
+    names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
     raise Code.SHAPE.unexpected(f"{what}: expected a {' or '.join(names)}", names, described(value))
 
 
@@ -162,26 +162,26 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
         raise Code.SHAPE.unexpected(
             f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
         )
-    found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
+    covariances = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
-    trace = np.trace(found, axis1=1, axis2=2)
-    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(found).max(
-        axis=(1, 2)
-    )
-    product = found[:, 0, 0] * found[:, 1, 1]
-    negative = (found[:, 0, 0] < 0) | (
-        product - found[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
+    trace = np.trace(covariances, axis1=1, axis2=2)
+    uneven = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(
+        covariances
+    ).max(axis=(1, 2))
+    product = covariances[:, 0, 0] * covariances[:, 1, 1]
+    negative = (covariances[:, 0, 0] < 0) | (
+        product - covariances[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
     )
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
-        got = found[wrong[0]].tolist()
+        value = covariances[wrong[0]].tolist()
         raise Code.NO_COVARIANCE.refusal(
-            f"{what}: expected symmetric matrices of no negative variance, got {got} in row "
+            f"{what}: expected symmetric matrices of no negative variance, got {value} in row "
             f"{wrong[0]}",
             "covariances",
-            got,
+            value,
         )
-    return found
+    return covariances
 
 
 def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -192,9 +192,9 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
             f"{called}: ids: expected whole numbers", "(N,)", str(exc)
         ) from exc
     if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-        got = f"{given.dtype} of shape {given.shape}"
+        received = f"{given.dtype} of shape {given.shape}"
         raise Code.SHAPE.unexpected(
-            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", got
+            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", received
         )
     wrong = given[(given < 0) | (given >= known)]
     if len(wrong) and wrong[0] < 0:
@@ -206,7 +206,7 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
     ids = given.astype(np.intp)
     back = np.flatnonzero(np.diff(ids) <= 0)
     if len(back):
-        got = ids[back[0] : back[0] + 2].tolist()
+        received = ids[back[0] : back[0] + 2].tolist()
         expected = f"{called}: ids: expected each once, ascending (points in the order of the ids)"
-        raise Code.SHAPE.unexpected(expected, "ascending", got)
+        raise Code.SHAPE.unexpected(expected, "ascending", received)
     return ids

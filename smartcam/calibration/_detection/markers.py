@@ -113,7 +113,7 @@ def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = 
     given = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
     if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
-        window = sorted(WINDOWS_PX, key=lambda one: len(lengths[one]))[len(WINDOWS_PX) // 2]
+        window = sorted(WINDOWS_PX, key=lambda place: len(lengths[place]))[len(WINDOWS_PX) // 2]
         given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
         if len(longest) > MAX_OUTLINES:
@@ -129,8 +129,8 @@ def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.
     cv2 = load("cv2")
     mean, kind = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
     dark = cv2.adaptiveThreshold(bytes_, 255, mean, kind, window, given.adaptiveThreshConstant)
-    found, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    lengths = np.array([len(one) for one in found], dtype=np.intp)
+    contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    lengths = np.array([len(contour) for contour in contours], dtype=np.intp)
     low, high = given.minMarkerPerimeterRate, given.maxMarkerPerimeterRate
     largest = max(bytes_.shape)  # OpenCV takes whole pixels
     return lengths[(lengths >= int(low * largest)) & (lengths <= int(high * largest))]
@@ -155,13 +155,13 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
     if largest.sum() < MIN_AGREEING_MARKERS or matrix is None:
         return MarkerAgreement(good, 0)
-    off = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
-    off /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
+    distances = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
+    distances /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
     away = np.linalg.norm(mapped[:, None] - mapped[largest], axis=2).min(axis=1) / pitch
     upright = _alike(slopes, derivatives(matrix, mapped))
-    joined = largest | ((off < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
+    joined = largest | ((distances < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
     good[known[joined]] = True
-    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
+    contrary = ~joined & (distances > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
     return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
 
 
@@ -192,8 +192,8 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
     expected = seen + np.einsum("jkl,ijl->ijk", slopes, ways)
     # a corner of a square lies between the two next markers, and perspective beside one of them
     # is about the opposite of that beside the other
-    near = distances < 1.1 * distances.min(axis=1, keepdims=True)
-    shares = near / near.sum(axis=1, keepdims=True)
+    is_near = distances < 1.1 * distances.min(axis=1, keepdims=True)
+    shares = is_near / is_near.sum(axis=1, keepdims=True)
     places: Array = np.einsum("ij,ijk->ik", shares, expected)
     return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
 
@@ -231,11 +231,11 @@ def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDAr
     # the mean of both derivatives predicts one marker from the other exactly to second order
     both = (slopes[:, None] + slopes[None]) / 2
     expected = np.einsum("ijkl,ijl->ijk", both, ways)
-    off = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
+    apart = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
     return np.asarray(
         (distances > 0)
         & (distances <= reach)
-        & (off < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
+        & (apart < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
         & _alike(slopes[:, None], slopes[None])
     )
 

@@ -100,14 +100,14 @@ def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
 
     Raises MIRRORED if no arrangement is proper; ``what`` names the target.
     """
-    proper = [way for way in ways if way.proper]
+    proper = [arrangement for arrangement in ways if arrangement.proper]
     if not proper:
         raise Code.MIRRORED.refusal(
             f"{what}: expected an image of the sheet as one reads it, got one that is mirrored",
             "y to the left of x",
             "y to the right of x",
         )
-    return max(proper, key=lambda way: way.rightward)
+    return max(proper, key=lambda arrangement: arrangement.rightward)
 
 
 def marked(
@@ -119,7 +119,7 @@ def marked(
     ``what`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too
     little darker than the next corner, and MIRRORED.
     """
-    levels = {int(way.order[0, 0]): level(way.order) for way in ways}
+    levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in ways}
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
     margin = levels[second] - levels[origin]
     if not margin >= MIN_ORIGIN_CONTRAST:
@@ -129,4 +129,6 @@ def marked(
             MIN_ORIGIN_CONTRAST,
             margin,
         )
-    return leftmost([way for way in ways if way.order[0, 0] == origin], what), margin
+    return leftmost(
+        [arrangement for arrangement in ways if arrangement.order[0, 0] == origin], what
+    ), margin

@@ -149,15 +149,15 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     items += [
         _camera(sight, camera, shape) for camera, shape in zip(scene.cameras, shapes, strict=True)
     ]
-    items.sort(key=lambda one: -one.depth)  # draw far objects first
+    items.sort(key=lambda item: -item.depth)  # draw far objects first
     parts = [text((BORDER, 28), title, "title")] if title else []
     parts += [item.svg for item in items]
-    for one, tips in zip(scene.axes, ends, strict=True):
-        start = sight.pixels(one.pose.translation)
+    for axes, tips in zip(scene.axes, ends, strict=True):
+        start = sight.pixels(axes.pose.translation)
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
             items.append(_Drawn(0.0, "", axis, tip))
-        items.append(_Drawn(0.0, "", one.name, start + LABEL_OFFSET_PX))
+        items.append(_Drawn(0.0, "", axes.name, start + LABEL_OFFSET_PX))
     parts += _labels([(item.label, item.at) for item in items[::-1] if item.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
@@ -174,7 +174,7 @@ def _frustum(camera: DrawnCamera, length: float) -> Array:
 
 def _camera(sight: _ViewerProjection, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
-    sides = [line(centre, one, "camera") for one in rim]
+    sides = [line(centre, corner, "camera") for corner in rim]
     svg = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
     return _Drawn(sight.depth(shape), svg, camera.name, centre + LABEL_OFFSET_PX)
 
@@ -190,7 +190,7 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
             x, y = at + offset
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
-            if not outside and not any(_overlap(box, one) for one in occupied):
+            if not outside and not any(_overlap(box, placed) for placed in occupied):
                 occupied.append(box)
                 if math.hypot(*offset) > 25:
                     yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')

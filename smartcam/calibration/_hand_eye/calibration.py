@@ -200,23 +200,27 @@ def calibrate_hand_eye(
             "hand-eye: expected views of one target, got views of several", views[0].target
         )
     ordered = [views[i] for i in order]
-    lens, own, of_sheet = camera, None, list[Remark]()
+    lens, lens_calibration, of_sheet = camera, None, list[Remark]()
     if lens is None:
         # A sheet bent by a tenth of a millimetre, which views cannot show, makes cameras 1.7 mm off
         # where 0.7 mm are expected, if the views alone tell the lens (measured in simulation).
         few = len(ordered[0].target.points) <= MAX_FREE_POINTS
         alone: Sheet = "free" if few else "exact"
-        own = calibrate_intrinsics(ordered, sheet="auto" if adjust == "auto" else alone)
-        lens = own.camera
-        of_sheet = [warning for warning in own.warnings if warning.code == Code.SHEET_NOT_EXACT]
-    located = [locate(one, lens) for one in ordered]
+        lens_calibration = calibrate_intrinsics(
+            ordered, sheet="auto" if adjust == "auto" else alone
+        )
+        lens = lens_calibration.camera
+        of_sheet = [
+            warning for warning in lens_calibration.warnings if warning.code == Code.SHEET_NOT_EXACT
+        ]
+    located = [locate(view, lens) for view in ordered]
     if ordered[0].target.turned_alike:
         ordered = _numbered_alike(ordered, robot, located)
-        located = [locate(one, lens) for one in ordered]
+        located = [locate(view, lens) for view in ordered]
         views = [ordered[i] for i in np.argsort(order)]
     ordered, strays = without_strays(ordered, located, lens, given=camera is not None)
-    located = [locate(one, lens) for one in ordered] if strays else located
-    poses = Rigid.stacked(one.transform.rigid for one in located)
+    located = [locate(view, lens) for view in ordered] if strays else located
+    poses = Rigid.stacked(view.transform.rigid for view in located)
     seen = _observations(ordered, located, lens)
     problem = Problem(
         robot=robot,
@@ -224,20 +228,22 @@ def calibrate_hand_eye(
         poses=poses,
         given=_given(ordered),
         sigmas=_positive(robot_sigmas),
-        lens=None if own is None else own.covariance,
+        lens=None if lens_calibration is None else lens_calibration.covariance,
     )
-    named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
-    kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
-    if own is not None:  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
-        kept += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
-    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
+    named = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
+    bend_places = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    if (
+        lens_calibration is not None
+    ):  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
+        bend_places += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
+    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *bend_places)}
     free["scale and camera"] = (0, *free["camera"])
-    if own is not None and adjust == "auto":
+    if lens_calibration is not None and adjust == "auto":
         # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
         # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
         del free[NOTHING], free["scale"]
-    asked = _Asked(_allowed(free, adjust), method, drop_bad)
-    result = _without_bad(problem, asked, named, [transforms[i] for i in order], ordered)
+    request = _Asked(_allowed(free, adjust), method, drop_bad)
+    result = _without_bad(problem, request, named, [transforms[i] for i in order], ordered)
     _check_scale(result.target_scale, most_scale)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
@@ -299,7 +305,7 @@ def calibrate_hand_eye_from_poses(
     check_positive(most_scale, "most_scale", "parts of its size")
     transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
     seen = [target_poses[i] for i in order]
-    poses = Rigid.stacked(one.rigid for one in seen)
+    poses = Rigid.stacked(pose.rigid for pose in seen)
     scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
     white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
@@ -309,8 +315,8 @@ def calibrate_hand_eye_from_poses(
         sigmas=_positive(robot_sigmas),
     )
     named = [f"pose {i}" for i in order]
-    asked = _Asked(_allowed({NOTHING: (), "scale": (0,)}, adjust), method, drop_bad)
-    result = _without_bad(problem, asked, named, [transforms[i] for i in order], seen)
+    request = _Asked(_allowed({NOTHING: (), "scale": (0,)}, adjust), method, drop_bad)
+    result = _without_bad(problem, request, named, [transforms[i] for i in order], seen)
     _check_scale(result.target_scale, most_scale)
     return dataclasses.replace(
         _reordered(result, np.argsort(order)),
@@ -372,7 +378,7 @@ def _numbered_alike(
 ) -> list[TargetView]:
     """Return views with one origin, for a target that looks the same after half a turn."""
     target = views[0].target
-    poses = Rigid.stacked(one.transform.rigid for one in located)
+    poses = Rigid.stacked(view.transform.rigid for view in located)
     arm = float(np.ptp(target.points, axis=0).max())
     other = other_numbering(robot, poses, half_turn(target), arm).tolist()
     return [
@@ -389,9 +395,9 @@ def _observations(
     views: Sequence[TargetView], located: Sequence[TargetPose], camera: CameraModel
 ) -> PixelObservations:
     """Return the views' points, with noise as large as the views themselves show."""
-    off = np.concatenate([one.residuals for one in located])
+    residuals = np.concatenate([view.residuals for view in located])
     noise = np.concatenate([view.covariance for view in views])
-    more = excess(off, noise, off.size - 6 * len(views))
+    more = excess(residuals, noise, residuals.size - 6 * len(views))
     given = _given(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))
@@ -419,15 +425,15 @@ class _Asked(NamedTuple):
 
 def _without_bad(
     problem: Problem,
-    asked: _Asked,
+    request: _Asked,
     named: Sequence[str],
     robot_poses: Sequence[Transform],
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
     """Return the calibration from the poses that are not bad, with the errors of all poses."""
-    used, remarks = _near(problem, asked, named)
-    result = _solved(problem.taken(used), asked, robot_poses[0])
-    while len(bad := _bad(result)) and asked.drop_bad:
+    used, remarks = _near(problem, request, named)
+    result = _solved(problem.taken(used), request, robot_poses[0])
+    while len(bad := _bad(result)) and request.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
         worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
         fewer = np.delete(used, worst)
@@ -441,29 +447,29 @@ def _without_bad(
         for index in worst:
             number = int(used[index])
             remarks[number] = _bad_view(result, index, named[number], "was not used")
-        used, result = fewer, _solved(problem.taken(fewer), asked, robot_poses[0])
+        used, result = fewer, _solved(problem.taken(fewer), request, robot_poses[0])
     for index in bad:
         number = int(used[index])
-        kept = _bad_view(result, index, named[number], "is used all the same")
-        remarks.setdefault(number, kept)
+        remark = _bad_view(result, index, named[number], "is used all the same")
+        remarks.setdefault(number, remark)
     errors, left_out = np.full((2, problem.count), np.nan)
     unused = np.setdiff1d(np.arange(problem.count), used)
     left: list[int] = unused.tolist()
     for number in left:
-        (off,) = result.point_errors([robot_poses[number]], [seen[number]])
-        if np.isfinite(off).all():
-            errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
+        (errors_of_pose,) = result.point_errors([robot_poses[number]], [seen[number]])
+        if np.isfinite(errors_of_pose).all():
+            errors[number] = left_out[number] = math.sqrt(float((errors_of_pose**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
-    some = problem.taken(used)
-    _check_fit(some, result)
+    sampled = problem.taken(used)
+    _check_fit(sampled, result)
     return dataclasses.replace(
         result,
         errors=errors,
         leave_one_out=left_out,
         used=tuple(np.isin(np.arange(problem.count), used).tolist()),
         warnings=(
-            *_size_remark(some, asked),
-            *_remarks(some, result),
+            *_size_remark(sampled, request),
+            *_remarks(sampled, result),
             *_moved_remark(problem.taken(unused), result, [named[i] for i in left]),
             *remarks.values(),
         ),
@@ -481,10 +487,10 @@ def _moved_remark(
     arm = float(np.linalg.norm(seen.translation, axis=1).mean())
     places = {"target": target.before(between.inverse() @ (camera @ seen))}
     places["camera"] = camera.before(between @ (target @ seen.inverse()))
-    for what, steps in places.items():
+    for thing, steps in places.items():
         if (move := common_move(steps * np.repeat([arm, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
-                f"the {what} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
+                f"the {thing} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
                 f"{', '.join(named)} were left out, and agree on another place of it than all "
                 "others; which of both holds now, they cannot tell"
             )
@@ -492,7 +498,7 @@ def _moved_remark(
 
 
 def _near(
-    problem: Problem, asked: _Asked, named: Sequence[str]
+    problem: Problem, request: _Asked, named: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
     """Return the poses to begin with, and remarks, by number, on those that belong to other views.
 
@@ -502,7 +508,7 @@ def _near(
     gross = agreed.gross(most_error(problem))
     left = problem.count - len(gross)
     drop = (
-        asked.drop_bad
+        request.drop_bad
         and left >= MIN_GOOD_POSES
         and len(gross) <= MAX_BAD_POSE_SHARE * problem.count
     )
@@ -542,26 +548,26 @@ def _bad_view(result: HandEyeCalibration, index: int, name: str, done: str) -> R
     )
 
 
-def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibration:
-    check_choice(asked.method, ["auto", *METHODS], "method")
-    chosen, found = candidates(problem, asked.free, asked.method)
+def _solved(problem: Problem, request: _Asked, pose: Transform) -> HandEyeCalibration:
+    check_choice(request.method, ["auto", *METHODS], "method")
+    chosen, candidates_ = candidates(problem, request.free, request.method)
     if chosen is None:
         raise poor_fit(f"none at all {problem.count} poses", None)
-    return _result(problem, chosen, found, pose)
+    return _result(problem, chosen, candidates_, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
     """Raise ``POOR_FIT`` if poses and views do not belong together."""
     errors = result.errors if result.held_out_error is None else result.leave_one_out
-    off, most = float(np.median(errors)), most_error(problem)
-    if off > most:
-        raise poor_fit(f"one {1e3 * off:.3g} mm off, {1e3 * most:.3g} mm at most expected", off)
+    error, most = float(np.median(errors)), most_error(problem)
+    if error > most:
+        raise poor_fit(f"one {1e3 * error:.3g} mm off, {1e3 * most:.3g} mm at most expected", error)
 
 
 def _result(
     problem: Problem,
     chosen: Candidate,
-    found: Sequence[Candidate],
+    considered: Sequence[Candidate],
     pose: Transform,
 ) -> HandEyeCalibration:
     in_hand, solution = problem.robot.in_hand, chosen.solution
@@ -578,7 +584,8 @@ def _result(
         target_scale=seen.scale(solution.change),
         method=chosen.name,
         candidates={
-            one.name: one.held_out if math.isfinite(one.held_out) else None for one in found
+            candidate.name: candidate.held_out if math.isfinite(candidate.held_out) else None
+            for candidate in considered
         },
         errors=np.array([math.sqrt(float((error**2).mean())) for error in errors]),
         mean_error=float(np.concatenate(errors).mean()),
@@ -614,15 +621,17 @@ def _covariance(chosen: Candidate) -> Array:
         return np.full((12, 12), np.nan)
     cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
-    whole, left = solution.information, others.information
-    if whole is None or left is None:  # solved without a part of the poses, not without each
+    information, left = solution.information, others.information
+    if information is None or left is None:  # solved without a part of the poses, not without each
         return jackknife(steps[:MAX_FOLDS])
     places = of_one_place(chosen.problem.robot.poses)
-    alike = [places == one for one in np.unique(places)]  # poses of one place are left out together
-    steps = np.array([steps[one].sum(axis=0) for one in alike])  # to first order
-    left = np.array([whole - (whole - left[one]).sum(axis=0) for one in alike])
-    spreads = np.array([inverse_scaled(one)[:12, :12] for one in left])
-    scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole)[:12, :12])
+    alike = [
+        places == place for place in np.unique(places)
+    ]  # poses of one place are left out together
+    steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # to first order
+    left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
+    spreads = np.array([inverse_scaled(information_left)[:12, :12] for information_left in left])
+    scatter = weighed_jackknife(steps, spreads, inverse_scaled(information)[:12, :12])
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
         return scatter
@@ -632,20 +641,20 @@ def _covariance(chosen: Candidate) -> Array:
     return joint
 
 
-def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
+def _size_remark(problem: Problem, request: _Asked) -> Iterator[Remark]:
     """Return a remark if the target has another size, and that was not to be adjusted."""
-    if asked.method not in LINEAR and any(0 in one for one in asked.free.values()):
+    if request.method not in LINEAR and any(0 in freed for freed in request.free.values()):
         return
     numbers = np.arange(problem.count)
-    found = scale_of(problem.robot, problem.poses)
+    scale = scale_of(problem.robot, problem.poses)
     parts = [problem.taken(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
     others = [scale_of(part.robot, part.poses) for part in parts]
-    if found is None or not others or None in others:
+    if scale is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
-    if abs(found - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
+    if abs(scale - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
-            f"expected the target as large as it was said, got {found:.4f} times that by the "
+            f"expected the target as large as it was said, got {scale:.4f} times that by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "
             "lens' focal length is off by as much"
         )

@@ -102,10 +102,16 @@ class HandEyeCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = KIND
     _called: ClassVar[str] = "hand-eye calibration"
     _others: ClassVar[storage.Others] = {
-        "frames": (FRAMES, lambda one: (one.robot_poses[0].target, one.robot_poses[0].source)),
+        "frames": (
+            FRAMES,
+            lambda calibration: (
+                calibration.robot_poses[0].target,
+                calibration.robot_poses[0].source,
+            ),
+        ),
         "target": (
             storage.StoredTarget | None,
-            lambda one: one.views[0].target if one.views else None,
+            lambda calibration: calibration.views[0].target if calibration.views else None,
         ),
     }
     _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
@@ -144,8 +150,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 called, f"views: expected {count}, and their target", len(self.views)
             )
         if self.covariance.shape != (12, 12):
-            got = len(self.covariance)
-            raise storage.refused(called, "covariance: expected 12 rows of 12", got)
+            size = len(self.covariance)
+            raise storage.refused(called, "covariance: expected 12 rows of 12", size)
 
     @property
     def target(self) -> Target | None:
@@ -249,8 +255,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 the plane in front of the camera; NO_CALIBRATION: the calibration has no lens.
         """
         lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
-        found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
-        places = plane.apply(found)
+        mapped = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
+        places = plane.apply(mapped)
         check_finite(places, "to_plane: points")
         return places
 
@@ -296,8 +302,8 @@ class HandEyeCalibration(storage.SavedCalibration):
         between = robot_pose.inverse() if in_hand else robot_pose
         seen = self.camera_pose.inverse() @ between @ self.target_pose
         if isinstance(view, Transform):
-            off = seen.translation - self.target_scale * view.translation
-            return np.array([float(np.linalg.norm(off))])
+            distances = seen.translation - self.target_scale * view.translation
+            return np.array([float(np.linalg.norm(distances))])
         lens = self._lens("point_errors")
         check_view(view, lens.size)
         if self.views and view.target != self.views[0].target:
@@ -306,12 +312,12 @@ class HandEyeCalibration(storage.SavedCalibration):
                 self.views[0].target,
                 view.target,
             )
-        found = [
-            point_errors(lens, seen.rigid, one.points, self.target_scale * one.object_points)
-            for one in (view, *([half_turned(view)] if view.target.turned_alike else []))
+        errors_of_views = [
+            point_errors(lens, seen.rigid, turned.points, self.target_scale * turned.object_points)
+            for turned in (view, *([half_turned(view)] if view.target.turned_alike else []))
         ]
-        errors = min(found, key=lambda off: float(np.median(off)))
-        return errors if errors is found[0] else errors[::-1]
+        errors = min(errors_of_views, key=lambda view_errors: float(np.median(view_errors)))
+        return errors if errors is errors_of_views[0] else errors[::-1]
 
     @property
     def _flange(self) -> str:

@@ -133,7 +133,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = "camera"
     _called: ClassVar[str] = "calibration of cameras"
     _others: ClassVar[storage.Others] = {
-        "target": (storage.StoredTarget, lambda one: one.views[0].view.target)
+        "target": (storage.StoredTarget, lambda calibration: calibration.views[0].view.target)
     }
 
     camera: CameraModel
@@ -222,9 +222,9 @@ class IntrinsicCalibration(storage.SavedCalibration):
                 first,
                 view.target,
             )
-        near = Rigid.stacked([locate(view, self.camera).transform.rigid])
+        pose = Rigid.stacked([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else first.points + self.sheet
-        bundle = Bundle.single(self.camera, near, points=points)
+        bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
     def _check(self, found: Mapping[str, Any], called: str) -> None:
@@ -300,13 +300,13 @@ def calibrate_intrinsics(
         del used[worst]
     check_tilts(adjusted, "intrinsics")
     bad = [used[worst]] if ratio > BAD_VIEW_RATIO else []
-    found = _summary(
+    calibration = _summary(
         given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
     )
     turned = list[str]()
     target = given[0].target
     if target.turned_alike and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
-        found, turned = _numbered_alike(found, distortion_model, fixed_names, sheet)
+        calibration, turned = _numbered_alike(calibration, distortion_model, fixed_names, sheet)
     again = functools.partial(
         calibrate_intrinsics,
         distortion_model=distortion_model,
@@ -314,51 +314,51 @@ def calibrate_intrinsics(
         sheet=sheet,
         drop_bad=drop_bad,
     )
-    found = examined(found, again, drop=drop_bad)
+    calibration = examined(calibration, again, drop=drop_bad)
     if not turned:
-        return found
+        return calibration
     remark = Code.SHEET_NOT_EXACT.remark(
         f"the target looks the same after half a turn, and its shape shows that {', '.join(turned)}"
         " numbered it from its other end than the rest; they are numbered as the rest here"
     )
-    return dataclasses.replace(found, warnings=(*found.warnings, remark))
+    return dataclasses.replace(calibration, warnings=(*calibration.warnings, remark))
 
 
 def _numbered_alike(
-    found: IntrinsicCalibration, model: DistortionModel, held: tuple[str, ...], sheet: Sheet
+    calibration: IntrinsicCalibration, model: DistortionModel, held: tuple[str, ...], sheet: Sheet
 ) -> tuple[IntrinsicCalibration, list[str]]:
     """Return the calibration from views numbered from one end, and the names of turned views.
 
     Without turned views, and if the shape of the sheet does not explain far more then, the
-    calibration is ``found``.
+    calibration is ``calibration``.
     """
     # Shape and numbers are fitted in turn, which only lowers the squares: Lloyd, as for flips.
-    views = [view.view for view in found.views]
-    used = [number for number, view in enumerate(found.views) if view.used]
+    views = [view.view for view in calibration.views]
+    used = [number for number, view in enumerate(calibration.views) if view.used]
     bad = sorted(set(range(len(views))) - set(used))
     numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
-    shaped = found
+    shaped = calibration
     for _ in range(MAX_ROUNDS):
         lens = fit_lens([numbered[i] for i in used], model, held)
         shaped = _summary(numbered, used, lens, bad, "free")
         wrong = np.zeros(len(views), dtype=np.bool_)
         for number in used:
             both = numbered[number], half_turned(numbered[number])
-            as_is, other = (float((off**2).sum()) for off in shaped.point_errors(both))
+            as_is, other = (float((errors**2).sum()) for errors in shaped.point_errors(both))
             wrong[number] = other < as_is
         if not wrong.any():
             break
         turned ^= wrong
         numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
-    if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * found.rms:
-        return found, []
+    if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * calibration.rms:
+        return calibration, []
     if 2 * turned.sum() > len(turned):
         turned = ~turned
         numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
     lens = fit_lens([numbered[i] for i in used], model, held)
     better = _summary(numbered, used, lens, bad, sheet)
     names = [label(view, i) for i, view in enumerate(views) if turned[i]]
-    return (found, []) if better.sheet is None else (better, names)
+    return (calibration, []) if better.sheet is None else (better, names)
 
 
 def check_views(
@@ -389,8 +389,8 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         common, first, second = np.intersect1d(views[0].ids, view.ids, return_indices=True)
         if not len(common):
             return
-        off = views[0].points[first] - view.points[second]
-        largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
+        distances = views[0].points[first] - view.points[second]
+        largest = max(largest, float(np.linalg.norm(distances, axis=1).max()))
     if largest < least:
         raise Code.POSES_TOO_SIMILAR.refusal(
             f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "
@@ -433,13 +433,13 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
 
 def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[int, float]:
     """Return the worst view, and its weighted RMS over the median of the others."""
-    found = [
+    errors = [
         weighted_rms(view, residuals, adjusted.more)
         for view, residuals in zip(views, adjusted.residuals, strict=True)
     ]
-    worst = int(np.argmax(found))
-    others = float(np.median(np.delete(found, worst)))
-    return worst, found[worst] / others if others > 0 else 1.0
+    worst = int(np.argmax(errors))
+    others = float(np.median(np.delete(errors, worst)))
+    return worst, errors[worst] / others if others > 0 else 1.0
 
 
 def weighted_rms(view: TargetView, residuals: Array, more: float) -> float:
@@ -464,7 +464,8 @@ def _summary(
     sights = [Sight(0, number, view) for number, view in enumerate(of_used)]
     shape = choose_shape(adjusted, sights, sheet)
     errors = [
-        view_rms(one.residuals[0]) if len(used) > MIN_VIEWS else math.nan for one in shape.left_out
+        view_rms(left.residuals[0]) if len(used) > MIN_VIEWS else math.nan
+        for left in shape.left_out
     ]
     adjusted, bundle = shape.adjusted, shape.adjusted.bundle
     camera, basis = bundle.cameras[0], bundle.basis[0]

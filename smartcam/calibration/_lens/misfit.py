@@ -151,13 +151,15 @@ class Reduced(NamedTuple):
         parts = []
         for equation in equations:
             rows = equation.by_pose.reshape(-1, 6)
-            rest = np.column_stack(
+            rows_of_shared = np.column_stack(
                 [equation.by_shared.reshape(len(rows), -1), equation.residuals.ravel()]
             )
-            rest = rest - rows @ solve_scaled(rows.T @ rows, rows.T @ rest)
-            parts.append(rest.T @ rest)
-        found = np.array(parts)
-        return cls(found[:, :-1, :-1], found[:, :-1, -1], found[:, -1, -1])
+            rows_of_shared = rows_of_shared - rows @ solve_scaled(
+                rows.T @ rows, rows.T @ rows_of_shared
+            )
+            parts.append(rows_of_shared.T @ rows_of_shared)
+        sums = np.array(parts)
+        return cls(sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1])
 
     def misfits(self, change: Array) -> Array:
         """Return the weighted squares of each view (V,) if the values change by (L,)."""
@@ -171,11 +173,11 @@ class Reduced(NamedTuple):
         """
         # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
-        for whole, side in zip(self.matrix, self.right, strict=True) if places else ():
-            own = whole[np.ix_(places, places)]
-            both = solve_scaled(own, np.column_stack([whole[places], side[places]]))
-            matrix = matrix - whole[:, places] @ both[:, :-1]
-            right = right - whole[:, places] @ both[:, -1]
+        for sums_matrix, side in zip(self.matrix, self.right, strict=True) if places else ():
+            reduced = sums_matrix[np.ix_(places, places)]
+            both = solve_scaled(reduced, np.column_stack([sums_matrix[places], side[places]]))
+            matrix = matrix - sums_matrix[:, places] @ both[:, :-1]
+            right = right - sums_matrix[:, places] @ both[:, -1]
             squares = squares - side[places] @ both[:, -1]
         basis = np.eye(len(right))[:, free]
         change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
@@ -208,7 +210,7 @@ class _FlippedLens(NamedTuple):
         basis = np.eye(len(self.mirror))[:, free]
         as_is = mirrored = reduced.squares
         for _ in range(MAX_ROUNDS):
-            plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
+            plain, other = (reduced.matrix[mask].sum(axis=0) for mask in (~flipped, flipped))
             back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
             matrix = plain + self.mirror[:, None] * other * self.mirror
             right = reduced.right[~flipped].sum(axis=0) + back
@@ -229,8 +231,8 @@ class _Misfit:
         """``free`` (COUNT,): mask of the values that were fitted."""
         self.reduced = Reduced.of(equations)
         self._count, views = sum(equation.residuals.size for equation in equations), len(equations)
-        there = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
-        self.usual, bends = free & there, there.copy()
+        adjusted = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
+        self.usual, bends = free & adjusted, adjusted.copy()
         self.usual[SHEET], bends[: IMAGE.start] = True, False
         best = self.reduced.best
         explained = {
@@ -239,10 +241,13 @@ class _Misfit:
             "a lens of another model": (best(self.usual | bends)[1], float(bends.sum())),
         }
         self._before = best(self.usual)[1]
-        self._best = min(self.score(*one) for one in [(self._before, 0), *explained.values()])
+        self._best = min(
+            self.score(*score_and_count)
+            for score_and_count in [(self._before, 0), *explained.values()]
+        )
         self._others = ", ".join(
-            f"{what} {self._before / max(after, 1e-300):.3g}"
-            for what, (after, _) in explained.items()
+            f"{name} {self._before / max(after, 1e-300):.3g}"
+            for name, (after, _) in explained.items()
         )
 
     def score(self, squares: float, unknowns: float) -> float:
@@ -277,14 +282,16 @@ class _Misfit:
         for first in range(2, len(names) - 1):
             parts = [slice(None, first), slice(first, None)]
             sums = Reduced(
-                *(np.array([part[some].sum(axis=0) for some in parts]) for part in self.reduced)
+                *(np.array([part[mask].sum(axis=0) for mask in parts]) for part in self.reduced)
             )
-            tried += [(sums.best(self.usual, some)[1], first, how) for how, some in changes.items()]
+            tried += [
+                (sums.best(self.usual, places)[1], first, how) for how, places in changes.items()
+            ]
         after, first, best = min(tried)
         if not self.offer(after, len(changes[best]) + 1, CHANGE_COST_RATIO):
             return
         least = CHANGE_COST_RATIO * after
-        alike = [how for some, one, how in sorted(tried) if one == first and some < least]
+        alike = [how for score, group, how in sorted(tried) if group == first and score < least]
         code = Code.POOR_FIT if alike == [MOVED] else Code.WRONG_LENS
         yield code.remark(
             f"views of two settings: those from {names[first]} on do not fit those before: "
@@ -321,12 +328,16 @@ def misfit_remarks(
     reduced, usual, changes = misfit.reduced, misfit.usual, {ZOOMED: LENS[:4]}
     if len(fitted[0]) > 1:
         sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
-        changes = {f"{one} camera: {ZOOMED}": some for one, some in sides.items() if usual[some[0]]}
+        changes = {
+            f"{side} camera: {ZOOMED}": score_and_count
+            for side, score_and_count in sides.items()
+            if usual[score_and_count[0]]
+        }
         changes[MOVED] = RIG
         after = reduced.best(usual, RIG)[1]
         apart = misfit.offer(after, len(RIG) * len(fitted), APART_COST_RATIO)
-    if found := list(misfit.changed(changes, names)):
-        yield from found
+    if remarks := list(misfit.changed(changes, names)):
+        yield from remarks
     elif apart:
         yield Code.NOT_SIMULTANEOUS.remark(
             "the views of each pair do not belong together: did the target move between the two, "
@@ -342,7 +353,7 @@ def _flipped(misfit: _Misfit, camera: CameraModel, names: Sequence[str]) -> Iter
         for how, axes in FLIPS.items()
         for guess in _guesses(misfit.reduced, [2 + axis for axis in axes])
     ]
-    flipped, after, how = min(tried, key=lambda one: one[1])
+    flipped, after, how = min(tried, key=lambda score_and_count: score_and_count[1])
     if flipped.any() and not flipped.all() and misfit.offer(after, len(names), 1.0):
         fewer = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
         which = ", ".join(itertools.compress(names, fewer.tolist()))
@@ -370,7 +381,7 @@ def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[R
     """
     if len(fitted) < MIN_VIEWS_FOR_LENS:
         return
-    equations = [one.equations(more) for one in fitted]
+    equations = [view.equations(more) for view in fitted]
     reduced = Reduced.of(equations)
     before, after = float(reduced.squares.sum()), reduced.best(LENSES)[1]
     if before > FITTED_COST_RATIO * after:

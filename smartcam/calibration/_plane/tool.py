@@ -62,8 +62,8 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
             degrees.
     """
     flanges = [
-        as_motion(one, f"tool tip: pose {number}", "base", "flange")
-        for number, one in enumerate(as_list(flanges, object, "tool tip: pose"))
+        as_motion(pose, f"tool tip: pose {number}", "base", "flange")
+        for number, pose in enumerate(as_list(flanges, object, "tool tip: pose"))
     ]
     if len(flanges) < 2:
         raise Code.TOO_FEW.unexpected("tool tip: expected two touches or more", 2, len(flanges))
@@ -126,8 +126,8 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     # as complex numbers, for which a turn is a product
     places = np.array([complex(pose.position.x, pose.position.y) for pose in poses])
     turns = np.exp(1j * np.array([pose.orientation.theta for pose in poses]))
-    near = turns - turns.mean()
-    spread = float(np.sqrt(np.mean(np.abs(near) ** 2)))
+    centred = turns - turns.mean()
+    spread = float(np.sqrt(np.mean(np.abs(centred) ** 2)))
     if not spread > _MIN_ORIENTATION_SPREAD:
         raise Code.INSUFFICIENT_ROTATION.refusal(
             f"rotation centre: expected angles that differ, got a spread of {spread:.3g}, which "
@@ -135,7 +135,7 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
             _MIN_ORIENTATION_SPREAD,
             spread,
         )
-    arm = np.vdot(near, places) / np.vdot(near, near)
+    arm = np.vdot(centred, places) / np.vdot(centred, centred)
     centre = places.mean() - arm * turns.mean()
     return RotationCentre(_plane(centre), _plane(arm), _plane(places - centre - arm * turns))
 

@@ -154,8 +154,8 @@ def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
     for shape in shapes:
         match shape:
             case Polygon(points):
-                first, *rest = (_pair(x, y) for x, y in points)
-                yield " ".join([f"{first} m", *(f"{one} l" for one in rest), "h"])
+                first, *others = (_pair(x, y) for x, y in points)
+                yield " ".join([f"{first} m", *(f"{point} l" for point in others), "h"])
             case Disc((x, y), radius):
                 yield _pdf_circle(x, y, radius)
             case Label():

@@ -88,10 +88,13 @@ class SheetCalibration(storage.SavedCalibration):
     _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
     _later: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
     _others: ClassVar[storage.Others] = {
-        "target": (storage.StoredTarget, lambda one: one.view.target),
-        "camera": (CameraModel | None, lambda one: one.sheet.camera),
-        "matrix": (storage.Matrix3, lambda one: one.sheet.matrix),
-        "covariance": (Annotated[Array, storage.matrix(9)], lambda one: one.sheet.covariance),
+        "target": (storage.StoredTarget, lambda calibration: calibration.view.target),
+        "camera": (CameraModel | None, lambda calibration: calibration.sheet.camera),
+        "matrix": (storage.Matrix3, lambda calibration: calibration.sheet.matrix),
+        "covariance": (
+            Annotated[Array, storage.matrix(9)],
+            lambda calibration: calibration.sheet.covariance,
+        ),
     }
 
     view: TargetView
@@ -408,7 +411,7 @@ def fit_corners(
             is off by more than a tenth; and those of :func:`~smartcam.calibration.fit_plane`.
     """
     points = target.points[:, :2]
-    wrong = [one for one in ids if not 0 <= one < len(points)]
+    wrong = [ident for ident in ids if not 0 <= ident < len(points)]
     if wrong:
         raise Code.SHAPE.unexpected(
             f"touched points: expected numbers from 0 to {len(points) - 1}",

@@ -152,10 +152,10 @@ class SheetPlane:
                 pixels - DIRECTION_STEP_PX * ahead,
             )
         )
-        way = ends - starts
+        directions = ends - starts
         return Poses(
             np.column_stack([middles, np.zeros(len(middles))]),
-            quaternion_about_z(np.arctan2(way[:, 1], way[:, 0])),
+            quaternion_about_z(np.arctan2(directions[:, 1], directions[:, 0])),
         )
 
     def _seen(self, pixels: ArrayLike) -> Array:
@@ -270,10 +270,10 @@ def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[
     # points they take 1.8 ms, SciPy's least_squares 2.2 ms (measured), in no fewer lines.
     weights, normal = whitening(noise, 0.0), np.eye(8)
     for _ in range(MAX_STEPS):
-        off = weights @ (pixels - apply_homography(matrix, source))[..., None]
+        residuals = weights @ (pixels - apply_homography(matrix, source))[..., None]
         jacobian = (weights @ element_derivatives(matrix, source)[..., :8]).reshape(-1, 8)
         normal = jacobian.T @ jacobian
-        step = np.linalg.solve(normal, jacobian.T @ off.ravel())
+        step = np.linalg.solve(normal, jacobian.T @ residuals.ravel())
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
         if (np.abs(step) * unit_diagonal(normal)).max() < SETTLED_SIGMAS:
             break

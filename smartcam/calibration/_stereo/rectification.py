@@ -118,7 +118,7 @@ def rectify(
             MIN_ACROSS_COSINE,
             across,
         )
-    kept = tuple(
+    rectified_maps = tuple(
         _kept(camera, turn, projection, output)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
@@ -130,7 +130,7 @@ def rectify(
         depth=depth,
         maps=(maps[0], maps[1]),
         masks=(masks[0], masks[1]),
-        kept=(kept[0], kept[1]),
+        kept=(rectified_maps[0], rectified_maps[1]),
         invalid=(1.0 - float(masks[0].mean()), 1.0 - float(masks[1].mean())),
     )
 
@@ -156,8 +156,8 @@ def _checked(
     return int(width), int(height)
 
 
-def _shape(what: str, expected: str, got: object) -> CalibrationError:
-    return Code.SHAPE.unexpected(f"rectify: {what}: expected {expected}", expected, got)
+def _shape(what: str, expected: str, actual: object) -> CalibrationError:
+    return Code.SHAPE.unexpected(f"rectify: {what}: expected {expected}", expected, actual)
 
 
 def _parallel(
@@ -184,15 +184,17 @@ def _parallel(
         transform.translation,
     )
     if left.distortion_model == "equidistant":
-        found: Any = cv2.fisheye.stereoRectify(
+        rectified: Any = cv2.fisheye.stereoRectify(
             *given, cv2.CALIB_ZERO_DISPARITY, newImageSize=output, balance=alpha
         )
     else:
-        found = cv2.stereoRectify(
+        rectified = cv2.stereoRectify(
             *given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output
         )
-    first, second, one, two, depth = (np.array(each, dtype=np.float64) for each in found[:5])
-    return (first, second), (one, two), depth
+    first, second, first_projection, two, depth = (
+        np.array(each, dtype=np.float64) for each in rectified[:5]
+    )
+    return (first, second), (first_projection, two), depth
 
 
 def _map(

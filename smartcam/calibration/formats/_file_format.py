@@ -82,10 +82,10 @@ class Format(Generic[T]):
                 f"{path}: {self.title}: {exc}", code=exc.code, expected=exc.expected, got=exc.got
             ) from exc
 
-    def _in_metres(self, found: T | Measured[T], unit: str | None) -> T:
-        by_file = isinstance(found, Measured)
-        stated = cast("Measured[T]", found).unit if by_file else "m"
-        value = cast("Measured[T]", found).value if by_file else cast("T", found)
+    def _in_metres(self, parsed: T | Measured[T], unit: str | None) -> T:
+        by_file = isinstance(parsed, Measured)
+        stated = cast("Measured[T]", parsed).unit if by_file else "m"
+        value = cast("Measured[T]", parsed).value if by_file else cast("T", parsed)
         motions = _motions(value)
         if not motions:
             return value
@@ -117,7 +117,7 @@ def _motions(value: Any) -> list[Transform]:
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
-        return [motion for one in value for motion in _motions(one)]
+        return [motion for item in value for motion in _motions(item)]
     return _motions(getattr(value, "transforms", ()))
 
 
@@ -126,9 +126,9 @@ def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, Transform):
         return dataclasses.replace(value, translation=factor * value.translation)
     if isinstance(value, tuple) and hasattr(value, "_replace"):
-        return type(value)(*(_scaled(one, factor) for one in value))
+        return type(value)(*(_scaled(item, factor) for item in value))
     if isinstance(value, (list, tuple)):
-        return type(value)(_scaled(one, factor) for one in value)
+        return type(value)(_scaled(item, factor) for item in value)
     return dataclasses.replace(value, transforms=_scaled(value.transforms, factor))
 
 

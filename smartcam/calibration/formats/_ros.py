@@ -81,15 +81,15 @@ def _from_words(words: list[str]) -> Transform:
 
 def _from_launch(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
-    nodes = [one.attrib for one in load_xml(text.strip()).iter("node")]
-    found = [
+    nodes = [node.attrib for node in load_xml(text.strip()).iter("node")]
+    arguments = [
         node["args"]
         for node in nodes
         if _COMMAND in (node.get("type"), node.get("exec")) and "args" in node
     ]
-    if len(found) != 1:
-        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(found)))
-    return found[0]
+    if len(arguments) != 1:
+        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(arguments)))
+    return arguments[0]
 
 
 def _from_python(text: str) -> list[str]:
@@ -103,17 +103,17 @@ def _from_python(text: str) -> list[str]:
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
     ]
-    found = [
+    arguments = [
         call["arguments"]
         for call in calls
         if "arguments" in call
         and isinstance(call.get("executable"), ast.Constant)
         and getattr(call["executable"], "value", None) == _COMMAND
     ]
-    if len(found) != 1:
-        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(found)))
+    if len(arguments) != 1:
+        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(arguments)))
     try:
-        words = ast.literal_eval(found[0])
+        words = ast.literal_eval(arguments[0])
     except (ValueError, TypeError, MemoryError, RecursionError) as exc:
         raise malformed("arguments", "texts and numbers, no variables or calls", "others") from exc
     return [str(word) for word in sequence(words, "arguments")]
@@ -126,16 +126,16 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
     """
     joints = {}
     for joint in load_xml(text.strip()).iter("joint"):
-        ends = [one.get("link", "") for kind in ("parent", "child") for one in joint.iter(kind)]
+        ends = [link.get("link", "") for kind in ("parent", "child") for link in joint.iter(kind)]
         if len(ends) == 2:
             joints[ends[0], ends[1]] = joint
     names = (target, source)
     if names not in joints and len(joints) == 1:
         (names,) = joints
     if names not in joints:
-        there = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
-        raise malformed("file", f"a joint of parent {target} and child {source}", there)
-    given = next((one.attrib for one in joints[names].iter("origin")), {})
+        joints_text = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
+        raise malformed("file", f"a joint of parent {target} and child {source}", joints_text)
+    given = next((origin.attrib for origin in joints[names].iter("origin")), {})
     place, turn = (
         reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
     )
@@ -165,7 +165,8 @@ def _from_options(words: Sequence[str]) -> Transform:
 
 def _values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
     return [
-        number(given[one], one) if one in given else default for one, default in defaults.items()
+        number(given[field], field) if field in given else default
+        for field, default in defaults.items()
     ]
 
 

@@ -53,15 +53,15 @@ def parse_json(text: str) -> list[HandEyeSample]:
     samples = sequence(load_json(text), "file")
     pairs = [sequence(pair, f"sample {index}", 2) for index, pair in enumerate(samples)]
     return [
-        _sample(index, *(matrix_of(one, f"sample {index}", (4, 4)) for one in pair))
+        _sample(index, *(matrix_of(matrix, f"sample {index}", (4, 4)) for matrix in pair))
         for index, pair in enumerate(pairs)
     ]
 
 
 def parse_yaml(text: str) -> list[HandEyeSample]:
     """Return the samples of a YAML file; frames are base, effector, camera and object."""
-    found, keys = sequence(load_yaml(text), "file"), (_HAND, _SEEN)
-    pairs = [mapping(pair, f"sample {index}", keys) for index, pair in enumerate(found)]
+    samples, keys = sequence(load_yaml(text), "file"), (_HAND, _SEEN)
+    pairs = [mapping(pair, f"sample {index}", keys) for index, pair in enumerate(samples)]
     return [
         _sample(index, *(np.reshape(reals(pair[key], key, 16), (4, 4)) for key in keys))
         for index, pair in enumerate(pairs)

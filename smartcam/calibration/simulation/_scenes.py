@@ -121,8 +121,8 @@ def around(
         looking = np.column_stack([side, np.cross(-out, side), -out])
         roll = random.uniform(-math.pi / 2, math.pi / 2)
         rotation = looking @ exp_rotation(np.array([0.0, 0.0, roll]))
-        far = distance * random.uniform(0.8, 1.2)
-        poses.append(Transform("target", "camera", rotation, centre + far * out))
+        reach = distance * random.uniform(0.8, 1.2)
+        poses.append(Transform("target", "camera", rotation, centre + reach * out))
     return poses
 
 

@@ -218,13 +218,13 @@ class _Views:
             seen = motion_from_data(lying, CAMERA, TARGET)
             places = (calibration.camera_pose @ seen).apply(points)
         columns = shape_of(self._target)[0]
-        off: list[float] = []
+        errors: list[float] = []
         for direction in DIAGONALS[:TOUCHES]:
             number = int(np.argmax(points[:, :2] @ direction))
             row, column = divmod(number, columns)
             step = Step(
-                id=f"verify-{len(off) + 1}",
-                title=f"Touch {len(off) + 1} of {TOUCHES}",
+                id=f"verify-{len(errors) + 1}",
+                title=f"Touch {len(errors) + 1} of {TOUCHES}",
                 description=f"Move the tip of the tool onto point {column + 1} of row {row + 1} of "
                 "the sheet, counted from its origin, and take the tip's position from the robot, "
                 "in its base.",
@@ -232,11 +232,11 @@ class _Views:
             )
             answer = await ask(step)
             touched = np.array([1e-3 * answer[axis] for axis in "xyz"])
-            off.append(1e3 * float(np.linalg.norm(touched - places[number])))
-        note = f"the tip touched the sheet {', '.join(f'{one:.2f}' for one in off)} mm off"
+            errors.append(1e3 * float(np.linalg.norm(touched - places[number])))
+        note = f"the tip touched the sheet {', '.join(f'{error:.2f}' for error in errors)} mm off"
         others = tuple(warning for warning in calibration.warnings if warning.code != Code.REFUTED)
         allowed = calibration.allowed
-        if max(off) > allowed.error:
+        if max(errors) > allowed.error:
             others = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *others)
         return replace(calibration, warnings=others), note
 
@@ -356,13 +356,13 @@ class _Views:
             notes=(f"{len(self._samples)} views",),
             timeout=CALCULATION_TIMEOUT,
         )
-        found = (await ask(step, self._solve)).outcome
-        if "code" in found:
-            worst, code = len(self._samples), Code(found["code"])
-            judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
-            return None, (f"{code}: {found['text']}",), judgement
+        check = (await ask(step, self._solve)).outcome
+        if "code" in check:
+            worst, code = len(self._samples), Code(check["code"])
+            judgement = refused(code, check["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {check['text']}",), judgement
         views = [view.to_data() for view in self._views()]
-        calibration = HandEyeCalibration.from_data({**found, "views": views})
+        calibration = HandEyeCalibration.from_data({**check, "views": views})
         _, _, notes, judgement = _outcome(calibration)
         return calibration, notes, judgement
 
@@ -449,10 +449,10 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     notes = [f"{figures['views']} views, {figures['method']}"]
     if held_out is not None:
         worst = calibration.worst
-        off = 1e3 * float(calibration.leave_one_out[worst])
+        error = 1e3 * float(calibration.leave_one_out[worst])
         notes += [
             f"{figures['held_out_mm']:.3g} mm rms on the sheet, at views that were left out",
-            f"the worst is view {worst + 1}: {off:.3g} mm",
+            f"the worst is view {worst + 1}: {error:.3g} mm",
         ]
     if figures["translation_error_mm"] is not None:
         notes.append(

@@ -79,26 +79,26 @@ class MarkCamera:
 
         Cancellation: as that of ``localize``.
         """
-        found = await self.localize()
+        localizations = await self.localize()
         rows = [
             {
-                "feature_id": one.feature_id,
-                "quality": one.quality,
-                "photo_index": one.photo_index,
-                "frame_id": one.pose.header.frame_id,
-                "x": one.pose.position.x,
-                "y": one.pose.position.y,
-                "theta": one.pose.orientation.theta,
+                "feature_id": localization.feature_id,
+                "quality": localization.quality,
+                "photo_index": localization.photo_index,
+                "frame_id": localization.pose.header.frame_id,
+                "x": localization.pose.position.x,
+                "y": localization.pose.position.y,
+                "theta": localization.pose.orientation.theta,
                 "y_down": self.y_down,
             }
-            for one in found
-            if self.feature in {"", one.feature_id}
+            for localization in localizations
+            if self.feature in {"", localization.feature_id}
         ]
         if not 0 < len(rows) <= MAX_MARKS:
             wanted = f"{self.feature!r} " if self.feature else ""
             raise (Code.SHAPE if rows else Code.TOO_FEW).refusal(
-                f"the camera found {len(rows)} marks {wanted}among {len(found)} localizations; "
-                f"expected 1 to {MAX_MARKS}",
+                f"the camera found {len(rows)} marks {wanted}among {len(localizations)} "
+                f"localizations; expected 1 to {MAX_MARKS}",
                 got=len(rows),
             )
         return rows

@@ -261,13 +261,13 @@ class PointSource(Touches, ABC):
 
     def _fits_without(self, index: int) -> bool:
         """Return True if the touches fit without one of them, and another one is left as a test."""
-        rest = copy.copy(self)
-        rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        others = copy.copy(self)
+        others.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
-            codes = {warning.code for warning in rest.fit(robust=False).warnings}
+            codes = {warning.code for warning in others.fit(robust=False).warnings}
         except CalibrationError:
             return False
-        return len(rest.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
+        return len(others.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,
@@ -311,7 +311,7 @@ class PointSource(Touches, ABC):
         """Return the data for a picture of the touches."""
         if plane is None:
             return {**plain(self.touches), "choices": self._choices()}
-        found = compared(
+        comparison = compared(
             plane,
             self.touches,
             plane.camera_points,
@@ -320,7 +320,7 @@ class PointSource(Touches, ABC):
             worst=plane.worst,
             left_out=plane.outliers,
         )
-        return {**found, **self.SHOWN, "choices": self._choices(found["points"])}
+        return {**comparison, **self.SHOWN, "choices": self._choices(comparison["points"])}
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
         """Return the touches as clickable choices, at the places where they are drawn."""

@@ -128,10 +128,10 @@ class _ScriptRun:
         self._send(None)
         for number, entry in enumerate(entries, 1):
             if self.request is None or self.request.step.id != entry["step"]:
-                here = "the end" if self.request is None else f"step {self.request.step.id!r}"
+                place = "the end" if self.request is None else f"step {self.request.step.id!r}"
                 self.close()
                 raise Code.WRONG_JOURNAL.refusal(
-                    f"entry {number} is of step {entry['step']!r}, expected {here}: another "
+                    f"entry {number} is of step {entry['step']!r}, expected {place}: another "
                     f"version of {wizard.name!r} wrote it"
                 )
             self.take(entry)
@@ -241,8 +241,8 @@ class WizardSession:
         if self.state != "asking" or not self._log.entries:
             return None
         done = [
-            {"step": one["step"], "answers": one["answers"], "at": one["at"]}
-            for one in copy.deepcopy(self._log.entries)
+            {"step": entry["step"], "answers": entry["answers"], "at": entry["at"]}
+            for entry in copy.deepcopy(self._log.entries)
         ]
         times = {"since": header.get("started_at"), "last": done[-1]["at"]}
         return {**times, "done": done, "parameters": copy.deepcopy(self.parameters)}
@@ -260,18 +260,18 @@ class WizardSession:
 
     def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         wizard, journal = self.wizard, self._journal
-        mine = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
+        expected = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
         if journal is not None and journal.header is not None:
-            found = {name: journal.header.get(name) for name in mine}
-            if found != mine:
+            actual = {name: journal.header.get(name) for name in expected}
+            if actual != expected:
                 raise Code.WRONG_JOURNAL.refusal(
-                    f"{journal.path}: written by {_named(found)}, expected {_named(mine)}",
-                    mine,
-                    found,
+                    f"{journal.path}: written by {_named(actual)}, expected {_named(expected)}",
+                    expected,
+                    actual,
                 )
             return journal.header
         return {
-            **mine,
+            **expected,
             "flow": secrets.token_hex(8),
             "started_at": datetime.now(UTC).isoformat(),
             "parameters": _stored(dict(parameters), "the parameters"),
@@ -360,8 +360,8 @@ class WizardSession:
         """Return the approximate number of steps; None if it is not known."""
         if not self.wizard.steps or self.step is None:
             return None
-        rest = {"save": 0, "review": 1}.get(self.step.id, 2)
-        return max(self.wizard.steps, len(self._log.entries) + 1 + rest)
+        remaining = {"save": 0, "review": 1}.get(self.step.id, 2)
+        return max(self.wizard.steps, len(self._log.entries) + 1 + remaining)
 
     def _can(self) -> list[str]:
         if self.state != "asking":

@@ -106,8 +106,8 @@ def draw(
         f'href="data:image/png;base64,{_png(grey.bytes)}"/>',
         *canvas.covered(counts),
     ]
-    found = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
-    texts = [found, _seen(counts, earlier, view)]
+    summary = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
+    texts = [summary, _seen(counts, earlier, view)]
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:

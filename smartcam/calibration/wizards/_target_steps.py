@@ -121,7 +121,7 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
         return target_from_data(_checked(data))
     step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
     given = await ask(step.with_defaults({"square": square}))
-    lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
+    lengths = {field.name for field in _INPUTS[kind] if isinstance(field, Number) and field.unit}
     values = {
         name: 1e-3 * value if name in lengths and value is not None else value
         for name, value in given.items()

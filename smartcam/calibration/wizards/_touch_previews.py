@@ -94,10 +94,10 @@ def compared(
         )
     origin = across @ (calibration.origin - centre)
     at = np.array([touch.robot for touch in touches]).reshape(-1, 3)
-    off = np.isin(np.arange(len(at)), [*left_out])
+    is_left_out = np.isin(np.arange(len(at)), [*left_out])
     view = _view(
-        across @ (np.concatenate([counted, at[~off]]) - centre).T,
-        np.column_stack([origin, across @ (at[off] - centre).T]),
+        across @ (np.concatenate([counted, at[~is_left_out]]) - centre).T,
+        np.column_stack([origin, across @ (at[is_left_out] - centre).T]),
     )
     return {
         **preview,
@@ -114,8 +114,8 @@ def _view(points: Array, others: Array) -> Array:
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
     flat = others[:2].T
-    near = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
-    shown = np.vstack([low, high, near])
+    visible = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
+    shown = np.vstack([low, high, visible])
     low, high = shown.min(axis=0), shown.max(axis=0)
     margin = MARGIN_RATIO * float((high - low).max())
     return np.array([low - margin, high + margin])

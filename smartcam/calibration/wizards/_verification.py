@@ -104,12 +104,14 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
     NOT_FINITE; UNVERIFIED if the touches' sigma is not known; MissingExtraError: SciPy is not
     installed.
     """
-    own = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
+    own_variance = float(
+        np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1]
+    )
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
-        variance = own + sigma**2 / count
+        variance = own_variance + sigma**2 / count
         shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
         if (
             _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
@@ -182,10 +184,10 @@ class _DriftCheck(Touches):
         self.camera_unit = about.outcome.get("camera_unit", "m")
         self._camera = camera
         self._record_to = record_to
-        found = PlaneCalibration.from_data(about.outcome["data"])
+        calibration = PlaneCalibration.from_data(about.outcome["data"])
         if self.sigma is not None:
-            found = replace(found, touch_sigma=self.sigma, sigma_given=True)
-        self.calibration = found
+            calibration = replace(calibration, touch_sigma=self.sigma, sigma_given=True)
+        self.calibration = calibration
 
     async def run(self) -> dict[str, Any]:
         while True:
@@ -269,7 +271,7 @@ class _DriftCheck(Touches):
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
         needed = [touches_needed(self.calibration, point) for point in self._seen()]
-        enough = [one for one in needed if one is not None]
+        enough = [name for name in needed if name is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),

@@ -96,10 +96,10 @@ def _guided(views: Sequence[TargetView]) -> NextView | None:
         return None
     # parts will be about as far away as the target is
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
-    found = suggest_views(
+    views_found = suggest_views(
         lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]
     )
-    return found[0] if found else None
+    return views_found[0] if views_found else None
 
 
 FOCAL_LENGTH_WIDTHS: Final = 1.2
