@@ -150,15 +150,20 @@ class Places(Generic[G]):
         if len(crowd) < self.most:
             crowd = []
             if not is_loopback(peer):
-                theirs = [one for one, place in self._places.items() if place.peer == peer]
-                if len(theirs) >= share_of(self.most):
-                    crowd, taken = theirs, f"{len(theirs)} others of {peer} are open"
+                places_of_peer = [
+                    occupant for occupant, place in self._places.items() if place.peer == peer
+                ]
+                if len(places_of_peer) >= share_of(self.most):
+                    crowd, taken = (
+                        places_of_peer,
+                        f"{len(places_of_peer)} others of {peer} are open",
+                    )
         if crowd:
             self.crowded_out += 1
-            one = next((one for one in crowd if not one.settled), None)
-            if one is None:
+            evicted = next((occupant for occupant in crowd if not occupant.settled), None)
+            if evicted is None:
                 return f"{taken}, and each has {self._own}"
-            self._send_away(one, f"{taken}, it was without {self._own} for longest")
+            self._send_away(evicted, f"{taken}, it was without {self._own} for longest")
         self._places[occupant] = _TakenPlace(
             peer, now, self._within, self._what, now + self._within
         )
@@ -191,15 +196,22 @@ class Places(Generic[G]):
 
     def waits_longest(self) -> tuple[float, G] | None:
         """Return the connection that has had no session for longest, and since when; None: none."""
-        found = next((one for one in self._places.items() if not one[0].settled), None)
-        return None if found is None else (found[1].since, found[0])
+        longest_waiting = next(
+            (
+                occupant_and_place
+                for occupant_and_place in self._places.items()
+                if not occupant_and_place[0].settled
+            ),
+            None,
+        )
+        return None if longest_waiting is None else (longest_waiting[1].since, longest_waiting[0])
 
     def make_room(self, why: str) -> None:
         """Close the connection that has had no session for longest."""
-        found = self.waits_longest()
-        if found is not None:
+        longest_waiting = self.waits_longest()
+        if longest_waiting is not None:
             self.crowded_out += 1
-            self._send_away(found[1], why)
+            self._send_away(longest_waiting[1], why)
 
     def end_overdue(self, now: float) -> None:
         """End connections whose time is over; a connection with a session gets new time."""
@@ -391,10 +403,10 @@ class Acceptor(Generic[G]):
             else:
                 self._admit(connection)
 
-    def _warn_once(self, what: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Log that nothing can be accepted; once, until accepting works again."""
         if not self._scarce:
-            self._log.warning("! %s", what)
+            self._log.warning("! %s", text)
         self._scarce = True
 
     def _admit(self, connection: socket.socket) -> None:
@@ -453,10 +465,14 @@ def _make_room() -> bool:
     """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
     open_here = [acceptor.places for acceptor in _here.acceptors if acceptor.loop is loop]
-    waiting = [(found[0], one) for one in open_here if (found := one.waits_longest()) is not None]
+    waiting = [
+        (longest_waiting[0], acceptor)
+        for acceptor in open_here
+        if (longest_waiting := acceptor.waits_longest()) is not None
+    ]
     if not waiting:
         return False
-    _, places = min(waiting, key=lambda one: one[0])
+    _, places = min(waiting, key=lambda time_and_acceptor: time_and_acceptor[0])
     places.make_room("the process has too few file descriptors left")
     return True
 
@@ -474,8 +490,8 @@ async def listening(host: str, port: int, *, local: bool = False) -> socket.sock
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(RESOLVE_TIMEOUT):
-        found = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
-    family, _, _, _, address = found[0]
+        addresses = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
+    family, _, _, _, address = addresses[0]
     if local and not is_loopback(str(address[0])):
         raise ValueError(f"{host} is {address[0]} here, which needs a token")
     listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)

@@ -30,8 +30,8 @@ def tell_of_forks(one: KnowsForks) -> None:
 
 
 def _tell_all() -> None:
-    for one in tuple(_notified):
-        one.forked()
+    for notified in tuple(_notified):
+        notified.forked()
 
 
 if hasattr(os, "register_at_fork"):

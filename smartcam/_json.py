@@ -105,7 +105,7 @@ def _container_text(value: object) -> str:
         if text is not None:
             return text
     elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
-        return f"{{{','.join([f'{_quoted(str(name))}:{one}' for name, one in value.items()])}}}"
+        return f"{{{','.join([f'{_quoted(str(name))}:{item}' for name, item in value.items()])}}}"
     elif _is_table(value):
         text = _table_text(value)
         if text is not None:
@@ -152,7 +152,7 @@ def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
         return None
     fields = zip(dtype.names, kinds, strict=True)
     form = ",".join(
-        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[one.kind]}" for name, one in fields]
+        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[field.kind]}" for name, field in fields]
     )
     texts = frozenset(place for place, kind in enumerate(kinds) if kind.kind == "S")
     floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")
@@ -191,9 +191,9 @@ def plain(value: Any) -> Any:
     if kind in _PLAIN:
         return value
     if kind is list or kind is tuple:
-        return value if _PLAIN.issuperset(map(type, value)) else [plain(one) for one in value]
+        return value if _PLAIN.issuperset(map(type, value)) else [plain(item) for item in value]
     if kind is dict:
-        return {str(name): plain(one) for name, one in value.items()}
+        return {str(name): plain(item) for name, item in value.items()}
     if issubclass(kind, tuple) and hasattr(value, "_asdict"):
         fields: dict[str, Any] = value._asdict()
         if _PLAIN.issuperset(map(type, fields.values())):

@@ -166,28 +166,28 @@ class _ThreadCall:
             self._fail(asyncio.CancelledError())
             return
         try:
-            got = self._function()
-            if inspect.iscoroutine(got):
-                self._task = start_task(self._finish_by(got))
+            outcome = self._function()
+            if inspect.iscoroutine(outcome):
+                self._task = start_task(self._finish_by(outcome))
                 if sys.version_info < (3, 12):
-                    self._task.add_done_callback(lambda _: self._never_begun(got))
+                    self._task.add_done_callback(lambda _: self._never_begun(outcome))
                 return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
-            self._succeed(got)
+            self._succeed(outcome)
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
         """Run a coroutine; the waiting thread goes on without another turn of the loop."""
         try:
-            got = await work
+            outcome = await work
         except asyncio.CancelledError:
             self._fail(LocalProtocolError("cancelled: the thread of the event loop has ended"))
             raise
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
-            self._succeed(got)
+            self._succeed(outcome)
 
     def _never_begun(self, work: Coroutine[Any, Any, object]) -> None:
         """End a coroutine that was cancelled before its task's first step; asyncio does not."""

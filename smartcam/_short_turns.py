@@ -19,34 +19,34 @@ _wanted: Final[dict[object, float]] = {}  # seconds, by the object that asks for
 _before: Final[list[float]] = []  # the original interval, while another is set
 
 
-def shorten_turns(who: object, seconds: float) -> None:
+def shorten_turns(owner: object, seconds: float) -> None:
     """Shorten turns to at most this length, until :func:`leave_turns`.
 
     Args:
-        who: any object that can be a key; it has one length at a time.
+        owner: any object that can be a key; it has one length at a time.
         seconds: length of a turn.
     """
     if not _wanted:
         _before[:] = [sys.getswitchinterval()]
-    _wanted[who] = seconds
+    _wanted[owner] = seconds
     _apply()
 
 
-def leave_turns(who: object) -> None:
+def leave_turns(owner: object) -> None:
     """End an object's request for short turns. Harmless when called twice."""
-    if _wanted.pop(who, None) is not None:
+    if _wanted.pop(owner, None) is not None:
         _apply()
 
 
 @contextmanager
 def short_turns(seconds: float) -> Iterator[None]:
     """Shorten turns to at most this length within a block."""
-    who = object()
-    shorten_turns(who, seconds)
+    owner = object()
+    shorten_turns(owner, seconds)
     try:
         yield
     finally:
-        leave_turns(who)
+        leave_turns(owner)
 
 
 def _apply() -> None:

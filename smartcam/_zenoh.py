@@ -141,7 +141,7 @@ class BusLink:
 
     def settings(self, timeout: float) -> dict[str, Any]:
         """Return the engine's settings by their paths."""
-        found: dict[str, Any] = {
+        settings: dict[str, Any] = {
             "mode": self.mode,
             "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
@@ -163,10 +163,10 @@ class BusLink:
             "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE_TIME))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
-            found[f"transport/link/tx/queue/size/{queue}"] = 16
+            settings[f"transport/link/tx/queue/size/{queue}"] = 16
         if self.certificates is not None:
             tls = f"{self.certificates.rstrip('/')}/"
-            found |= {
+            settings |= {
                 "transport/link/tls/root_ca_certificate": f"{tls}ca.pem",
                 "transport/link/tls/enable_mtls": True,
                 "transport/link/tls/connect_certificate": f"{tls}cert.pem",
@@ -175,7 +175,7 @@ class BusLink:
                 "transport/link/tls/listen_private_key": f"{tls}key.pem",
                 "transport/link/tls/verify_name_on_connect": True,
             }
-        return found
+        return settings
 
 
 def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
@@ -195,8 +195,8 @@ def _free_port(endpoint: str) -> int:
     ports = random.SystemRandom().sample(PORTS, 100)
     for port in ports:
         try:
-            with socket.socket(family) as found:
-                found.bind((host, port))
+            with socket.socket(family) as sock:
+                sock.bind((host, port))
         except OSError as exc:
             if exc.errno in {errno.EADDRINUSE, errno.EACCES}:
                 continue
@@ -216,19 +216,19 @@ def _end_lingering(ports: frozenset[int]) -> None:
         return  # Windows, where nothing waits
     for number in numbers:
         try:
-            found = socket.socket(fileno=number)
+            sock = socket.socket(fileno=number)
         except OSError:
             continue  # a file, or closed by now
         try:
-            if found.family in INTERNET and ports & {
-                found.getsockname()[1],
-                found.getpeername()[1],
+            if sock.family in INTERNET and ports & {
+                sock.getsockname()[1],
+                sock.getpeername()[1],
             }:
-                found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
         except OSError:
             pass  # the socket has no peer
         finally:
-            found.detach()
+            sock.detach()
 
 
 @functools.cache
@@ -271,9 +271,9 @@ class ZenohSession:
         self,
         link: BusLink,
         more: Mapping[str, Any] | None = None,
-        what: str = "the fleet's bus",
+        bus_text: str = "the fleet's bus",
     ) -> None:
-        self._link, self._more, self._what = link, dict(more or {}), what
+        self._link, self._more, self._what = link, dict(more or {}), bus_text
         self._zenoh = engine()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
@@ -382,7 +382,7 @@ class ZenohSession:
         session, self._session = self._session, None
         if session is not None:
             self._reopening = True
-            old = [one.lose() for one in tuple(self._declared)]
+            old = [declared.lose() for declared in tuple(self._declared)]
             closing = self._loop.run_in_executor(
                 None, _lose, session, old, self._link.mode != "client"
             )
@@ -392,10 +392,10 @@ class ZenohSession:
         if not self._reopening:
             raise ConfigurationError(f"{self._what} is not open")
         await self._open(timeout)
-        for number, one in enumerate(tuple(self._declared)):
+        for number, declared in enumerate(tuple(self._declared)):
             if number % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-            one.again()
+            declared.again()
         self._reopening = False
 
     def _end_lingering(self) -> None:
@@ -433,8 +433,8 @@ class ZenohSession:
             bell.close()
         if session is None:
             return
-        for one in tuple(self._declared):
-            one.close()
+        for declared in tuple(self._declared):
+            declared.close()
         closing = self._loop.run_in_executor(
             None, _end, session, self._threads(), self._link.mode != "client"
         )
@@ -563,15 +563,15 @@ class ZenohSession:
         with self._lock:
             self._replying -= 1
 
-    def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
+    def declare(self, declared: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; the declaration is closed with this session."""
         made = None if self._reopening else how(self.session)
-        self._declared[one] = None
+        self._declared[declared] = None
         return made
 
-    def forget(self, one: ZenohDeclared) -> None:
+    def forget(self, declared: ZenohDeclared) -> None:
         """Remove a closed end from those that the session closes."""
-        self._declared.pop(one, None)
+        self._declared.pop(declared, None)
 
     @property
     def session(self) -> Any:
@@ -671,10 +671,10 @@ class ZenohDeclared:
 
     def lose(self) -> Any:
         """Prepare for the end of the session; return the object to keep until then."""
-        it, self._it = self._it, None
+        declared, self._it = self._it, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
-        return None if self._by_dropping else it
+        return None if self._by_dropping else declared
 
     def again(self) -> None:
         """Declare the key again at the present session."""
@@ -691,9 +691,9 @@ class ZenohDeclared:
         if not self._closed:
             self._closed = True
             self._end.forget(self)
-            it, self._it = self._it, None
-            if not self._by_dropping and it is not None:
-                quietly(it.undeclare)
+            declared, self._it = self._it, None
+            if not self._by_dropping and declared is not None:
+                quietly(declared.undeclare)
 
 
 def _lose(session: Any, declared: list[Any], router: bool) -> None:
@@ -757,10 +757,10 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
     ``ended`` is called when no more calls will come.
     """
 
-    def called(it: Any) -> None:
+    def called(declaration: Any) -> None:
         if not _thread.known:
             keep_thread()
-        call(it)
+        call(declaration)
 
     return engine().handlers.Callback(called, ended, indirect=False)
 

@@ -261,7 +261,7 @@ class _EstimatedPose(Pose):
         return {**super()._asdict(), "sigma": self.sigma}
 
     def __repr__(self) -> str:
-        return f"Pose({', '.join(f'{name}={one!r}' for name, one in self._asdict().items())})"
+        return f"Pose({', '.join(f'{name}={value!r}' for name, value in self._asdict().items())})"
 
 
 class Localization(NamedTuple):

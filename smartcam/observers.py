@@ -162,9 +162,9 @@ class Observers:
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
         self._all = check_all(observers, "observers", "a list of observers")
-        for one in self._all:
-            if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
-                raise wrong_argument("observers", "objects of classes of Observer", one)
+        for observer in self._all:
+            if not all(callable(getattr(observer, hook, None)) for hook in _HOOKS):
+                raise wrong_argument("observers", "objects of classes of Observer", observer)
         self._on_state = self._overriding("on_state")
         self._on_result = tuple(self._looking_at("on_results", "on_result"))
         self._on_picture = self._overriding("on_picture")
@@ -223,12 +223,12 @@ class Observers:
         self, camera: str, error: SmartCamError, triggered_at: datetime | None = None
     ) -> None:
         """Report an error to all observers."""
-        for one in self._all:
-            self._call(one.on_error, camera, error, triggered_at)
+        for observer in self._all:
+            self._call(observer.on_error, camera, error, triggered_at)
 
     def _overriding(self, name: str) -> tuple[Callable[..., None], ...]:
         """Return this method of the observers that override it, in order."""
-        hooks = [_own_hook(one, name) for one in self._all]
+        hooks = [_own_hook(observer, name) for observer in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
     def _looking_at(self, first: str, other: str) -> Iterator[tuple[Callable[..., None], bool]]:
@@ -236,9 +236,11 @@ class Observers:
 
         The method that is overridden last counts; ``first`` if one class overrides both.
         """
-        for one in self._all:
-            hook, second = _own_hook(one, first), _own_hook(one, other)
-            if hook is None or (second is not None and _depth(one, other) < _depth(one, first)):
+        for observer in self._all:
+            hook, second = _own_hook(observer, first), _own_hook(observer, other)
+            if hook is None or (
+                second is not None and _depth(observer, other) < _depth(observer, first)
+            ):
                 if second is not None:
                     yield second, False
             else:

@@ -77,7 +77,7 @@ class Address(NamedTuple):
         user = query = ""
         if self.parameters or self.quirks:
             named = [quote(value, safe="") for key, value in self.parameters if key == USER]
-            user = "".join(f"{one}@" for one in named)
+            user = "".join(f"{part}@" for part in named)
             pairs = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
             query = urlencode(
                 [(key, value) for key, value in pairs if value and key not in {USER, PASSWORD}],
@@ -255,10 +255,10 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
                 return protocol, url
         schemes = [scheme for protocol in known_protocols() for scheme in protocol.schemes]
         if is_fleet(url):
-            own = " or ".join(f"{scheme}://" for scheme in schemes)
+            own_schemes = " or ".join(f"{scheme}://" for scheme in schemes)
             raise UnsupportedError(
                 f"{masked(url)} is of a fleet, whose agent has the session with the camera: this "
-                f"wants the camera's own address, which begins with {own}"
+                f"wants the camera's own address, which begins with {own_schemes}"
             )
         schemes += FLEET_SCHEMES
         known = ", ".join(f"{scheme}://" for scheme in schemes)
@@ -434,17 +434,18 @@ def with_ids(options: dict[str, Any]) -> dict[str, Any]:
     names = options.get("application_names")
     if not isinstance(names, Mapping) or not names:
         return options
-    found = dict(options)
-    if isinstance(found.get("application"), str):
-        found["application"] = id_of(found["application"], names)
+    options_by_id = dict(options)
+    if isinstance(options_by_id.get("application"), str):
+        options_by_id["application"] = id_of(options_by_id["application"], names)
     for option in ("interpret_as", "calibration"):
-        given: Any = found.get(option)
+        given: Any = options_by_id.get(option)
         if isinstance(given, Mapping):
             each: Mapping[Any, Any] = given
-            found[option] = {
-                id_of(key, names) if isinstance(key, str) else key: one for key, one in each.items()
+            options_by_id[option] = {
+                id_of(key, names) if isinstance(key, str) else key: value
+                for key, value in each.items()
             }
-    return found
+    return options_by_id
 
 
 def id_of(application: str, names: Mapping[str, int]) -> int:
@@ -461,11 +462,11 @@ def id_of(application: str, names: Mapping[str, int]) -> int:
     )
 
 
-def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
+def validated(kind: type[M], given: M | Mapping[str, Any], label: str) -> M:
     """Return ``given`` as a model; a mapping has its fields.
 
     Raises:
-        ConfigurationError: a field is wrong; the text begins with ``what`` and names the field.
+        ConfigurationError: a field is wrong; the text begins with ``label`` and names the field.
     """
     from pydantic import ValidationError
 
@@ -473,7 +474,7 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
         return kind.model_validate(dict(given) if isinstance(given, Mapping) else given)
     except ValidationError as exc:
         text = validation_text(exc, kind.model_fields)
-        raise ConfigurationError(f"{what}: {text}") from exc
+        raise ConfigurationError(f"{label}: {text}") from exc
 
 
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:

@@ -35,7 +35,7 @@ class Overflow(enum.Enum):
     items."""
 
 
-_OVERFLOWS = [one.value for one in Overflow]
+_OVERFLOWS = [overflow.value for overflow in Overflow]
 
 
 def _weightless(_item: object) -> int:
@@ -68,12 +68,12 @@ class Queue(Generic[T]):
         max_queue_bytes: int = sys.maxsize,
         size_of: Callable[[T], int] = _weightless,
     ) -> None:
-        who = f"{name}()"
+        caller = f"{name}()"
         self._name = name
-        self._max_queue = check_integer(max_queue, "max_queue", 1, who=who)
-        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, who=who)
-        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, who))
-        self._min_interval = check_seconds(min_interval, "min_interval", who)
+        self._max_queue = check_integer(max_queue, "max_queue", 1, caller=caller)
+        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, caller=caller)
+        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, caller))
+        self._min_interval = check_seconds(min_interval, "min_interval", caller)
         self._size_of = size_of
         self._items: collections.deque[T | SmartCamError] = collections.deque()
         self._ready = asyncio.Event()

@@ -84,19 +84,19 @@ class _Stamps:
             await asyncio.wait([self._task])
 
     async def _look(self, frame: Frame, now: float) -> None:
-        found = await asyncio.to_thread(_stamp_of, frame)
-        if found is not None and 0 <= now - found < MAX_LATENCY:
-            self.latencies.append(now - found)
+        stamp = await asyncio.to_thread(_stamp_of, frame)
+        if stamp is not None and 0 <= now - stamp < MAX_LATENCY:
+            self.latencies.append(now - stamp)
 
 
 def _stamp_of(frame: Frame) -> float | None:
     from smartcam.frames._inside import read_stamp
 
     try:
-        found = read_stamp(frame.grey()[:STAMP_ROWS])
+        stamp = read_stamp(frame.grey()[:STAMP_ROWS])
     except FrameSourceError:  # a frame without brightness, or wrong bytes: no stamp
         return None
-    return None if found is None else found[1] / 1e9
+    return None if stamp is None else stamp[1] / 1e9
 
 
 class _Taken:

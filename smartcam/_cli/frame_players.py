@@ -52,8 +52,8 @@ def address(_context: object, parameter: click.Parameter, text: str | None) -> A
     host, colon, port = text.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     plain = host[1:-1] if bracketed else host
-    whole = colon and plain and (bracketed or ":" not in host)
-    if not (whole and re.fullmatch(r"[0-9]{1,5}", port) and int(port) <= 65535):
+    is_full = colon and plain and (bracketed or ":" not in host)
+    if not (is_full and re.fullmatch(r"[0-9]{1,5}", port) and int(port) <= 65535):
         raise click.BadParameter(
             f"{text!r}: expected HOST:PORT, such as 127.0.0.1:8554 or [::1]:8554", param=parameter
         )
@@ -99,8 +99,10 @@ def rtsp_urls(
     server: RtspServer, sources: Sequence[FrameSource], password: str | None
 ) -> dict[str, str]:
     """Return the URLs for players, by name."""
-    who = "" if password is None else f"{RTSP_USER}:{password}@"
-    return {name: server.url(name).replace("//", f"//{who}", 1) for name in names_of(sources)}
+    credentials = "" if password is None else f"{RTSP_USER}:{password}@"
+    return {
+        name: server.url(name).replace("//", f"//{credentials}", 1) for name in names_of(sources)
+    }
 
 
 # ---------------------------------------------------------------------- RTP

@@ -212,7 +212,7 @@ class _Tries:
         return tried
 
     def _all_for_good(self) -> bool:
-        wrong = [isinstance(one, PERMANENT_ERRORS) for one in self._first.values()]
+        wrong = [isinstance(error, PERMANENT_ERRORS) for error in self._first.values()]
         return len(wrong) == self._count and all(wrong)
 
     async def check(self) -> None:
@@ -249,8 +249,8 @@ def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
     played = {} if server is None else server.statistics()
     rows: list[str] = []
     for place, (name, source) in enumerate(names_of(site.sources).items()):
-        who = sorted(viewer.address for viewer in site.viewers if viewer.place == place)
+        addresses = sorted(viewer.address for viewer in site.viewers if viewer.place == place)
         by_rtsp = played[name].viewers if name in played else 0
-        who += [f"{by_rtsp} by RTSP"] if by_rtsp else []
-        rows += [f"{source.name}: {', '.join(who)}"] if who else []
+        addresses += [f"{by_rtsp} by RTSP"] if by_rtsp else []
+        rows += [f"{source.name}: {', '.join(addresses)}"] if addresses else []
     return "; ".join(rows) or "nobody looks"

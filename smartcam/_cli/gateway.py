@@ -147,7 +147,7 @@ def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> Gat
         return file.settings(**given)
     except ValidationError as exc:
         (first, *_) = exc.errors()
-        where = "".join(f"--{one}: " for one in first["loc"][:1]).replace("_", "-")
+        where = "".join(f"--{option}: " for option in first["loc"][:1]).replace("_", "-")
         raise ConfigurationError(where + first["msg"].removeprefix("Value error, ")) from exc
 
 
@@ -176,13 +176,13 @@ async def _emulated(options: Options) -> AsyncIterator[str]:
 
 def _tell_account(server: Gateway, options: Options) -> None:
     """Print the account of all requests and parts."""
-    found = server.account
+    account = server.account
     if options.as_json:
-        options.show({"account": dataclasses.asdict(found)}, "")
+        options.show({"account": dataclasses.asdict(account)}, "")
         return
     click.echo(
-        f"requests {found.requests} = answered {found.answered} + errors {found.errors} + "
-        f"abandoned {found.abandoned} + open {found.open}; parts {found.parts} = delivered "
-        f"{found.delivered} + forgotten {found.forgotten} + waiting {found.waiting}",
+        f"requests {account.requests} = answered {account.answered} + errors {account.errors} + "
+        f"abandoned {account.abandoned} + open {account.open}; parts {account.parts} = delivered "
+        f"{account.delivered} + forgotten {account.forgotten} + waiting {account.waiting}",
         err=True,
     )

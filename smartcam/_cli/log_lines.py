@@ -72,8 +72,14 @@ class JsonLines(logging.Formatter):
             return camera
         cameras = self._cameras()
         given = record.args if isinstance(record.args, tuple) else ()
-        for one in given[:2]:
-            name = one if isinstance(one, str) else str(one) if isinstance(one, Exception) else ""
+        for argument in given[:2]:
+            name = (
+                argument
+                if isinstance(argument, str)
+                else str(argument)
+                if isinstance(argument, Exception)
+                else ""
+            )
             for part in (name, name.partition(": ")[0]):
                 if part and part in cameras:
                     return part
@@ -168,8 +174,8 @@ def json_log(
     handlers, before = root.handlers[:], root.level
     handler = LineHandler(descriptor, most)
     handler.setFormatter(JsonLines(agent, cameras))
-    for one in handlers:
-        root.removeHandler(one)
+    for old_handler in handlers:
+        root.removeHandler(old_handler)
     root.addHandler(handler)
     root.setLevel(level)
     logging.captureWarnings(True)
@@ -179,6 +185,6 @@ def json_log(
         logging.captureWarnings(False)
         root.removeHandler(handler)
         root.setLevel(before)
-        for one in handlers:
-            root.addHandler(one)
+        for old_handler in handlers:
+            root.addHandler(old_handler)
         handler.close()

@@ -41,10 +41,10 @@ async def outlet(url: str, file: str, options: Options) -> None:
     from smartcam._cli.live import have_open
     from smartcam.outlets import Outlets, OutletsFile
 
-    found = OutletsFile.load(file)
+    outlets_file = OutletsFile.load(file)
     source = _OutletSource(options)
     outlets = Outlets(
-        found.outlets,
+        outlets_file.outlets,
         Path(file).parent,
         columns=source.columns,
         command=source.command,

@@ -57,8 +57,8 @@ async def results(
     from smartcam.outlets import StoreQuestion
     from smartcam.outlets._inside import read_store
 
-    found = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
-    _show(found.rows, found.summary, "", options)
+    stored = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
+    _show(stored.rows, stored.summary, "", options)
 
 
 async def _ask(

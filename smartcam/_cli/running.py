@@ -168,8 +168,8 @@ async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.S
 
     def on_signal(number: signal.Signals) -> None:
         ended_by.append(number)
-        for one in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(one)
+        for signal_number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(signal_number)
         if task is not None:
             task.cancel()
 

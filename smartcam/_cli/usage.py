@@ -85,10 +85,10 @@ MAX_SUMMARY_CHARACTERS = 400
 
 def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:
     """Write the commands of a group with their whole summaries, without hidden ones."""
-    found = [(name, group.commands[name]) for name in group.list_commands(ctx)]
+    commands = [(name, group.commands[name]) for name in group.list_commands(ctx)]
     rows = [
         (name, command.get_short_help_str(MAX_SUMMARY_CHARACTERS))
-        for name, command in found
+        for name, command in commands
         if not command.hidden
     ]
     with formatter.section("Commands"):

@@ -204,11 +204,11 @@ class CommandLock:
             return None
         return self._start_job("going_back", self._go_back(before))
 
-    def _start_job(self, what: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
+    def _start_job(self, label: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
         if self._jobs is None:
             job.close()
             return None
-        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{what}")
+        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{label}")
         self._leaving.add(task)
         task.add_done_callback(self._leaving.discard)
         return task

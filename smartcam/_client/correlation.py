@@ -290,9 +290,9 @@ class Correlation:
         self._complete = complete
         self.satisfied = self.doubted = False
         self._last = None
-        for one in self.owed:  # the report of its beginning may have been lost
-            one.evidence = TriggerEvidence()
-            one.evidence.began = 1
+        for owed in self.owed:  # the report of its beginning may have been lost
+            owed.evidence = TriggerEvidence()
+            owed.evidence.began = 1
 
     def settled(self) -> None:
         """Note that no older result can come, since the application was stopped."""
@@ -307,7 +307,7 @@ class Correlation:
         """
         self.doubted = False
         if self._complete:
-            self.owed = [one for one in self.owed if one.evidence.began]
+            self.owed = [owed for owed in self.owed if owed.evidence.began]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
@@ -418,10 +418,10 @@ class Correlation:
         self._given = None  # that run uses it
         return self._complete and previous is not None
 
-    def judge_marked(self, asked: bool) -> Match:
+    def judge_marked(self, is_ours: bool) -> Match:
         """Return the trigger of a container if the wire shows whether it answers this client."""
         pending = self.pending
-        if not asked:
+        if not is_ours:
             return NOBODYS
         if pending is not None and not pending.ended:
             return OURS if pending.received < pending.wanted else EXTRA
@@ -447,16 +447,16 @@ class Correlation:
     def judge_older(self, number: int | None) -> Match:
         """Return the trigger of a container that does not belong to the trigger under way."""
         if number is not None and number in self._given_up:
-            self._pay([one for one in self.owed if one.number == number])
+            self._pay([owed for owed in self.owed if owed.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
             return EXTRA
         # an unknown number may be that of a trigger that was sent without a number
         if self.owed:
             open_ = [
-                one
-                for one in self.owed
-                if (number is None or one.number is None) and self._may_pay(one.evidence)
+                owed
+                for owed in self.owed
+                if (number is None or owed.number is None) and self._may_pay(owed.evidence)
             ]
             if open_:
                 return Match(self._pay(open_))

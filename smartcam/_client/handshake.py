@@ -373,7 +373,9 @@ async def establish(
         f"{settings.name}: no session with {address.url}: {why}",
         host=address.host,
         port=address.port,
-        attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
+        attempts=tuple(
+            f"attempt {number}: {attempt_made}" for number, attempt_made in enumerate(tries, 1)
+        ),
     ) from cause
 
 

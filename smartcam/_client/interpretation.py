@@ -115,21 +115,21 @@ class Interpretation:
         self._one: _ApplicationReader | None = None
         self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
-            for application, one in spec.items():
+            for application, interpreter in spec.items():
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{shown(application)} is no id"
                     )
-                self._by_application[application] = _way(resolve(one, lenient=lenient), own)
+                self._by_application[application] = _way(resolve(interpreter, lenient=lenient), own)
         else:
             self._one = _raw(own) if spec is None else _way(resolve(spec, lenient=lenient), own)
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
             if self._one is not None:
                 self._calibrations.check(None, self._one.interpreter)
-            for application, way in self._by_application.items():
-                self._calibrations.check(application, way.interpreter)
+            for application, reader in self._by_application.items():
+                self._calibrations.check(application, reader.interpreter)
         self.by_application: bool = self._one is None
 
     @property
@@ -144,28 +144,28 @@ class Interpretation:
 
     def interpreter(self, application: int | None) -> Interpreter | None:
         """Return the interpreter of an application; None for one that is not known."""
-        way = self._way(application)
-        return None if way is None else way.interpreter
+        reader = self._way(application)
+        return None if reader is None else reader.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return the place of the number in this application's containers, None without one."""
-        way = self._one or self._way(application)
-        return way.numbering if way is not None else None
+        reader = self._one or self._way(application)
+        return reader.numbering if reader is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
         """Return the layouts with a number in them, in the form of ``interpret_as``."""
         if self._one is not None:
             return _numbered(self._one)
-        texts = {key: _numbered(way) for key, way in self._by_application.items()}
+        texts = {key: _numbered(reader) for key, reader in self._by_application.items()}
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number, None if it has none or does not fit."""
-        way = self._way(container.application)
-        if way is None or way.interpreter.layout is None:
+        reader = self._way(container.application)
+        if reader is None or reader.interpreter.layout is None:
             return None
         try:
-            return way.interpreter.layout.sequence(container.data, byte_order(endian))
+            return reader.interpreter.layout.sequence(container.data, byte_order(endian))
         except InterpretationError:
             return None
 
@@ -175,15 +175,15 @@ class Interpretation:
         return self._by_application.get(application)
 
     def _known(self, application: int) -> _ApplicationReader:
-        way = self._way(application)
-        if way is None:
+        reader = self._way(application)
+        if reader is None:
             known = sorted(self._by_application)
             raise WrongApplicationError(
                 f"a result of application {application} came; interpret_as knows {known}",
                 expected=known,
                 got=application,
             )
-        return way
+        return reader
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
@@ -195,15 +195,15 @@ class Interpretation:
                 value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        way = self._one or self._known(container.application)
-        interpreter, simple = way.interpreter, way.simple
+        reader_of_application = self._one or self._known(container.application)
+        interpreter, simple = reader_of_application.interpreter, reader_of_application.simple
         data = container.data
         if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
-        if simple is not None and not way.sequenced:
+        if simple is not None and not reader_of_application.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
-            if self._calibrations is not None and way.calibrated:
+            if self._calibrations is not None and reader_of_application.calibrated:
                 value = self._calibrations.apply(value, container.application)
             return value, None, context.empty_slots
         order = byte_order(endian)
@@ -212,9 +212,9 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
-        if self._calibrations is not None and way.calibrated:
+        if self._calibrations is not None and reader_of_application.calibrated:
             value = self._calibrations.apply(value, container.application)
-        sequence = run_sequence(interpreter, reader) if way.sequenced else None
+        sequence = run_sequence(interpreter, reader) if reader_of_application.sequenced else None
         return value, sequence, context.empty_slots
 
     def _context(
@@ -244,14 +244,19 @@ class Interpretation:
         None if they are to be interpreted one by one: the interpreter uses a Reader, a sequence
         number must be read, or one container does not fit.
         """
-        way = self._way(application)
-        if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
+        reader = self._way(application)
+        if (
+            reader is None
+            or reader.simple is None
+            or reader.sequenced
+            or endian not in _BYTE_ORDERS
+        ):
             return None
         context = self._context(application, endian, camera, number, at)
         try:
-            values = way.simple.read_all(payloads, context)
+            values = reader.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None and way.calibrated:
+            if self._calibrations is not None and reader.calibrated:
                 # each alone, so that its bits do not depend on the way it came
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
@@ -280,9 +285,11 @@ class _Calibrations:
             self._one = _calibration(given, y_down)
             return
         self._by_application = {}
-        for application, one in given.items():
+        for application, calibration in given.items():
             number = check_application(application, "calibration: application")
-            self._by_application[number] = None if one is None else _calibration(one, y_down)
+            self._by_application[number] = (
+                None if calibration is None else _calibration(calibration, y_down)
+            )
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
         """Raise if no value of an interpreter would ever pass.
@@ -331,7 +338,7 @@ class _Calibrations:
                 got=type(value).__name__,
             )
         try:
-            found: object = calibration.to_robot(parts)
+            transformed: object = calibration.to_robot(parts)
         except CalibrationError as exc:
             raise InterpretationError(
                 f"calibration: {exc}", expected=exc.expected, got=exc.got
@@ -341,13 +348,14 @@ class _Calibrations:
         except BaseException as exc:
             text = text_of(exc)
             raise InterpretationError(f"the calibration failed with {text}", got=text) from exc
-        made = localizations_of(found)
+        made = localizations_of(transformed)
         if made is None or len(made) != len(parts):
-            got = type(found).__name__ if made is None else len(made)
+            actual = type(transformed).__name__ if made is None else len(made)
             raise InterpretationError(
-                f"calibration: expected to_robot to return {len(parts)} localizations, got {got}",
+                f"calibration: expected to_robot to return {len(parts)} localizations, "
+                f"got {actual}",
                 expected=len(parts),
-                got=got,
+                got=actual,
             )
         return made
 
@@ -400,8 +408,8 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 def without_poses(interpreter: Interpreter) -> str | None:
     """Return an interpreter's name if it is in ``_WITHOUT_POSES``; a subclass does not count."""
     # exactly these types: a user's subclass may give anything
-    found = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
-    return next(found, None)
+    names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
+    return next(names, None)
 
 
 def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
@@ -453,9 +461,9 @@ def _raw(own: bool) -> _ApplicationReader:
     return _way(resolve(None), own)
 
 
-def _numbered(way: _ApplicationReader) -> str | None:
-    layout = way.interpreter.layout
-    return None if way.numbering is None or layout is None else layout.text
+def _numbered(reader: _ApplicationReader) -> str | None:
+    layout = reader.interpreter.layout
+    return None if reader.numbering is None or layout is None else layout.text
 
 
 def _way(interpreter: Interpreter, own: bool) -> _ApplicationReader:

@@ -229,9 +229,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             await self._doorbell
         chunk = self._chunks.popleft()
         if chunk.frames > self._most:
-            chunk, rest = split(chunk, self._most)
-            if rest.events:
-                self._chunks.appendleft(rest)
+            chunk, remainder = split(chunk, self._most)
+            if remainder.events:
+                self._chunks.appendleft(remainder)
         if chunk.frames >= MIN_FRAMES_PER_CHUNK and (
             self._chunks or chunk.frames > MIN_FRAMES_PER_CHUNK
         ):
@@ -462,9 +462,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def _show_rest(self) -> None:
         show, self.on_rest = self.on_rest, None
-        rest = self.machine.pending if show is not None else b""
-        if show is not None and rest:
-            show(rest)
+        pending = self.machine.pending if show is not None else b""
+        if show is not None and pending:
+            show(pending)
 
     def _lose(self, reason: BaseException) -> None:
         if self._loss is None:
@@ -488,23 +488,23 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
             frames += 1
         others = Chunk(at, events[frames:], chunk.frames - frames, chunk.delivery)
         return Chunk(at, events[:frames], frames, chunk.delivery), others
-    some: list[Event] = []
-    left, rest = frames, collections.deque(events)
-    while left > 0 and rest:
-        event = rest.popleft()
+    known_events: list[Event] = []
+    left, events_left = frames, collections.deque(events)
+    while left > 0 and events_left:
+        event = events_left.popleft()
         if type(event) is ResultBurst:
             if len(event.data) > left:
                 event, behind = event.cut(left)
-                rest.appendleft(behind)
+                events_left.appendleft(behind)
             left -= len(event.data)
         else:
             left -= 1
-        some.append(event)
-    while some and rest and type(some[-1]) is TriggerAnswer:
-        some.append(rest.popleft())
+        known_events.append(event)
+    while known_events and events_left and type(known_events[-1]) is TriggerAnswer:
+        known_events.append(events_left.popleft())
     taken = frames - left
-    first = replace(chunk, events=some, frames=taken)
-    return first, replace(chunk, events=list(rest), frames=chunk.frames - taken)
+    first = replace(chunk, events=known_events, frames=taken)
+    return first, replace(chunk, events=list(events_left), frames=chunk.frames - taken)
 
 
 async def open_link(

@@ -354,8 +354,10 @@ class Results:
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        asked = container.asked
-        match = correlation.judge(number) if asked is None else correlation.judge_marked(asked)
+        requested = container.asked
+        match = (
+            correlation.judge(number) if requested is None else correlation.judge_marked(requested)
+        )
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:
@@ -382,10 +384,10 @@ class Results:
         counters, listeners = self._counters, self._listeners
         current = fate in _CURRENT
         if owner is None:
-            heard = listeners.hears_results
+            has_listeners = listeners.hears_results
             if fate == "nobody":
-                fate = "streamed" if heard else "unclaimed"
-            if not heard:
+                fate = "streamed" if has_listeners else "unclaimed"
+            if not has_listeners:
                 counters.count(fate)
                 return
         name, own_number = self._name, counters.received + 1

@@ -382,7 +382,9 @@ class Supervisor:
         )
         self._wake_waiters()
 
-    async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
+    async def _retry_taken(
+        self, taken: ConnectionTakenError, notify: Callable[[], None]
+    ) -> Session:
         """Make a new session after a long pause, or as soon as the camera is to be taken back.
 
         Raises:
@@ -392,7 +394,7 @@ class Supervisor:
         self._waits.end = taken
         self._times_taken += 1
         self._take_back.clear()
-        tell()
+        notify()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._take_back.wait()
@@ -430,12 +432,12 @@ class Supervisor:
 
     def _taken(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
-        what = f"stopped, so as not to fight for it ({error})"
+        outcome = f"stopped, so as not to fight for it ({error})"
         if self.on_taken is not None:
-            what = f"it is tried again in {self._pause_of_taken:.0f} s ({error})"
+            outcome = f"it is tried again in {self._pause_of_taken:.0f} s ({error})"
         taken = ConnectionTakenError(
             f"{self._name}: lost again right after a reconnect: another client has the "
-            f"camera, which serves one; {what}",
+            f"camera, which serves one; {outcome}",
             host=address.host,
             port=address.port,
         )

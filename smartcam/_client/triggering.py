@@ -382,9 +382,9 @@ class Triggers:
         certain = self._connection.features.ordered or pending.evidence.began
         self._doubtful = None if certain else link
         waited = max(0.0, deadline - pending.sent_at)
-        came = f"{len(pending.results)} of {pending.wanted} results"
+        arrived = f"{len(pending.results)} of {pending.wanted} results"
         return TriggerTimeoutError(
-            f"{self._name}: {came if pending.results else 'no result'} within "
+            f"{self._name}: {arrived if pending.results else 'no result'} within "
             f"{shown_time(waited)} of the trigger; status: {self._status.last}"
             f"{_what_is_missing(pending)}",
             waited=waited,
@@ -395,9 +395,9 @@ class Triggers:
     ) -> list[m.Message]:
         """Return the messages of a trigger; its input is sent now if it is answered."""
         requests, features = self._requests, self._connection.features
-        asked = features.fences and features.polled and features.shows_triggers
+        has_evidence = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []
-        if asked:
+        if has_evidence:
             words.append(_GET_STATUS)
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
@@ -409,7 +409,7 @@ class Triggers:
             words.append(m.SetInput(data=input_data))
         words.append(_TRIGGER)
         if features.fences and features.shows_triggers:
-            words.append(_GET_STATUS if asked else _QUERY)
+            words.append(_GET_STATUS if has_evidence else _QUERY)
         return words
 
     def _end_reading(self, link: Link) -> None:
@@ -421,13 +421,15 @@ class Triggers:
         """End the trigger at once if the camera reports that it took none."""
 
         def on_answer(answer: asyncio.Future[Answer]) -> None:
-            got = answer.result()
-            if isinstance(got, SmartCamError) or pending.outcome.done():
+            answer_message = answer.result()
+            if isinstance(answer_message, SmartCamError) or pending.outcome.done():
                 return
             try:
-                self._requests.check(m.Trigger, got)
+                self._requests.check(m.Trigger, answer_message)
             except (CommandRejectedError, UnsupportedError) as exc:
-                busy = isinstance(got, m.Acknowledgement) and self._requests.is_busy(got)
+                busy = isinstance(answer_message, m.Acknowledgement) and self._requests.is_busy(
+                    answer_message
+                )
                 if not self._connection.features.ordered:  # perhaps an earlier trigger's answer
                     self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
@@ -571,8 +573,8 @@ def _what_is_missing(pending: PendingTrigger) -> str:
     """Return the part of an error text on the camera's missing messages about the trigger."""
     evidence, early = pending.evidence, ""
     if pending.early:
-        what = "1 result" if pending.early == 1 else f"{pending.early} results"
-        early = f"; {what} came before the camera had shown that it took the trigger"
+        missing = "1 result" if pending.early == 1 else f"{pending.early} results"
+        early = f"; {missing} came before the camera had shown that it took the trigger"
     if not evidence.reached:
         return f"; the camera has not shown that it took the trigger{early}{_HINT if early else ''}"
     if not evidence.proven:

@@ -68,7 +68,7 @@ def add_options(parser: Any) -> None:
 
 def terminal_summary(reporter: Any) -> None:
     """Write the findings about clients into pytest's report, if there are any."""
-    found = [
+    findings = [
         value
         for reports in reporter.stats.values()
         for report in reports
@@ -76,7 +76,7 @@ def terminal_summary(reporter: Any) -> None:
         for name, value in report.user_properties
         if name == PROPERTY
     ]
-    if found:
+    if findings:
         from smartcam.conformance.client._report import ClientFinding, write_findings
 
-        write_findings(reporter, [ClientFinding.from_json(value) for value in found])
+        write_findings(reporter, [ClientFinding.from_json(value) for value in findings])

@@ -121,13 +121,13 @@ class Cloud:
         parts = list(clouds)
         columns: dict[str, NDArray[Any] | None] = {}
         for name in ("colours", "sigma"):
-            found = [part for one in parts if (part := getattr(one, name)) is not None]
-            if found and len(found) < len(parts):
+            arrays = [part for cloud in parts if (part := getattr(cloud, name)) is not None]
+            if arrays and len(arrays) < len(parts):
                 raise ConfigurationError(
                     f"joined: expected all clouds with {name} or none, "
-                    f"got {len(found)} of {len(parts)}"
+                    f"got {len(arrays)} of {len(parts)}"
                 )
-            columns[name] = np.concatenate(found) if found else None
+            columns[name] = np.concatenate(arrays) if arrays else None
         points = [np.empty((0, 3), np.float32), *(part.points for part in parts)]
         return cls(np.concatenate(points), **columns)
 
@@ -166,10 +166,10 @@ def _as(values: NDArray[Any]) -> NDArray[np.float32]:
 
 def _shape(values: NDArray[Any], what: str, shape: tuple[int | None, ...]) -> None:
     fits = len(values.shape) == len(shape) and all(
-        want is None or got == want for got, want in zip(values.shape, shape, strict=True)
+        want is None or count == want for count, want in zip(values.shape, shape, strict=True)
     )
     if not fits:
-        wanted = ", ".join("any" if one is None else str(one) for one in shape)
+        wanted = ", ".join("any" if count is None else str(count) for count in shape)
         raise ConfigurationError(f"{what}: expected the shape ({wanted}), got {values.shape}")
 
 

@@ -53,7 +53,7 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     Raises:
         ConfigurationError: the corners are not (3,), or one is not below the other.
     """
-    corners = [np.asarray(one, np.float64) for one in (low, high)]
+    corners = [np.asarray(corner, np.float64) for corner in (low, high)]
     if any(corner.shape != (3,) for corner in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
     ends = _as_float32(corners)
@@ -112,12 +112,12 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     if len(cloud) <= neighbours:
         return cloud.taken(np.zeros(len(cloud), bool))
     tree = load("scipy.spatial").cKDTree(cloud.points)
-    kept = np.empty(len(cloud), bool)
+    mask = np.empty(len(cloud), bool)
     for part in _parts(len(cloud)):
         # It is enough to know the distance to the last of the required neighbours.
         distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
-        kept[part] = distances[:, 0] <= radius
-    return cloud.taken(kept)
+        mask[part] = distances[:, 0] <= radius
+    return cloud.taken(mask)
 
 
 @takes(cloud=of_class("Cloud"), size=a_number)
@@ -145,7 +145,7 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
         return sums / counts
 
     def columns(values: NDArray[Any]) -> NDArray[np.float64]:
-        return np.stack([means(one) for one in values.T], axis=1)
+        return np.stack([means(column) for column in values.T], axis=1)
 
     colours = cloud.colours
     return Cloud(

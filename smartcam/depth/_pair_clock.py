@@ -51,7 +51,7 @@ class PairClock:
         recent = list(self._seen)[-SKEW_PAIRS:]
         if not recent:
             return None
-        return statistics.median(one.captured[1] - one.captured[0] for one in recent)
+        return statistics.median(pair.captured[1] - pair.captured[0] for pair in recent)
 
     def drift(self, clocks: Sequence[ClockStatistics | None]) -> tuple[float | None, str]:
         """Return the right clock's drift against the left clock, and the source of this value.
@@ -73,9 +73,9 @@ class PairClock:
         seen = list(self._seen)
         if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None
-        found = []
+        rates = []
         for side in (0, 1):
-            at = np.array([one.captured[side] - seen[0].captured[side] for one in seen])
-            number = np.array([one.sequence[side] - seen[0].sequence[side] for one in seen])
-            found.append(float(np.polyfit(at, number, 1)[0]))
-        return (found[0], found[1]) if min(found) > 0 else None
+            at = np.array([pair.captured[side] - seen[0].captured[side] for pair in seen])
+            number = np.array([pair.sequence[side] - seen[0].sequence[side] for pair in seen])
+            rates.append(float(np.polyfit(at, number, 1)[0]))
+        return (rates[0], rates[1]) if min(rates) > 0 else None

@@ -100,10 +100,10 @@ def _header(data: bytes) -> _PcdHeader:
         raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
     types = []
     for kind, size in zip(kinds, sizes, strict=True):
-        found = TYPES.get((kind, count_of(size, "bytes")))
-        if found is None:
+        number_type = TYPES.get((kind, count_of(size, "bytes")))
+        if number_type is None:
             raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
-        types.append(found)
+        types.append(number_type)
     width, height, points = (_one(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
         raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
@@ -146,11 +146,11 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
         raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
-    packed, whole = struct.unpack_from("<II", data, head.start)
-    if whole != size or packed > len(data) - head.start - 8:
+    packed, unpacked_size = struct.unpack_from("<II", data, head.start)
+    if unpacked_size != size or packed > len(data) - head.start - 8:
         raise BadTableError(
             f"up to {len(data) - head.start - 8} bytes that unpack to {size}",
-            f"{packed} that unpack to {whole}",
+            f"{packed} that unpack to {unpacked_size}",
         )
     columns, place = {}, 0
     body = unpacked(data[head.start + 8 : head.start + 8 + packed], size)

@@ -123,7 +123,7 @@ def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
     with from_part("fleet", "an examination of a camera of a fleet needs"):
         from smartcam.doctor import _fleet_checks as checks
 
-    found = (
+    steps = (
         _NAME,
         _DoctorCheck("bus", checks.reach, _switch, in_session=False),
         _DoctorCheck(
@@ -132,7 +132,7 @@ def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
         _DoctorCheck("session", checks.connect, _switch, in_session=False),
         _DoctorCheck("reservation", checks.reserve, _once),
     )
-    return found, checks.address_of(url)
+    return steps, checks.address_of(url)
 
 
 _CHECKS = (
@@ -193,7 +193,7 @@ async def examine(
     loaded again. The same happens when the generator is closed: use :func:`contextlib.aclosing`.
     """
     if application is not None:
-        application = check_application(application, who="doctor")
+        application = check_application(application, caller="doctor")
     gige = _is_gige(url)
     if gige and (trigger or application is not None or interpret_as is not None):
         raise ConfigurationError(
@@ -228,13 +228,13 @@ async def examine(
         count=count,
     )
     fleet = is_fleet(url)
-    way, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
+    steps, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # checks the options
     alone = not fleet and serves_one(load_protocol(address.protocol))
     yield SHARED if fleet else NOTICE if alone else SEVERAL
     async with exam.stack, exam.borrowed:
-        for check in (*way, *_CHECKS):
+        for check in (*steps, *_CHECKS):
             goes_on = await _run(check, exam)
             for finding in exam.take():
                 yield finding
@@ -253,7 +253,10 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         async with asyncio.timeout(limit):
             await check.run(exam)
             if not check.in_session:
-                return not any(one.exit_code for one in exam.pending) or exam.camera is not None
+                return (
+                    not any(finding.exit_code for finding in exam.pending)
+                    or exam.camera is not None
+                )
             if not exam.connected_camera.connected and check.name != "clock":
                 await exam.connected_camera.query_application()  # raises the reason
     except LinkError as exc:

@@ -76,7 +76,7 @@ class FoundPort:
 
 def tcp_protocols() -> dict[str, Protocol]:
     """Return the protocols over TCP, by name; those that cannot be loaded are left out."""
-    found: dict[str, Protocol] = {}
+    protocols: dict[str, Protocol] = {}
     for info in PROTOCOLS.available():
         try:
             protocol = PROTOCOLS.load(info.name)
@@ -85,8 +85,8 @@ def tcp_protocols() -> dict[str, Protocol]:
                 raise
             continue  # a broken plug-in is left out
         if isinstance(protocol, Protocol) and Transport.TCP in protocol.schemes.values():
-            found[info.name] = protocol
-    return found
+            protocols[info.name] = protocol
+    return protocols
 
 
 def ports_of(
@@ -101,7 +101,7 @@ def ports_of(
     chosen = [*known]
     if names is not None:
         given = check_all(names, "protocols", "names of protocols", "find")
-        chosen = [*dict.fromkeys(check_text(one, "protocol", "find") for one in given)]
+        chosen = [*dict.fromkeys(check_text(name, "protocol", "find") for name in given)]
     for name in chosen:
         if name not in known:
             raise ConfigurationError(
@@ -110,17 +110,22 @@ def ports_of(
             )
     if not chosen:
         raise ConfigurationError("find: no protocol is named")
-    found: dict[int, tuple[Protocol, ...]] = {}
+    protocols_of_port: dict[int, tuple[Protocol, ...]] = {}
     for name in chosen:
         port = known[name].default_port
-        found[port] = (*found.get(port, ()), known[name])
-    for one in check_all(further, "ports", "numbers of ports", "find"):
-        port = check_integer(one, "port", 1, 0xFFFF, "find")
-        own = found.get(port, ())
-        found[port] = (*own, *(known[name] for name in chosen if known[name] not in own))
-    if len(found) > MAX_PORTS:
-        raise ConfigurationError(f"find: {len(found)} ports: expected {MAX_PORTS} at most")
-    return found
+        protocols_of_port[port] = (*protocols_of_port.get(port, ()), known[name])
+    for number in check_all(further, "ports", "numbers of ports", "find"):
+        port = check_integer(number, "port", 1, 0xFFFF, "find")
+        protocols_here = protocols_of_port.get(port, ())
+        protocols_of_port[port] = (
+            *protocols_here,
+            *(known[name] for name in chosen if known[name] not in protocols_here),
+        )
+    if len(protocols_of_port) > MAX_PORTS:
+        raise ConfigurationError(
+            f"find: {len(protocols_of_port)} ports: expected {MAX_PORTS} at most"
+        )
+    return protocols_of_port
 
 
 def serves_one(protocol: Protocol) -> bool:
@@ -134,7 +139,14 @@ def _scheme(protocol: Protocol) -> str:
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
     """Raise ConfigurationError if asking at these ports may take a camera from its client."""
-    names = sorted({one.name for several in ports.values() for one in several if serves_one(one)})
+    names = sorted(
+        {
+            protocol.name
+            for several in ports.values()
+            for protocol in several
+            if serves_one(protocol)
+        }
+    )
     if names:
         raise ConfigurationError(
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
@@ -168,7 +180,7 @@ def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, 
     return FoundPort(
         host=host,
         port=port,
-        protocols=tuple(one.name for one in possible),
+        protocols=tuple(protocol.name for protocol in possible),
         evidence=evidence,
         said=opened.received,
         seconds=opened.seconds,

@@ -106,8 +106,8 @@ def ways(address: Address) -> list[Way]:
     its protocol fails to load.
     """
     protocol, parameters = load_protocol(address.protocol), dict(address.parameters)
-    found: list[Way] = []
-    for scheme in sorted(protocol.schemes, key=lambda one: one != address.scheme):
+    ways_found: list[Way] = []
+    for scheme in sorted(protocol.schemes, key=lambda scheme: scheme != address.scheme):
         transport = protocol.schemes[scheme]
         groups = protocol.tries(transport, parameters=parameters)
         if address.dialect is not None:
@@ -115,8 +115,8 @@ def ways(address: Address) -> list[Way]:
             others = [tuple(d for d in group if d.name != address.dialect) for group in groups]
             groups = pinned + [group for group in others if group]
         at = address._replace(scheme=scheme)
-        found += [Way(at, transport, group) for group in groups]
-    return found
+        ways_found += [Way(at, transport, group) for group in groups]
+    return ways_found
 
 
 def other_ways(address: Address) -> list[Way]:
@@ -124,18 +124,18 @@ def other_ways(address: Address) -> list[Way]:
 
     They use the address's port; if that is its protocol's default, each uses its own default.
     """
-    own = load_protocol(address.protocol)
-    found: list[Way] = []
+    own_protocol = load_protocol(address.protocol)
+    ways_found: list[Way] = []
     for protocol in known_protocols():
-        if protocol.name == own.name:
+        if protocol.name == own_protocol.name:
             continue
-        port = protocol.default_port if address.port == own.default_port else address.port
+        port = protocol.default_port if address.port == own_protocol.default_port else address.port
         scheme = next(iter(protocol.schemes))
         try:
-            found += ways(Address(protocol.name, scheme, address.host, port))
+            ways_found += ways(Address(protocol.name, scheme, address.host, port))
         except ConfigurationError:  # it needs more than the URL has, such as a login
             continue
-    return found
+    return ways_found
 
 
 async def trials(
@@ -157,11 +157,13 @@ async def trials(
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
-    found = ways(address)
+    ways_found = ways(address)
     if every_protocol:
-        first = found[0].transport
-        found = sorted([*found, *other_ways(address)], key=lambda way: way.transport is not first)
-    left = collections.deque((way, True) for way in found)
+        first = ways_found[0].transport
+        ways_found = sorted(
+            [*ways_found, *other_ways(address)], key=lambda way: way.transport is not first
+        )
+    left = collections.deque((way, True) for way in ways_found)
     while left:
         way, disconnect_first = left.popleft()
         share = max(0.0, deadline - loop.time()) / (len(left) + 1)
@@ -191,8 +193,8 @@ def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
     """Return the protocol whose greeting a try has received, None without one."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
-    heard = next((frame.hex for frame in trial.frames if frame.direction == "!"), "")
-    start = bytes.fromhex(heard).lstrip()
+    first_frame = next((frame.hex for frame in trial.frames if frame.direction == "!"), "")
+    start = bytes.fromhex(first_frame).lstrip()
     return next((name for name in names if _greets(load_protocol(name), start)), None)
 
 
@@ -234,7 +236,7 @@ def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectF
     )
 
 
-def by_telling(found: Iterable[Trial]) -> list[Trial]:
+def by_telling(trials_made: Iterable[Trial]) -> list[Trial]:
     """Return failed tries, the most telling first.
 
     A refusal tells more than bytes that are no message, these more than other bytes, bytes more
@@ -247,7 +249,7 @@ def by_telling(found: Iterable[Trial]) -> list[Trial]:
         garbage = isinstance(trial.error, ProtocolError)
         return (not refused, not trial.received, not garbage, not linked)
 
-    return sorted(found, key=rank)
+    return sorted(trials_made, key=rank)
 
 
 async def _try(

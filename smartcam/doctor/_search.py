@@ -193,9 +193,9 @@ class CameraSearch:
         """Names of protocols whose cameras serve one client, and were found but not asked."""
         if self._ask:
             return []
-        found = {name for one in self._found.values() for name in one.protocols}
+        names = {name for port in self._found.values() for name in port.protocols}
         known = tcp_protocols()
-        return sorted(name for name in found if serves_one(known[name]))
+        return sorted(name for name in names if serves_one(known[name]))
 
     def results(self) -> list[FoundPort]:
         """Return the ports found so far, sorted by address."""
@@ -210,8 +210,12 @@ class CameraSearch:
 
         Cancellation: every connection is closed; the results stay.
         """
-        addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
-        leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
+        addresses = AddressSet([span for each in self._networks for span in await _spans(*each)])
+        leave = [
+            (text, left_span)
+            for text, span in self._leave
+            for left_span in await _spans(text, span)
+        ]
         _check_count(len(addresses), self._max_addresses)
         for text, span in leave:
             if span.size == 1 and span.first in addresses:
@@ -286,9 +290,9 @@ class CameraSearch:
                 self._found[key] = await asked(self._found[key])
 
         async with asyncio.TaskGroup() as group:
-            for key, one in sorted(self._found.items()):
-                if one.protocols:
-                    group.create_task(ask(key), name=f"smartcam.find[{one.host}:{one.port}].ask")
+            for key, port in sorted(self._found.items()):
+                if port.protocols:
+                    group.create_task(ask(key), name=f"smartcam.find[{port.host}:{port.port}].ask")
 
 
 # ---------------------------------------------------------------------- addresses
@@ -307,8 +311,8 @@ async def _spans(text: str, span: Span | None) -> list[Span]:
             f"no name server answers within {NAME_TIMEOUT:g} s"
         )
         raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
-    found = {address_of(str(one[4][0])) for one in resolved}
-    return [Span(address, address) for address in sorted(found)]
+    addresses = {address_of(str(entry[4][0])) for entry in resolved}
+    return [Span(address, address) for address in sorted(addresses)]
 
 
 def _check_size(networks: Iterable[tuple[str, Span | None]], most: int) -> None:
@@ -326,13 +330,13 @@ def _check_count(count: int, most: int) -> None:
 # ---------------------------------------------------------------------- asking
 
 
-async def asked(found: FoundPort) -> FoundPort:
+async def asked(port: FoundPort) -> FoundPort:
     """Ask a found camera, in each protocol that it may speak, and return the outcome."""
     failed: list[str] = []
-    for url in found.urls:
+    for url in port.urls:
         async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:
             async for trial in tries:
                 if trial.answer is not None:
-                    return dataclasses.replace(found, answer=trial.answer)
+                    return dataclasses.replace(port, answer=trial.answer)
                 failed.append(str(trial))
-    return dataclasses.replace(found, refusal="; ".join(failed))
+    return dataclasses.replace(port, refusal="; ".join(failed))

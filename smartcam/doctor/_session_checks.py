@@ -53,7 +53,7 @@ async def resolve(exam: Examination) -> None:
     limit = exam.options.step(10.0)
     try:
         async with asyncio.timeout(limit):
-            found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            resolved = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
         why = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
         why = why or f"no name server answers within {limit:g} s"
@@ -64,7 +64,7 @@ async def resolve(exam: Examination) -> None:
             host=host,
         )
         return
-    addresses = sorted({str(info[4][0]) for info in found})
+    addresses = sorted({str(info[4][0]) for info in resolved})
     if addresses != [host]:
         text = f"{host} is {', '.join(addresses)}"
         exam.report("ok", text, host=host, addresses=addresses)
@@ -133,13 +133,13 @@ def _say_session(
 
 async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Report why there is no session; return a camera if another way leads to one."""
-    own, found = exam.address, await _try_all(exam)
-    answer = found[-1].answer
+    address, trials_made = exam.address, await _try_all(exam)
+    answer = trials_made[-1].answer
     if answer is None:
-        _say_no_session(exam, found, None)
+        _say_no_session(exam, trials_made, None)
         return None
     exam.pin(answer.url)
-    if exam.address.scheme == own.scheme and own.dialect in {None, exam.address.dialect}:
+    if exam.address.scheme == address.scheme and address.dialect in {None, exam.address.dialect}:
         exam.report(
             "warning",
             f"no session at first ({failure}), and one a moment later",
@@ -148,7 +148,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
             attempts=list(failure.attempts),
         )
     else:
-        _say_no_session(exam, found, answer)
+        _say_no_session(exam, trials_made, answer)
     try:
         return await exam.make_camera().open()
     except ConnectFailedError as exc:
@@ -164,42 +164,44 @@ async def _try_all(exam: Examination) -> list[Trial]:
         return [trial async for trial in tries]
 
 
-def _say_no_session(exam: Examination, found: list[Trial], answer: CameraAnswer | None) -> None:
-    own = found[0].address
-    reason, trial = _reason(found, pinned=own.dialect is not None)
-    filled = words(trial, own, load_protocol(own.protocol))
+def _say_no_session(
+    exam: Examination, trials_made: list[Trial], answer: CameraAnswer | None
+) -> None:
+    address = trials_made[0].address
+    reason, trial = _reason(trials_made, pinned=address.dialect is not None)
+    filled = words(trial, address, load_protocol(address.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
-        others = [one for one in by_telling(found) if one is not trial]
+        others = [other for other in by_telling(trials_made) if other is not trial]
         also = f" Also tried: {_folded(others)}." if others else ""
         cure = reason.cure.format(**filled) + also
     exam.fail(
         reason.text.format(**filled),
         cure,
-        tries=[str(one) for one in found],
-        frames=[tuple(one.frames) for one in found],
+        tries=[str(trial) for trial in trials_made],
+        frames=[tuple(trial.frames) for trial in trials_made],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _reason(found: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
+def _reason(trials_made: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     """Return the reason why the URL gives no session, and the try that shows it."""
-    first = found[0]
-    own = [
+    first = trials_made[0]
+    trials_alike = [
         trial
-        for trial in found
+        for trial in trials_made
         if trial.transport == first.transport
         and not trial.other
         and (trial.dialect == first.dialect or not pinned)
     ]
-    return reason_for(own)
+    return reason_for(trials_alike)
 
 
-def _folded(found: list[Trial]) -> str:
+def _folded(trials_made: list[Trial]) -> str:
     """Return tries in one line, with equal outcomes of a transport's dialects together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for trial in found:
+    for trial in trials_made:
         at = f" at port {trial.address.port}" if trial.other else ""
         key = (f"{trial.transport.upper()}{at}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)

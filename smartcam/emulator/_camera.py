@@ -138,19 +138,19 @@ class EmulatedCamera(WireCamera):
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
-        who = "emulator"
+        caller = "emulator"
         if port is not None:
-            port = check_port(port, who)
+            port = check_port(port, caller)
         if name is not None:
-            name = check_text(name, "name", who, most=200)
+            name = check_text(name, "name", caller, most=200)
         if active is not None:
-            active = check_application(active, "active", who)
+            active = check_application(active, "active", caller)
         if running is not None:
-            running = check_flag(running, "running", who)
+            running = check_flag(running, "running", caller)
         if seed is not None:
-            seed = check_seed(seed, who)
+            seed = check_seed(seed, caller)
         if builtins is not None:
-            builtins = check_flag(builtins, "builtins", who)
+            builtins = check_flag(builtins, "builtins", caller)
         plan = make_plan(
             scenario,
             applications,
@@ -208,14 +208,14 @@ class EmulatedCamera(WireCamera):
         seed: int | None = None,
     ) -> EmulatedCamera:
         """Return a camera of a scenario; the other arguments override it."""
-        own = plan.quirks.model_dump(exclude_unset=True)
+        own_quirks = plan.quirks.model_dump(exclude_unset=True)
         return cls(
             scenario=plan,
             host=host,
             port=port,
             transport=transport,
             dialect=dialect,
-            quirks={**own, **quirks} if quirks else None,
+            quirks={**own_quirks, **quirks} if quirks else None,
             clock=clock,
             seed=seed,
         )
@@ -234,19 +234,19 @@ class EmulatedCamera(WireCamera):
                 )
                 return ("applications", number, "id"), text
         if plan.active is not None and plan.active not in known:
-            there = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
+            ids_text = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
             more = ", ..." if len(known) > _MAX_NAMED_IDS else ""
-            asked = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
-            return ("active",), f"no application has {asked}; there are {there}{more}"
+            asked_text = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
+            return ("active",), f"no application has {asked_text}; there are {ids_text}{more}"
         try:
             spoken = dialect.with_quirks(plan.quirks.of_the_wire)
         except ConfigurationError as exc:
             return ("quirks",), str(exc)
         for number, cue in enumerate(plan.timeline):
             for place, fault in enumerate(cue.do):
-                found = misfit(fault, spoken, known)
-                if found is not None:
-                    return ("timeline", number, "do", place, found[0]), found[1]
+                misfit_text = misfit(fault, spoken, known)
+                if misfit_text is not None:
+                    return ("timeline", number, "do", place, misfit_text[0]), misfit_text[1]
         return None
 
     @classmethod
@@ -455,9 +455,9 @@ class EmulatedCamera(WireCamera):
         if self.queue.device_on_camera:
             self._send_all(output, provoke=True)
         elif self._active is not None:
-            say = self._active.say
+            log = self._active.say
             for message in output:
-                say(message)
+                log(message)
 
     def _send_all(self, output: list[m.Message], *, provoke: bool) -> None:
         """Send messages to the client that has the session; they may trigger faults."""

@@ -115,7 +115,9 @@ class LinkOwner(Protocol):
         """Note that a connection has ended."""
         ...
 
-    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+    def traced(
+        self, link: ClientLink, sender: m.Sender, message: Frame | RemoteProtocolError
+    ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
@@ -235,9 +237,9 @@ class ClientLink(ABC):
         if self._faulty is not None:
             self._faulty.close()
 
-    def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+    def _trace(self, sender: m.Sender, message: Frame | RemoteProtocolError) -> None:
         if self._faulty is None or sender is m.Sender.CLIENT:
-            self._owner.traced(self, sender, what)
+            self._owner.traced(self, sender, message)
 
 
 @dataclass(eq=False)
@@ -269,7 +271,7 @@ class FaultyLink:
             wake=wake,
             carry=carry,
             end=self._end,
-            lost=lambda one: self._lose(sender, one),
+            lost=lambda message: self._lose(sender, message),
         )
 
     @property
@@ -334,13 +336,13 @@ class FaultyLink:
         """Add bytes of the client: a part of a stream, or one datagram."""
         if self.dead:
             return
-        heard = self._owner.queue.on_client
+        is_heard = self._owner.queue.on_client
         if self.machine.transport is Transport.UDP:
             self._take_message(cut_datagram(data, self._owner.codec))
             return
         if self._framer is None:
-            data = self._finish_frame(data) if heard else data
-            if not heard or self.machine.buffered:
+            data = self._finish_frame(data) if is_heard else data
+            if not is_heard or self.machine.buffered:
                 self._link.feed(data)
                 return
             self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
@@ -353,8 +355,8 @@ class FaultyLink:
     def _stop_cutting(self) -> None:
         """Give an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
         if self._framer is not None and not self._owner.queue.on_client and not self._incoming:
-            rest, self._framer = self._framer.pending, None
-            self._link.feed(rest)
+            pending, self._framer = self._framer.pending, None
+            self._link.feed(pending)
 
     def _finish_frame(self, data: bytes) -> bytes:
         """Let the frame pass that was unfinished when the faults were given; return the rest."""
@@ -394,12 +396,12 @@ class FaultyLink:
     # ------------------------------------------------------------------ both
 
     def _put(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
-        if line.size + sum(one.size for one in sent) > self._owner.write_limit:
+        if line.size + sum(message.size for message in sent) > self._owner.write_limit:
             self._link.overflow()
         outgoing = line is self._outgoing
         if self._link.closed or (outgoing and self.muted is not None):
-            for one in sent:
-                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, one)
+            for message in sent:
+                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, message)
         else:
             line.put(sent)
 

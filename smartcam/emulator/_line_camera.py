@@ -72,10 +72,10 @@ class LineClient:
     def keep(self) -> Self:
         """Return a client that answers the current line later; the next line is read now."""
         self._kept = True
-        kept = copy.copy(self)
+        copied = copy.copy(self)
         self._kept = False
         self.go_on()
-        return kept
+        return copied
 
     @property
     def gone(self) -> bool:
@@ -192,7 +192,7 @@ class LineCamera(WireCamera):
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
         self._spoken_to: dict[ClientLink, None] = {}  # links with lines to write
-        cues = [validated(Cue, one, f"cue {at}") for at, one in enumerate(timeline, start=1)]
+        cues = [validated(Cue, cue, f"cue {at}") for at, cue in enumerate(timeline, start=1)]
         self.lines: LineCodec = self.make_codec()
         super().__init__(
             spoken=self.lines,

@@ -176,8 +176,8 @@ class Log(Sequence[LogEntry]):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
             weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
         else:  # its size once it is read
-            _, _, _, what, fault, wire = entry
-            size = len(what.payload if isinstance(what, Frame) else what)
+            _, _, _, message, fault, wire = entry
+            size = len(message.payload if isinstance(message, Frame) else message)
             weight = _ENTRY_BYTES + _PER_BYTE * size
             if fault is not None or wire is not None:
                 weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
@@ -239,8 +239,8 @@ class Log(Sequence[LogEntry]):
     def _read(self) -> deque[LogEntry]:
         unread, entries = self._unread, self._entries
         while unread:
-            one = unread.popleft()
-            entries.append(one if isinstance(one, LogEntry) else self._entry(*one))
+            entry = unread.popleft()
+            entries.append(entry if isinstance(entry, LogEntry) else self._entry(*entry))
         return entries
 
     def _entry(
@@ -248,16 +248,16 @@ class Log(Sequence[LogEntry]):
         time: float,
         peer: str,
         sender: Sender,
-        what: Frame | bytes,
+        content: Frame | bytes,
         fault: str | None,
         wire: bytes | None,
     ) -> LogEntry:
         passed = None if wire is None else wire.hex(" ")
-        if isinstance(what, bytes):
-            message_id, message, payload = None, None, what
+        if isinstance(content, bytes):
+            message_id, message, payload = None, None, content
         else:
-            message_id, payload = what
-            message = _decode(self._dialect, sender, what)
+            message_id, payload = content
+            message = _decode(self._dialect, sender, content)
         direction, data = _DIRECTIONS[sender], payload.hex(" ")
         return LogEntry(time, direction, peer, message_id, message, data, None, fault, passed)
 
@@ -278,19 +278,19 @@ class TrafficLog:
         time: float,
         peer: str,
         sender: Sender,
-        what: Frame | bytes | RemoteProtocolError,
+        message: Frame | bytes | RemoteProtocolError,
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
         """Add a frame, bytes that make no frame, or the reason why they are ignored."""
-        if isinstance(what, RemoteProtocolError):
+        if isinstance(message, RemoteProtocolError):
             # only its text: the error keeps its traceback alive
-            data, error = what.data.hex(" "), str(what)
+            data, error = message.data.hex(" "), str(message)
             self.entries.append(
                 LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
             )
         else:
-            self.entries.append((time, peer, sender, what, fault, wire))
+            self.entries.append((time, peer, sender, message, fault, wire))
 
     async def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0

@@ -50,7 +50,7 @@ class FleetOutlets(Server):
     """
 
     def __init__(
-        self, server: FleetServer, tell: Callable[[str, str], None] = lambda _name, _why: None
+        self, server: FleetServer, report: Callable[[str, str], None] = lambda _name, _why: None
     ) -> None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
             from smartcam.outlets import Outlets, StoreQuestion
@@ -64,7 +64,7 @@ class FleetOutlets(Server):
             server.folder,
             columns=self._columns,
             command=self._command,
-            tell=tell,
+            tell=report,
             cameras=self._cameras,
             names=self._names,
         )
@@ -98,7 +98,7 @@ class FleetOutlets(Server):
             await program.close()
         await self.outlets.stop()
 
-    async def stored(self, asked: StoredRequest) -> dict[str, dict[str, Any]]:
+    async def stored(self, request: StoredRequest) -> dict[str, dict[str, Any]]:
         """Return the answers of the stores, by the outlet's name.
 
         Raises:
@@ -106,8 +106,8 @@ class FleetOutlets(Server):
 
         Cancellation: its thread finishes its work.
         """
-        since = None if asked.since is None else datetime.fromisoformat(asked.since)
-        question = self._question(since, asked.failed, asked.camera, asked.most)
+        since = None if request.since is None else datetime.fromisoformat(request.since)
+        question = self._question(since, request.failed, request.camera, request.most)
         answers = await asyncio.to_thread(self.outlets.stored, question)
         return {name: {"rows": answer.rows, **answer.summary} for name, answer in answers.items()}
 
@@ -139,7 +139,7 @@ class FleetOutlets(Server):
 
     def _cameras(self) -> dict[str, bool | None]:
         plan = self._server.reloads.now.plan
-        return {name: one.entry.emulated is not None for name, one in plan.items()}
+        return {name: planned.entry.emulated is not None for name, planned in plan.items()}
 
     def _names(self, camera: str) -> Mapping[str, int]:
         host = self._server.hosts.get(camera)

@@ -133,7 +133,7 @@ class DeviceFeatures(ABC):
 
 def spelled(name: str) -> str:
     """Return a name's letters and digits, which are equal for all spellings of the name."""
-    return "".join(one for one in name.lower() if one.isalnum())
+    return "".join(character for character in name.lower() if character.isalnum())
 
 
 class FrameFeatures:
@@ -220,8 +220,10 @@ class FrameFeatures:
         Cancellation: the device may have executed it.
         """
         given = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
-        found = {spelled(name): name for name in await self.names(timeout=timeout)}
-        name = found.get("usersetdefault", found.get("usersetdefaultselector", "UserSetDefault"))
+        features = {spelled(name): name for name in await self.names(timeout=timeout)}
+        name = features.get(
+            "usersetdefault", features.get("usersetdefaultselector", "UserSetDefault")
+        )
         await self[name].set(given, timeout=timeout)
 
     async def _with_set(self, user_set: str, command: str, timeout: float) -> None:

@@ -164,8 +164,8 @@ class FrameGroup:
         try:
             await asyncio.gather(*opening)
         except BaseException:
-            for one in opening:
-                one.cancel()
+            for task in opening:
+                task.cancel()
             await asyncio.wait(opening)
             await self._close_all()
             raise
@@ -229,45 +229,47 @@ class FrameGroup:
             }
 
     def _silence(self) -> str:
-        came = ", ".join(
+        counts = ", ".join(
             f"{name} {reader.statistics().offered}" for name, reader in self._readers.items()
         )
         return (
             f"frames of {' and '.join(self._sources)}: expected a set within "
             f"{self.within * 1e3:.3g} ms of each other in {self._timeout:g} s, got none; frames "
-            f"that came in all: {came}"
+            f"that came in all: {counts}"
         )
 
     def _take(self, name: str, frame: Frame) -> None:
         """Add a camera's frame, and deliver a set if it is complete."""
-        kept = self._kept[name]
-        kept.append(frame)
-        if len(kept) > MAX_WAITING_FRAMES:
-            kept.popleft()
+        queue = self._kept[name]
+        queue.append(frame)
+        if len(queue) > MAX_WAITING_FRAMES:
+            queue.popleft()
             self._alone[name] += 1
-        found = {name: frame}
+        frames = {name: frame}
         for other, waiting in self._kept.items():
             if other != name:
                 if not waiting:
                     return
-                found[other] = min(waiting, key=lambda one: abs(one.captured - frame.captured))
-        moments = [one.captured for one in found.values()]
+                frames[other] = min(
+                    waiting, key=lambda candidate: abs(candidate.captured - frame.captured)
+                )
+        moments = [member.captured for member in frames.values()]
         skew = max(moments) - min(moments)
         if skew > self.within:
             return
-        for other, one in found.items():
-            self._drop_until(other, one)
+        for other, member in frames.items():
+            self._drop_until(other, member)
         self._offered += 1
         self._skew = max(self._skew, skew)
         if self._next is not None:
             self._skipped += 1
-        self._next = FrameSet({key: found[key] for key in self._sources}, skew)
+        self._next = FrameSet({key: frames[key] for key in self._sources}, skew)
         self._came.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
         """Drop a frame that is in a set, and earlier frames, which cannot be in a set any more."""
-        kept = self._kept[name]
-        while kept.popleft() is not frame:
+        queue = self._kept[name]
+        while queue.popleft() is not frame:
             self._alone[name] += 1
 
     def _end(self, error: FrameSourceError | None) -> None:

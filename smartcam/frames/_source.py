@@ -476,10 +476,10 @@ class FrameSource(FrameSink):
             self._last_came = asyncio.get_running_loop().time()
 
     def _alive(self) -> list[FrameReader]:
-        return [reader for one in self._readers if (reader := one()) is not None]
+        return [reader for reference in self._readers if (reader := reference()) is not None]
 
-    def _dropped(self, one: weakref.ref[FrameReader]) -> None:
-        self._readers.discard(one)
+    def _dropped(self, reference: weakref.ref[FrameReader]) -> None:
+        self._readers.discard(reference)
         if not self._readers and self._loop is not None:
             self._idle_since = self._loop.time()
         self._changed.set()

@@ -24,8 +24,8 @@ def check_choice(value: object, among: Sequence[str], what: str) -> None:
 
 def check_size(values: Any, called: str) -> None:
     """Raise SHAPE unless a value is an image's width and height, pixels."""
-    whole = (int, np.integer)
+    integers = (int, np.integer)
     plain = isinstance(values, tuple | list) and len(values) == 2
-    if not plain or not all(isinstance(value, whole) and value > 0 for value in values):
+    if not plain or not all(isinstance(value, integers) and value > 0 for value in values):
         expected = f"{called}: size: expected width and height in pixels"
         raise Code.SHAPE.unexpected(expected, "(width, height)", values)

@@ -157,10 +157,10 @@ class Code(enum.StrEnum):
     ) -> CalibrationError:
         """Return an error; ``text`` names the expected value, and ``got`` is appended."""
         try:
-            came = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
+            described = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - a foreign class may raise any
-            came = shown(got)
-        return self.refusal(f"{text}, got {came}", expected, got)
+            described = shown(got)
+        return self.refusal(f"{text}, got {described}", expected, got)
 
     def remark(self, text: str) -> Remark:
         """Return a remark with this code."""

@@ -65,8 +65,8 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
 
 def as_vector(values: ArrayLike, length: int, what: str) -> Array:
     """Return ``values`` as float64 of shape (``length``,); raise SHAPE or NOT_FINITE."""
-    one: Any = [values]
-    vector: Array = as_points(one, length, what)[0]
+    listed: Any = [values]
+    vector: Array = as_points(listed, length, what)[0]
     return vector
 
 
@@ -77,13 +77,13 @@ def check_finite(values: Array, what: str) -> None:
         raise not_finite(what, np.atleast_1d(values[row]).tolist())
 
 
-def not_finite(what: str, got: object) -> CalibrationError:
+def not_finite(what: str, actual: object) -> CalibrationError:
     """Return the error for a calibration's result that is not finite."""
     return Code.NOT_FINITE.refusal(
-        f"{what}: expected finite numbers, the calibration gives {got}: it is damaged, or this is "
-        "far outside of what it was made for",
+        f"{what}: expected finite numbers, the calibration gives {actual}: it is damaged, or this "
+        "is far outside of what it was made for",
         "finite numbers",
-        got,
+        actual,
     )
 
 

@@ -85,14 +85,14 @@ class Transform:
                 (rotation.shape, translation.shape),
             )
         with np.errstate(all="ignore"):
-            off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
             turn = float(np.linalg.det(rotation))
-        far = not np.abs(translation).max() <= MAX_COORDINATE
-        if not (off < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or far:
+        too_far = not np.abs(translation).max() <= MAX_COORDINATE
+        if not (error < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or too_far:
             mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
             raise Code.NOT_RIGID.refusal(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
-                f"determinant {turn:.6g}{mirror}, off by {off:.3g}, and {translation.tolist()}",
+                f"determinant {turn:.6g}{mirror}, off by {error:.3g}, and {translation.tolist()}",
                 "a rotation, determinant 1",
                 turn,
             )

@@ -139,7 +139,7 @@ class Program:
         picture = Picture.of(source)
         findings, seconds = self._run(picture, input)
         values: dict[str, Any] = {
-            "ok": all(found.ok for found in findings.values()),
+            "ok": all(finding.ok for finding in findings.values()),
             "reason": "",
         }
         if self.layout.sequence_field is not None:
@@ -210,9 +210,9 @@ class FollowedApplication(Tool[ToolSettings]):
 
 def _reason(findings: Mapping[str, Finding]) -> str:
     """Return the first reason among findings; "" if all are ok."""
-    for name, found in findings.items():
-        if not found.ok:
-            why = found.reason or "not ok"
+    for name, finding in findings.items():
+        if not finding.ok:
+            why = finding.reason or "not ok"
             return f"{name}: {why}" if len(findings) > 1 else why
     return ""
 
@@ -256,17 +256,19 @@ def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
         if field.name in OWN_FIELDS or field.sequence:
             raise ConfigurationError(f"{step.name}: a tool may not have the field {field.name!r}")
     if several:
-        own = Field("ok", "bool")
-        fields = tuple(replace(one, name=f"{step.name}_{one.name}") for one in (own, *fields))
+        verdict = Field("ok", "bool")
+        fields = tuple(
+            replace(field, name=f"{step.name}_{field.name}") for field in (verdict, *fields)
+        )
     return replace(step, fields=fields, records=records)
 
 
-def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, Any]:
+def _values(step: ProgramStep, finding: Finding, *, several: bool) -> dict[str, Any]:
     """Return a finding's values by their names in the result; missing values are left empty."""
     if not step.own:
         return {}
     prefix = f"{step.name}_" if several else ""
-    given = {**found.values, "ok": found.ok} if several else found.values
+    given = {**finding.values, "ok": finding.ok} if several else finding.values
     values = {
         field.name: given.get(field.name.removeprefix(prefix), _empty_value(field))
         for field in step.fields
@@ -274,7 +276,7 @@ def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, An
     if step.records:
         values[step.name] = [
             {field.name: record.get(field.name, _empty_value(field)) for field in step.records}
-            for record in found.records
+            for record in finding.records
         ]
     return values
 
@@ -361,7 +363,7 @@ def _known_settings(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
     for key in place[:-1]:
         field = getattr(model, "model_fields", {}).get(key)
         inner = () if field is None else (field.annotation, *get_args(field.annotation))
-        model = next((one for one in inner if hasattr(one, "model_fields")), None)
+        model = next((model for model in inner if hasattr(model, "model_fields")), None)
     return getattr(model, "model_fields", ())
 
 

@@ -124,12 +124,12 @@ class LocalizationsInterpreter(PlainInterpreter):
             rows = map(self._pick, rows)
         heights = self._heights(data, context) if self._z is not None else None
         total, skipped, z = 0.0, 0, 0.0
-        found: list[Localization] = []
+        parts: list[Localization] = []
         try:
             for text, quality, photo_index, x, y, theta in rows:
                 if heights is not None:
                     z = next(heights)
-                if not x and self._is_empty(data, len(found) + skipped):
+                if not x and self._is_empty(data, len(parts) + skipped):
                     skipped += 1
                     continue
                 if scales is not None:
@@ -147,7 +147,7 @@ class LocalizationsInterpreter(PlainInterpreter):
                     feature_id = text.partition(b"\0")[0].decode()
                     if len(names) < MAX_NAMES:
                         names[text] = feature_id
-                found.append(new(Localization, (feature_id, quality, photo_index, pose)))
+                parts.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
             self._check_numbers(data, context)
             raise
@@ -157,17 +157,17 @@ class LocalizationsInterpreter(PlainInterpreter):
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
-        return found if self._sigmas is None else self._with_sigmas(found, data, context)
+        return parts if self._sigmas is None else self._with_sigmas(parts, data, context)
 
     def _with_sigmas(
-        self, found: list[Localization], data: bytes, context: Context
+        self, localizations: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
         """Return localizations with the errors of their poses, if these are numbers."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
         taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
         result: list[Localization] = []
-        for part, row in zip(found, taken, strict=True):
+        for part, row in zip(localizations, taken, strict=True):
             x, y, theta = (row[place] * scale for place, scale in use.sigmas)
             xy, xt, yt = (0.0 if place is None else row[place] for place in use.correlations)
             if context.y_down:
@@ -259,7 +259,7 @@ def _use_of(layout: tuple[Field, ...]) -> _Use:
         None if places == [*range(len(names))] else operator.itemgetter(*places),
         [*fields].index("z") if "z" in fields else None,
         _scales(fields),
-        any(one.type in {"string", "bool"} and one.name != "feature_id" for one in layout),
+        any(field.type in {"string", "bool"} and field.name != "feature_id" for field in layout),
         _sigma_use(fields),
     )
 

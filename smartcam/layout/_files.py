@@ -114,7 +114,7 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     Raises LayoutError if it is neither.
     """
     try:
-        loaded: Any = load(text, what="layout: YAML")
+        loaded: Any = load(text, label="layout: YAML")
     except BadYamlError as exc:
         # "x: int32, y: int32" is no YAML; a broken document is no layout text either
         try:

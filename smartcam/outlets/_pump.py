@@ -89,9 +89,9 @@ class Pump:
         self,
         outlet: Outlet[Any],
         spool: Spool,
-        tell: Callable[[str, str], None] = lambda _name, _why: None,
+        report: Callable[[str, str], None] = lambda _name, _why: None,
     ) -> None:
-        self.outlet, self.spool, self._tell = outlet, spool, tell
+        self.outlet, self.spool, self._tell = outlet, spool, report
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
@@ -171,15 +171,15 @@ class Pump:
     ) -> None:
         """Accept a result or an error; never wait."""
         number = self._numbers[camera] = self._numbers.get(camera, 0) + 1
-        came = Arrival(camera, number, at, size, make)
+        arrival = Arrival(camera, number, at, size, make)
         if (
             len(self._waiting) >= MAX_WAITING
             or self._waiting_bytes + size > MAX_WAITING_BYTES
             or self._lost  # entries after a gap stay after it
         ):
-            self._lost[camera] = came, self._lost.get(camera, (came, 0))[1] + 1
+            self._lost[camera] = arrival, self._lost.get(camera, (arrival, 0))[1] + 1
         else:
-            self._waiting.append(came)
+            self._waiting.append(arrival)
             self._waiting_bytes += size
         if self._gathering is None:
             loop = asyncio.get_running_loop()
@@ -192,13 +192,13 @@ class Pump:
     @property
     def account(self) -> OutletAccount:
         """The account of all entries, with those that wait in memory."""
-        kept, waiting = self._account, len(self._waiting)
+        counts, waiting = self._account, len(self._waiting)
         lost = sum(count for _, count in self._lost.values())
-        dropped = dict(kept.dropped)
+        dropped = dict(counts.dropped)
         if lost:
             dropped["memory"] = dropped.get("memory", 0) + lost
         return OutletAccount(
-            kept.results + waiting + lost, kept.delivered, kept.spooled + waiting, dropped
+            counts.results + waiting + lost, counts.delivered, counts.spooled + waiting, dropped
         )
 
     # ------------------------------------------------------------------ into the spool
@@ -219,7 +219,9 @@ class Pump:
 
     async def _keep_some(self) -> None:
         """Write the first waiting entries, or the gap after all of them."""
-        batch = [one for one, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)]
+        batch = [
+            arrival for arrival, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)
+        ]
         lost = {} if batch else dict(self._lost)
         await self._kept(batch, lost)
 
@@ -228,17 +230,19 @@ class Pump:
 
         def work() -> OutletAccount:
             entries = list[OutletEntry]()
-            for one in batch:
-                kind, application, body = one.make()
-                entry = OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
+            for arrival in batch:
+                kind, application, body = arrival.make()
+                entry = OutletEntry(
+                    arrival.camera, epoch, arrival.number, kind, application, arrival.at, body
+                )
                 entries.append(entry)
             gaps = [
                 (
-                    OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),
+                    OutletEntry(arrival.camera, epoch, arrival.number, "gap", None, arrival.at, ""),
                     count,
                     _MEMORY,
                 )
-                for one, count in lost.values()
+                for arrival, count in lost.values()
             ]
             self.spool.add(entries, gaps)
             return self.spool.account
@@ -249,9 +253,9 @@ class Pump:
     def _drop_kept(
         self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]], account: OutletAccount
     ) -> None:
-        for one in batch:
+        for arrival in batch:
             self._waiting.popleft()
-            self._waiting_bytes -= one.size
+            self._waiting_bytes -= arrival.size
         for camera, (_, count) in lost.items():
             last, now = self._lost.pop(camera)
             if now > count:
@@ -273,14 +277,14 @@ class Pump:
 
         running = asyncio.wrap_future(self._thread.submit(guarded))
         try:
-            found = await asyncio.shield(running)
+            outcome = await asyncio.shield(running)
         except asyncio.CancelledError:
             await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang forever
             if running.done() and running.exception() is None:
                 then(running.result())
             raise
-        then(found)
-        return found
+        then(outcome)
+        return outcome
 
     def _say_disk(self, why: str) -> None:
         if why != self.disk_trouble:
@@ -383,16 +387,16 @@ class Pump:
             Exception: the far end is lost.
         """
         loop = asyncio.get_running_loop()
-        came = loop.create_task(self._spooled.wait())
+        arrival = loop.create_task(self._spooled.wait())
         watching = loop.create_task(self.outlet.watch())
         try:
-            await asyncio.wait({came, watching}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({arrival, watching}, return_when=asyncio.FIRST_COMPLETED)
             if watching.done():
                 watching.result()
         finally:
-            for task in (came, watching):
+            for task in (arrival, watching):
                 task.cancel()
-            await asyncio.wait({came, watching})
+            await asyncio.wait({arrival, watching})
 
     def _say_far(self, why: str) -> None:
         if why != self.trouble:

@@ -146,9 +146,9 @@ class Spool:
             _check_versions(self.path)
             database.execute("BEGIN IMMEDIATE")
             database.execute("COMMIT")
-            ((found,),) = database.execute("PRAGMA quick_check(1)").fetchall()
-            if found != "ok":
-                raise sqlite3.DatabaseError(found)
+            ((answer,),) = database.execute("PRAGMA quick_check(1)").fetchall()
+            if answer != "ok":
+                raise sqlite3.DatabaseError(answer)
             database.executescript(_SCHEMA)
             self._load(database)
         except BaseException:
@@ -227,7 +227,9 @@ class Spool:
     def _forget_damaged(self) -> None:
         pattern = f"{self.path.name}.damaged-*"
         names = sorted(
-            one for one in self.path.parent.glob(pattern) if one.name[-4:] not in ("-wal", "-shm")
+            path
+            for path in self.path.parent.glob(pattern)
+            if path.name[-4:] not in ("-wal", "-shm")
         )
         for name in names[:-MAX_DAMAGED_FILES]:
             for suffix in ("", "-wal", "-shm"):
@@ -260,14 +262,14 @@ class Spool:
                 _add_gap(database, last, count, why, self._in_flight)
                 new["results"] = new.get("results", 0) + count
                 new["dropped.memory"] = new.get("dropped.memory", 0) + count
-            came = sum(entry.kind != "gap" for entry in entries)
-            new["results"] = new.get("results", 0) + came
+            results = sum(entry.kind != "gap" for entry in entries)
+            new["results"] = new.get("results", 0) + results
             taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
-            kept, refused = (
+            accepted, refused = (
                 entries[:taken],
                 [entry for entry in entries[taken:] if entry.kind != "gap"],
             )
-            size = self._write(database, kept)
+            size = self._write(database, accepted)
             for last, count in _by_camera(refused):
                 _add_gap(database, last, count, "the spool was full", self._in_flight)
             if refused:
@@ -277,7 +279,7 @@ class Spool:
             _set(database, new)
         self._counts = new
         self._bytes += size - freed
-        self._spooled += sum(entry.kind != "gap" for entry in kept) - gone
+        self._spooled += sum(entry.kind != "gap" for entry in accepted) - gone
 
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
         rows = [_row(entry, place) for place, entry in enumerate(entries, _next_place(database))]
@@ -520,8 +522,8 @@ def _next_place(database: sqlite3.Connection) -> int:
     Raises:
         sqlite3.DatabaseError: the file's record of the last place is damaged.
     """
-    found = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
-    last = 0 if found is None else found[0]
+    row = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
+    last = 0 if row is None else row[0]
     if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MAX_PLACES_AT_ONCE:
         raise sqlite3.DatabaseError(f"expected the last place of an entry, got {last!r:.40}")
     return last + 1
@@ -540,10 +542,10 @@ def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
 
 def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
     """Return the last entry of each camera, and the number of the camera's entries."""
-    found: dict[str, tuple[OutletEntry, int]] = {}
+    gaps: dict[str, tuple[OutletEntry, int]] = {}
     for entry in entries:
-        found[entry.camera] = entry, found.get(entry.camera, (entry, 0))[1] + 1
-    return [*found.values()]
+        gaps[entry.camera] = entry, gaps.get(entry.camera, (entry, 0))[1] + 1
+    return [*gaps.values()]
 
 
 def _add_gap(
@@ -568,21 +570,21 @@ def _add_gap(
         unknown: whether more may be missing than the count.
     """
     unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
-    for there, checksum, *fields in database.execute(
+    for gap_place, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
         (last.camera, in_flight, MAX_PLACE if place is None else place),
     ):
         entry = OutletEntry(*fields)
-        if entry.kind != "gap" or _checksum(entry, there) != checksum:
+        if entry.kind != "gap" or _checksum(entry, gap_place) != checksum:
             break
         older = json.loads(entry.body)
         count += older["lost"]
         unknown = unknown or older["at_least"]
         reasons.append(older["error"])
-        gone.append((there,))
+        gone.append((gap_place,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
-    each = dict.fromkeys(one for text in reversed(reasons) for one in text.split("; "))
+    each = dict.fromkeys(reason for text in reversed(reasons) for reason in text.split("; "))
     error = "; ".join(each)[:MAX_REASON_CHARACTERS]
     body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)

@@ -199,10 +199,10 @@ class _StoreFile:
     def _identity_there(self) -> object:
         """Return the device and the number of the file at the path; None without one."""
         try:
-            there = self.path.stat()
+            status = self.path.stat()
         except FileNotFoundError:
             return None
-        return there.st_dev, there.st_ino
+        return status.st_dev, status.st_ino
 
     def close(self) -> None:
         """Close the file."""
@@ -314,16 +314,16 @@ class _StoreFile:
     ) -> None:
         """Add the column of a value to those that are known, created if needed."""
         name, kind, unit = wanted
-        there = database.execute(
+        rows = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)
         ).fetchall()
-        for of, column, its_kind, its_unit in there:
+        for of, column, its_kind, its_unit in rows:
             if (of, _affinity(its_kind), its_unit) == (name, _affinity(kind), unit):
                 known[name] = column
                 return
-        if len(there) >= MAX_COLUMNS:
+        if len(rows) >= MAX_COLUMNS:
             return
-        taken = {column.lower() for _, column, _, _ in there} | _OWN
+        taken = {column.lower() for _, column, _, _ in rows} | _OWN
         column = base = re.sub(r"\W", "_", name)[:MAX_COLUMN_CHARACTERS] or "value"
         if column.lower() in taken:
             column = base = f"{base}_{unit or kind}"
@@ -341,8 +341,8 @@ class _StoreFile:
         pattern, folder = self.settings.pictures, self.path.parent
         if pattern is None or entry.kind == "gap":
             return None
-        found = picture_of(pattern, folder, fields)
-        return None if found is None else str(found.relative_to(folder))
+        picture = picture_of(pattern, folder, fields)
+        return None if picture is None else str(picture.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:
         """Delete results beyond the bounds of age and size, a part at a time."""

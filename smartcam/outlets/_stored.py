@@ -118,8 +118,8 @@ def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResult
         f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {of}",
         values,
     ).fetchone()
-    found = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
-    return StoredResults(found, total, failed, errors, gaps, lost, bool(at_least))
+    records = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
+    return StoredResults(records, total, failed, errors, gaps, lost, bool(at_least))
 
 
 def _failure_condition(database: sqlite3.Connection) -> str:
@@ -132,9 +132,9 @@ def _failure_condition(database: sqlite3.Connection) -> str:
         if good is not None:
             quoted = column.replace('"', '""')
             conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
-    found = [
+    conditions_sql = [
         f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
         for application, each in conditions.items()
     ]
-    either = " OR ".join(["kind != 'result'", *found])
+    either = " OR ".join(["kind != 'result'", *conditions_sql])
     return f"({either})"

@@ -108,8 +108,8 @@ class HeldResults:
         """
         self._named = application
         self._unanswered.discard(question)
-        held = [one for one in self._waiting if isinstance(one, _Held)]
-        for seen in (self._seen, *(one.seen for one in held)):
+        held = [item for item in self._waiting if isinstance(item, _Held)]
+        for seen in (self._seen, *(item.seen for item in held)):
             if seen is not None:
                 seen.add(application)
         self._release()

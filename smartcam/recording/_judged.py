@@ -133,12 +133,15 @@ class PictureMatcher:
     def _by_time(self, result: Result[Any]) -> Frame | None:
         if result.triggered_at is None:  # the duration of the inspection is unknown
             return None
-        triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
+        triggered, received = result.triggered_at.timestamp(), result.received_at.timestamp()
         if self._dropped >= triggered:
             return None
         for picture in self._pictures:
             began = picture.frame.utc - picture.frame.duration
-            if picture.result_number is None and triggered <= began <= picture.frame.utc <= came:
+            if (
+                picture.result_number is None
+                and triggered <= began <= picture.frame.utc <= received
+            ):
                 missing = (
                     picture.left_out or picture.frame.lost
                 )  # a missing picture may be the result's

@@ -156,11 +156,11 @@ class Recording:
 
     def items(self, camera: str | None = None) -> Iterator[Item]:
         """Yield all items, of all cameras or of one."""
-        for found in self.all_items(camera):
-            if not isinstance(found, RecordedState) and (
-                self.since is None or _when(found) >= self.since
+        for item in self.all_items(camera):
+            if not isinstance(item, RecordedState) and (
+                self.since is None or _when(item) >= self.since
             ):
-                yield found
+                yield item
 
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
         """Yield the items for a replay, with those before ``since`` and the states of cameras.
@@ -172,13 +172,13 @@ class Recording:
         for path in self._files_of(camera):
             scan, last = _Scan(path), None
             try:
-                for found in scan.items(states=True):
-                    at = _when(found)
+                for item in scan.items(states=True):
+                    at = _when(item)
                     if self.until is not None and at > self.until:
                         continue
-                    if camera is None or found.camera == camera:
-                        last = found.camera, at
-                        yield found
+                    if camera is None or item.camera == camera:
+                        last = item.camera, at
+                        yield item
             except SmartCamError as exc:
                 if path == self.path:
                     raise
@@ -235,9 +235,9 @@ def frame_of(picture: RecordedPicture) -> Frame:
     return replace(frame, lost=frame.lost + picture.left_out) if picture.left_out else frame
 
 
-def check_recording(value: Recording, who: str) -> Recording:
+def check_recording(value: Recording, caller: str) -> Recording:
     """Return a recording; raise ConfigurationError for another type."""
-    return check_kind(value, Recording, "recording", "what load_recording() returns", who)
+    return check_kind(value, Recording, "recording", "what load_recording() returns", caller)
 
 
 def load_recording(
@@ -302,7 +302,7 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
         named = sorted((name, entry.path) for name, entry in files_of(folder))
     except OSError as exc:
         raise ConfigurationError(f"recording {folder}: {exc.strerror or exc}") from exc
-    found: list[Path] = []
+    paths: list[Path] = []
     begins: list[FileName | None] = [name for name, _ in named]
     for (name, path), follows in zip(named, [*begins[1:], None], strict=False):
         if follows is not None and follows.camera == name.camera and since is not None:
@@ -310,13 +310,13 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
         else:
             over = False
         if not over and (until is None or name.at <= until):
-            found.append(Path(path))
-    if not found:
+            paths.append(Path(path))
+    if not paths:
         raise ConfigurationError(
             f"recording {folder}: no recordings of a fleet are in this folder"
             f"{' at that time' if named else ''}; expected CAMERA_TIME{ENDING}"
         )
-    return found
+    return paths
 
 
 @dataclass(slots=True)
@@ -558,14 +558,14 @@ class _Scan:
 
     def _check_magic(self, begin: bytes) -> None:
         if not begin.startswith(b"\x89MCAP"):
-            came = f"it begins with {begin.hex(' ')}" if begin else "it is empty"
-            raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {came}")
+            actual = f"it begins with {begin.hex(' ')}" if begin else "it is empty"
+            raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {actual}")
 
     def _check_format(self) -> None:
-        came, version = self.file_facts.get("format"), self.file_facts.get("version")
-        if came not in FORMATS:
+        actual, version = self.file_facts.get("format"), self.file_facts.get("version")
+        if actual not in FORMATS:
             raise ConfigurationError(
-                f"recording {self.path}: its form is {came}, this version of smartcam reads "
+                f"recording {self.path}: its form is {actual}, this version of smartcam reads "
                 f"{' and '.join(FORMATS)}; it was written by smartcam {version}"
             )
 

@@ -590,8 +590,8 @@ class RecordingFile:
         Raises:
             OSError: the file was deleted, or moved away with its folder.
         """
-        own = os.fstat(self._stream.fileno())
-        if not os.path.samestat(own, self.path.stat()):
+        status = os.fstat(self._stream.fileno())
+        if not os.path.samestat(status, self.path.stat()):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.path))
 
     def cut(self, size: int) -> None:

@@ -69,8 +69,8 @@ class Raw:
 
 def ros1_name(name: str) -> str | None:
     """Return a type's name in ROS 1 (``std_msgs/String``); None if ROS 1 has no such type."""
-    package, _, rest = name.partition("/")
-    return None if package in ONLY_ROS2 else f"{package}/{rest.rpartition('/')[2]}"
+    package, _, short_name = name.partition("/")
+    return None if package in ONLY_ROS2 else f"{package}/{short_name.rpartition('/')[2]}"
 
 
 def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
 def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
     if field.nested:
         inner = kind.nested[field.type]
-        return [_fields(inner, one) for one in value] if field.shape else _fields(inner, value)
+        return [_fields(inner, item) for item in value] if field.shape else _fields(inner, value)
     if not field.shape:
         return _signed(value) if field.type == "byte" else value
     if field.type in _BYTES:
@@ -143,7 +143,7 @@ def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dic
         raise RosMessageError(f"{kind.name}: {where}: nested too deep")
     names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
     fields = {names.get(field.name, field.name): field for field in kind.fields}
-    found = dict[str, Any]()
+    checked = dict[str, Any]()
     for name, value in data.items():
         if name in only:
             continue
@@ -151,8 +151,8 @@ def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dic
         if field is None:
             expected = ", ".join((*fields, *only)) or "none"
             raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
-        found[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
-    return found
+        checked[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
+    return checked
 
 
 def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth: int) -> Any:
@@ -168,16 +168,18 @@ def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth
     if not field.nested:
         allowed = _ALLOWED.get(field.type, (int,))
         values: list[Any] = value if field.shape else [value]
-        for one in values:
-            if type(one) not in allowed:
-                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {one!r:.80}")
+        for item in values:
+            if type(item) not in allowed:
+                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {item!r:.80}")
         if field.type == "byte":
             values = [value + 256 if -128 <= value < 0 else value for value in values]
         return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:
         return _checked_fields(inner, value, f"{where}.", depth - 1)
-    return [_checked_fields(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
+    return [
+        _checked_fields(inner, item, f"{where}[{n}].", depth - 1) for n, item in enumerate(value)
+    ]
 
 
 def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:

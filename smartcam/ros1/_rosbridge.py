@@ -197,11 +197,11 @@ class RosbridgeNode(NamedNode):
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
-        heard = RosbridgeSubscription(self, name, kind, qos)
-        if self._log_if_absent(heard.exists, name, kind.name):
-            self._subscriptions.append(heard)
-            heard.ask()
-        return heard
+        subscription = RosbridgeSubscription(self, name, kind, qos)
+        if self._log_if_absent(subscription.exists, name, kind.name):
+            self._subscriptions.append(subscription)
+            subscription.ask()
+        return subscription
 
     def serve(
         self,
@@ -236,10 +236,10 @@ class RosbridgeNode(NamedNode):
             self._change()
         return served
 
-    def _new_name(self, name: str, what: str, there: dict[str, Any]) -> str:
-        full = self._resolved(name, what)
-        if full in there:
-            raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
+    def _new_name(self, name: str, kind_text: str, existing: dict[str, Any]) -> str:
+        full = self._resolved(name, kind_text)
+        if full in existing:
+            raise ConfigurationError(f"{self.full_name}: the {kind_text} {full} is there already")
         return full
 
     def _log_if_absent(self, exists: bool, name: str, kind: str) -> bool:
@@ -269,11 +269,11 @@ class RosbridgeNode(NamedNode):
             self._leaving.append(end)
             self._change()
 
-    def forget_subscription(self, heard: RosbridgeSubscription) -> None:
+    def forget_subscription(self, subscription: RosbridgeSubscription) -> None:
         """Remove a closed subscription."""
-        if heard in self._subscriptions:
-            self._subscriptions.remove(heard)
-            heard.leave()
+        if subscription in self._subscriptions:
+            self._subscriptions.remove(subscription)
+            subscription.leave()
 
     def renew(self, service: RosbridgeService) -> None:
         """Withdraw a service and advertise it again, so that its calls fail at their callers."""
@@ -346,8 +346,10 @@ class RosbridgeNode(NamedNode):
         await asyncio.sleep(0)
         new, leaving = self._new, [*self._leaving]
         self._new = []
-        await asyncio.gather(*(one.still() for one in leaving))
-        await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
+        await asyncio.gather(*(service.still() for service in leaving))
+        await retire(
+            self._link.url, list(dict.fromkeys(service.name for service in (*leaving, *new)))
+        )
         if leaving:  # first handle calls that the bridge has aborted
             await self.ask(PROBED_SERVICE, {})
         self._leaving = self._leaving[len(leaving) :]
@@ -359,18 +361,18 @@ class RosbridgeNode(NamedNode):
 
         Earlier operations of the bridge have been handled by then.
         """
-        asked = question(service, arguments)
+        request = question(service, arguments)
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
-        self._asked[asked["id"]] = answer
+        self._asked[request["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
-                self.send(encoded(asked))
+                self.send(encoded(request))
                 return await answer
         except TimeoutError:
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
             return None
         finally:
-            del self._asked[asked["id"]]
+            del self._asked[request["id"]]
 
     def _answered(self, operation: dict[str, Any]) -> None:
         answer = self._asked.get(str(operation.get("id")))
@@ -404,7 +406,7 @@ class RosbridgeNode(NamedNode):
             logger.warning("%s: no call: %.200r", self.full_name, operation)
             return
         service = self._services.get(name)
-        if any(one.name == name for one in self._leaving):
+        if any(service.name == name for service in self._leaving):
             return  # the call fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)

@@ -33,10 +33,10 @@ async def listen_for_subscribers(
         ]:
             answer = await node.ask(SERVICE, {"topic": publisher.name})
             values = answer.get("values") if answer else None
-            found = values.get("subscribers") if isinstance(values, dict) else None
-            if not isinstance(found, list):
-                for one in publishers.values():
-                    one.subscribed = True
+            names = values.get("subscribers") if isinstance(values, dict) else None
+            if not isinstance(names, list):
+                for known in publishers.values():
+                    known.subscribed = True
                 return
-            publisher.subscribed = bool(found)
+            publisher.subscribed = bool(names)
         await asyncio.sleep(PERIOD)

@@ -126,7 +126,7 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
         timeout = check_seconds(timeout, "timeout", "expect")
-        wanted = [_known(one) for one in expected]
+        wanted = [_known(message) for message in expected]
         self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
 
     def expect_nothing_while_busy(
@@ -148,9 +148,9 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         grace = check_seconds(grace, "grace", "expect_nothing_while_busy")
         timeout = check_seconds(timeout, "timeout", "expect_nothing_while_busy")
-        for one in also:
-            if not (isinstance(one, type) and issubclass(one, m.Message)):
-                raise wrong_argument("also", "types of messages", one)
+        for message in also:
+            if not (isinstance(message, type) and issubclass(message, m.Message)):
+                raise wrong_argument("also", "types of messages", message)
         allowed = (*ALLOWED_WHILE_BUSY, *also)
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
@@ -202,13 +202,13 @@ class CameraLog(Sequence["LogEntry"]):
         end = time.monotonic() + timeout
         while True:
             entries = self._read()
-            found = finding(entries)
+            found_text = finding(entries)
             gone = self._pushed_out()
             missing = f"{gone} older entries were pushed out of the full log" if gone else None
-            if found is None and not (missing and whole):
+            if found_text is None and not (missing and whole):
                 return
-            if time.monotonic() >= end or found is None:
-                reasons = [one for one in (found, missing) if one]
+            if time.monotonic() >= end or found_text is None:
+                reasons = [text for text in (found_text, missing) if text]
                 raise AssertionError("\n".join([*reasons, _shown(entries)]))
             time.sleep(LOOK_INTERVAL)
 
@@ -258,7 +258,7 @@ def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) ->
 
 
 def _place_text(wanted: list[Expected], place: int) -> str:
-    done = ", ".join(_name(one) for one in wanted[:place])
+    done = ", ".join(_name(message) for message in wanted[:place])
     return f"after {done}" if done else "at first"
 
 
@@ -314,9 +314,9 @@ def _shown(entries: list[LogEntry]) -> str:
     begin = entries[0].time if entries else 0.0
     for entry in entries[-MAX_SHOWN_ENTRIES:]:
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
-        what = entry.error or _text(entry)
+        text = entry.error or _text(entry)
         fault = f"  ({entry.fault})" if entry.fault else ""
-        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {what}{fault}")
+        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {text}{fault}")
     return "\n".join(
         ["what went over the wire (< from a client, > to it):", *(lines or ["  nothing"])]
     )

@@ -131,8 +131,8 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a source that gives frames") from exc
         except StopAsyncIteration:
             raise RefusedError(410, f"{name} has ended", "one that goes on") from None
-        kept = self._kept.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
-        kept.append(frame)
+        queue = self._kept.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
+        queue.append(frame)
         self._kept.move_to_end(viewer)
         while len(self._kept) > MAX_KEPT:
             self._kept.popitem(last=False)

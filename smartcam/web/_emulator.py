@@ -186,13 +186,13 @@ def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
     return site.cameras[_name(site, call)]
 
 
-def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
+def _operator(site: EmulatorSite, call: CallRequest, label: str) -> Any:
     """Return a method of the camera's operator; RefusedError: the camera does not have it."""
     emulator = _emulator(site, call)
-    if not hasattr(emulator.device, what):
+    if not hasattr(emulator.device, label):
         able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
-        raise RefusedError(409, f"{what} of a camera that speaks {emulator.dialect}", able)
-    return getattr(emulator.device, what)
+        raise RefusedError(409, f"{label} of a camera that speaks {emulator.dialect}", able)
+    return getattr(emulator.device, label)
 
 
 def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
@@ -258,7 +258,7 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
     switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
     if wanted.id not in emulator.application_ids:
-        known = ", ".join(str(one) for one in emulator.application_ids)
+        known = ", ".join(str(ident) for ident in emulator.application_ids)
         field = {"field": "id", "came": str(wanted.id), "expected": f"one of {known}"}
         raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
     if not switch(wanted.id, running=wanted.running):
@@ -404,8 +404,8 @@ def _log_entry(site: EmulatorSite, call: CallRequest) -> object:
     entries, count = emulator.log.since(serial, 1)
     first = count - len(emulator.log)
     if not entries or serial < first:
-        there = f"{first} to {count - 1}" if len(emulator.log) else "none"
-        raise RefusedError(404, f"log entry {text!r}", f"one that is there: {there}")
+        entries_text = f"{first} to {count - 1}" if len(emulator.log) else "none"
+        raise RefusedError(404, f"log entry {text!r}", f"one that is there: {entries_text}")
     return serialize.camera_entry(serial, entries[0], emulator, whole=True)
 
 

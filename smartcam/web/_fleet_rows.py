@@ -329,9 +329,9 @@ class FleetRow:
         value = shown_value(result.value, self._layout)
         if "parts" in value:
             parts = [
-                [one["name"][:40], *(round(one[key], 5) for key in ("x", "y", "theta"))]
-                for one in value["parts"][:MAX_DRAWN]
-                if None not in (one["x"], one["y"], one["theta"])
+                [part["name"][:40], *(round(part[key], 5) for key in ("x", "y", "theta"))]
+                for part in value["parts"][:MAX_DRAWN]
+                if None not in (part["x"], part["y"], part["theta"])
             ]
             return {**fields, "parts": parts, "parts_count": value["count"]}
         if "cut" in value:
@@ -386,10 +386,10 @@ def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
     if isinstance(value, dict):
         fields = list(value.items())[:20]
         return ", ".join(
-            f"{name} {line_of(one, units.get(name, {}), shown)}" for name, one in fields
+            f"{name} {line_of(value, units.get(name, {}), shown)}" for name, value in fields
         )
     if isinstance(value, list):
-        return f"{len(value)}: " + " | ".join(line_of(one, units, shown) for one in value[:3])
+        return f"{len(value)}: " + " | ".join(line_of(item, units, shown) for item in value[:3])
     if isinstance(value, float):
         if isinstance(units, str):
             return f"{shown.shown(value, units):.5g} {shown.of(units).name}"

@@ -142,13 +142,13 @@ class FleetSocket(PageSocket):
     async def _changed_rows(self) -> list[str]:
         view, sight, parts = self._view, self._sight, list[str]()
         ordered = await view.ordered(sight.query)
-        found = len(ordered.names)
-        first = max(0, min(sight.first, found - sight.count))
+        count = len(ordered.names)
+        first = max(0, min(sight.first, count - sight.count))
         names = [name for name in ordered.names[first : first + sight.count] if name in view.rows]
-        window = (found, first, names)
+        window = (count, first, names)
         if window != self._window:
             self._window = window
-            parts.append(f'"found":{found},"first":{first},"names":{json.dumps(names)}')
+            parts.append(f'"found":{count},"first":{first},"names":{json.dumps(names)}')
         seen, self._seen = self._seen, {}
         changed: list[str] = []
         for name in names:
@@ -165,7 +165,7 @@ class FleetSocket(PageSocket):
         return parts
 
     def _new_bars(self) -> Iterator[str]:
-        bars = [one for one in self._view.series if one[0] > self._bars]
+        bars = [bar for bar in self._view.series if bar[0] > self._bars]
         if bars:
             self._bars = bars[-1][0]
             yield f'"bars":{json.dumps(bars)}'

@@ -239,25 +239,25 @@ class FleetView:
             outcomes = await row.take(now)
             if row.may_have_changed:
                 row.account(outcomes, now)
-            came = self._count_in(row, outcomes, row.count - before)
+            arrived = self._count_in(row, outcomes, row.count - before)
             if row.may_have_changed or outcomes["errors"]:
                 self._refresh(row, now)
             if row.history.wants_picture:
                 self.failing[row] = None
-            done += 1 + came
+            done += 1 + arrived
             if done >= AT_ONCE:
                 done = 0
                 await asyncio.sleep(0)
 
-    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], came: int) -> int:
+    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], arrived: int) -> int:
         """Count a camera's outcomes; return their number."""
-        if came:
+        if arrived:
             self._bar.update(outcomes)
-            self._count += came
+            self._count += arrived
             self._errors += outcomes["errors"]
             self._aging.add(row)
             self._change(row)
-        return came
+        return arrived
 
     def _change(self, row: FleetRow) -> None:
         self.version += 1
@@ -363,17 +363,19 @@ class FleetView:
         return known is None or known.version != self.version
 
     async def _sorted(self, query: RowQuery) -> list[str]:
-        words, found = query.search.lower().split(), list[FleetRow]()
+        words, rows_found = query.search.lower().split(), list[FleetRow]()
         names = self._names
         for start in range(0, len(names), MAX_SIFTED_ROWS):
             rows = map(self.rows.get, names[start : start + MAX_SIFTED_ROWS])
-            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
+            rows_found += [
+                row for row in rows if row is not None and _fits(row, query.filter, words)
+            ]
             await asyncio.sleep(0)
         if query.sort in SORTS:
-            found.sort(key=SORTS[query.sort], reverse=query.down)
+            rows_found.sort(key=SORTS[query.sort], reverse=query.down)
         elif query.down:
-            found.reverse()
-        return [row.name for row in found]
+            rows_found.reverse()
+        return [row.name for row in rows_found]
 
 
 def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:

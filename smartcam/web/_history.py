@@ -127,24 +127,24 @@ class ShiftHistory:
         self._bars[-1][1 + KINDS.index(outcome)] += count
         self.totals[KINDS.index(outcome)] += count
 
-    def _fail(self, at: float, number: int | None, what: str) -> None:
+    def _fail(self, at: float, number: int | None, text: str) -> None:
         self._failed += 1
         self.in_a_row += 1
         if self.failed_since is None:
             self.failed_since = at
-        self._note(at, number, what)
+        self._note(at, number, text)
         self._newest = self._serial
 
-    def _note(self, at: float, number: int | None, what: str) -> None:
+    def _note(self, at: float, number: int | None, text: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
-        if last is not None and last.what == what[:MAX_TEXT_CHARACTERS] and not self._passed:
+        if last is not None and last.what == text[:MAX_TEXT_CHARACTERS] and not self._passed:
             last.count += 1
             last.until = at
             return
         self._passed = False
         self._serial += 1
-        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT_CHARACTERS]))
+        self._failures.append(Failure(self._serial, at, at, number, text[:MAX_TEXT_CHARACTERS]))
 
     # ------------------------------------------------------------------ pictures
 
@@ -211,7 +211,7 @@ class ShiftHistory:
             place = at // SLOT_SECONDS - last + count - 1
             if place >= 0:
                 slots[place] = [
-                    one + more for one, more in zip(slots[place], outcomes, strict=True)
+                    count + more for count, more in zip(slots[place], outcomes, strict=True)
                 ]
         return {"end": (last + 1) * SLOT_SECONDS, "places": "".join(map(_place, slots)).lstrip(" ")}
 

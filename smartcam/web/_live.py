@@ -132,7 +132,7 @@ class LiveReader:
         missed += len(new) - len(shown)
         if shown or missed:
             self._serial = view.serial
-            entries = [one.as_json() for one in shown]
+            entries = [result.as_json() for result in shown]
             yield News("results", {"results": entries, "missed": missed}, self._serial)
 
     def _changed(self, kind: str, value: Any) -> Iterator[News]:

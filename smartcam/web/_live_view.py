@@ -225,7 +225,7 @@ class LiveView:
             self._serial += max(0, len(batch) - MAX_RESULTS)
             for result in batch[-MAX_RESULTS:]:
                 self._add(result)
-            self._latencies += [one.latency for one in batch if one.latency is not None]
+            self._latencies += [result.latency for result in batch if result.latency is not None]
             self._picture_wanted = True
 
     def _add(self, result: Result[Any] | None, error: str = "") -> None:
@@ -305,12 +305,12 @@ def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
 
     ``units`` are those of its fields, and of the fields of its lists. ``layout``: that of a table.
     """
-    if isinstance(value, list) and all(isinstance(one, Localization) for one in value):
-        found: list[Localization] = value
-        frame = found[0].pose.header.frame_id if found else ""
+    if isinstance(value, list) and all(isinstance(part, Localization) for part in value):
+        localizations: list[Localization] = value
+        frame = localizations[0].pose.header.frame_id if localizations else ""
         return {
-            "parts": [_part(one) for one in found[:MAX_PARTS]],
-            "count": len(found),
+            "parts": [_part(localization) for localization in localizations[:MAX_PARTS]],
+            "count": len(localizations),
             "frame": frame,
         }
     units = {**units_of(value, layout), **_units_of_lists(value)}
@@ -342,9 +342,16 @@ def _as_text(value: Any) -> Any:
     return text if text and text.replace("\n", " ").isprintable() else value
 
 
-def _part(one: Localization) -> dict[str, Any]:
+def _part(localization: Localization) -> dict[str, Any]:
     """Return a part's place on the plane: metres, and radians about z."""
-    (x, y, z), (i, j, k, w) = one.pose.position, one.pose.orientation
+    (x, y, z), (i, j, k, w) = localization.pose.position, localization.pose.orientation
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
-    part = {"name": one.feature_id, "quality": one.quality, "x": x, "y": y, "z": z, "theta": theta}
+    part = {
+        "name": localization.feature_id,
+        "quality": localization.quality,
+        "x": x,
+        "y": y,
+        "z": z,
+        "theta": theta,
+    }
     return {name: jsonable(item) for name, item in part.items()}

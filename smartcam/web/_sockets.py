@@ -29,10 +29,12 @@ def check_websocket(request: web.Request, protocol: str, viewers: int, most: int
         RefusedError: 400, it asks for another; 503, there are ``most`` viewers already.
     """
     headers = request.headers
-    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", protocol).split(",")]
+    offered = [
+        offer.strip() for offer in headers.get("Sec-WebSocket-Protocol", protocol).split(",")
+    ]
     if headers.get("Upgrade", "").lower() != "websocket" or protocol not in offered:
-        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-        raise RefusedError(400, what, f"a WebSocket of {protocol}")
+        offered_text = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, offered_text, f"a WebSocket of {protocol}")
     if viewers >= most:
         raise RefusedError(503, f"viewer {most + 1}", f"{most} at one time")
 

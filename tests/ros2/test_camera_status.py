@@ -337,7 +337,7 @@ def test_state_that_is_known_is_said_in_one_way(known: KnownState, said: tuple[A
     )
     got = message.decode(message.encode(fields))
     assert (got.ready, got.application_id, got.error, how.level, how.text) == said
-    assert health(known, heard=False).level == (how.level if known.connected else STALE)
+    assert health(known, session_alive=False).level == (how.level if known.connected else STALE)
 
 
 async def test_unknown_bits_are_kept() -> None:

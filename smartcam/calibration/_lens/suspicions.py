@@ -188,7 +188,8 @@ def stray_remarks(outliers: Sequence[Stray], names: Sequence[str], done: str) ->
         distances = [outlier.off for outlier in outliers if outlier.ident == ident]
         yield Code.OUTLIER.remark(
             f"point {ident} of the target is {np.median(distances):.3g} pixels off in "
-            f"{len(distances)} of {len(names)} views: it is not at its nominal place, or something is taken for "
+            f"{len(distances)} of {len(names)} views: it is not at its nominal place, "
+            "or something is taken for "
             f"it; it {done} there"
         )
     rare = [outlier for outlier in outliers if outlier.ident not in often]

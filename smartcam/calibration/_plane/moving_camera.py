@@ -166,8 +166,9 @@ class MovingCamera:
         raise Code.PLANE_MOVED.refusal(
             f"moving camera: expected a motion that keeps the plane of the parts within "
             f"{1e3 * self._tolerance:g} mm, got one that shifts it by {1e3 * rise:.2f} mm along "
-            f"its normal and tilts it by {tilt:.2f} deg: {1e3 * distance:.2f} mm at the worst point "
-            "of the field. A camera that is raised or tilted needs a calibration of its own there",
+            f"its normal and tilts it by {tilt:.2f} deg: {1e3 * distance:.2f} mm at the worst "
+            "point of the field. A camera that is raised or tilted needs a calibration of its own "
+            "there",
             self._tolerance,
             distance,
         )

@@ -107,7 +107,7 @@ def load_yaml(text: str) -> Plain:
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
         text = text.partition("\n")[2]
     try:
-        root = compose(text, what="reading YAML")
+        root = compose(text, label="reading YAML")
         return None if root is None else _plain(root, set(), 0)
     except BadYamlError as exc:
         raise malformed("file", f"YAML ({_cut(str(exc))})") from exc

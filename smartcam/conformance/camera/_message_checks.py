@@ -40,9 +40,11 @@ def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        came = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
-        results = of_kind(came, MessageId.RESULT_CONTAINER)
-        if len(came) - len(results) != 1:
+        answers = [
+            message for message in client.received[mark:] if message.message_id != MessageId.STATUS
+        ]
+        results = of_kind(answers, MessageId.RESULT_CONTAINER)
+        if len(answers) - len(results) != 1:
             raise Differs(f"no answer to {what}, one to the Query after it", client.words(mark))
 
 

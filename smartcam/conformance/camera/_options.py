@@ -76,7 +76,7 @@ class Allow(enum.Flag):
     @property
     def names(self) -> list[str]:
         """The actions' names, in lower case."""
-        return [one.name.lower() for one in type(self) if one in self and one.name]
+        return [flag.name.lower() for flag in type(self) if flag in self and flag.name]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -70,8 +70,8 @@ class RawClient:
             opened = socket.create_connection(self._address, timeout=self._timeout)
             opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return opened
-        found = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
-        family, kind, proto, _, where = found[0]
+        addresses = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
+        family, kind, proto, _, where = addresses[0]
         opened = socket.socket(family, kind, proto)
         try:
             opened.connect(where)
@@ -121,11 +121,11 @@ class RawClient:
 
     def write(self, *data: bytes) -> float:
         """Send any bytes; as :meth:`send`."""
-        for one in data:
-            self._note(">", self.wire.spell_request(one))
+        for message in data:
+            self._note(">", self.wire.spell_request(message))
         at = time.monotonic()
-        for one in [b"".join(data)] if self._tcp else data:
-            self._write(one)
+        for message in [b"".join(data)] if self._tcp else data:
+            self._write(message)
         return at
 
     def _write(self, data: bytes) -> None:
@@ -148,9 +148,9 @@ class RawClient:
         """
         deadline = time.monotonic() + within
         while True:
-            heard = self._cut()
-            if heard is not None:
-                return heard
+            message = self._cut()
+            if message is not None:
+                return message
             left = deadline - time.monotonic()
             if left <= 0 or not self._receive(left):
                 return None
@@ -159,8 +159,8 @@ class RawClient:
         if not self._buffer:
             return None
         try:
-            found = self.wire.cut(self._buffer)
-            if not self._tcp and (found is None or found[2] != len(self._buffer)):
+            frame = self.wire.cut(self._buffer)
+            if not self._tcp and (frame is None or frame[2] != len(self._buffer)):
                 raise BadBytesError(
                     f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
                 )
@@ -168,19 +168,19 @@ class RawClient:
             self._note("<", hex_excerpt(self._buffer))
             self._buffer = b""
             raise Differs(f"frames of dialect {self.wire.dialect.name}", str(exc)) from exc
-        if found is None:
+        if frame is None:
             return None
-        message_id, body, size = found
+        message_id, body, size = frame
         self._buffer = self._buffer[size:]
-        heard = Heard(time.monotonic(), message_id, body)
-        self._note("<", self.wire.spell(heard))
+        message = Heard(time.monotonic(), message_id, body)
+        self._note("<", self.wire.spell(message))
         self._kept += len(body)
         if self._kept > MAX_HEARD_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
-        self.received.append(heard)
+        self.received.append(message)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]
-        return heard
+        return message
 
     def _receive(self, within: float) -> bool:
         if self.ended:
@@ -223,11 +223,11 @@ class RawClient:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
-        is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
+        is_it = fits if callable(fits) else lambda message: message.message_id == fits
         first = len(self.received) if mark < 0 else mark
-        for heard in self.received[first:]:
-            if is_it(heard):
-                return heard
+        for message in self.received[first:]:
+            if is_it(message):
+                return message
         deadline = time.monotonic() + within
         while (left := deadline - time.monotonic()) > 0:
             heard_now = self.next(left)
@@ -271,7 +271,7 @@ class RawClient:
 
     def words(self, first: int = 0) -> str:
         """Describe the frames from a place of :attr:`received` on, for a difference."""
-        shown = [self.wire.spell(one) for one in self.received[first:]]
+        shown = [self.wire.spell(message) for message in self.received[first:]]
         if len(shown) > 5:
             shown = [*shown[:4], f"{len(shown) - 4} more"]
         end = ["the end of the link"] if self.ended else []

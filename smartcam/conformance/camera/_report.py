@@ -40,7 +40,7 @@ class CameraReport:
 
     def add(self, finding: CameraFinding) -> None:
         """Add the outcome of a check or question; if it is repeated, the last outcome counts."""
-        self.findings = [one for one in self.findings if one.item.name != finding.item.name]
+        self.findings = [older for older in self.findings if older.item.name != finding.item.name]
         self.findings.append(finding)
 
     # ------------------------------------------------------------------ contents
@@ -108,13 +108,13 @@ class CameraReport:
 
     def _differences(self) -> list[str]:
         lines: list[str] = []
-        for one in self.differing:
+        for difference in self.differing:
             lines += [
-                f"  {one.item.name}: {one.item.about}",
-                f"    source:   {one.source}, {one.grade}",
-                f"    expected: {one.expected}",
-                f"    came:     {one.came}",
-                *(f"      {row}" for row in one.wire),
+                f"  {difference.item.name}: {difference.item.about}",
+                f"    source:   {difference.source}, {difference.grade}",
+                f"    expected: {difference.expected}",
+                f"    came:     {difference.came}",
+                *(f"      {row}" for row in difference.wire),
             ]
         return ["", "differs from the documented device:", *lines] if lines else []
 
@@ -155,8 +155,8 @@ class CameraReport:
                 note = "  # as in the emulator" if _is_default(item.quirk, finding.value) else ""
                 lines.append(f"  {item.quirk}: {_plain(finding.value)}{note}")
             elif finding.outcome is not CheckOutcome.NOT_APPLICABLE:
-                what = "no setting fits" if finding.failed else "not observed"
-                lines.append(f"  # {item.quirk}: {what}")
+                comment = "no setting fits" if finding.failed else "not observed"
+                lines.append(f"  # {item.quirk}: {comment}")
         if all(line.startswith("  #") for line in lines):
             return "\n".join(["quirks: {}", *lines])
         return "\n".join(["quirks:", *lines])

@@ -74,7 +74,7 @@ def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
     for inspection in inspections(camera):
         answers = of_kind(inspection.came, MessageId.TRIGGER)
-        if [camera.wire.numbers(heard.body) for heard in answers] != [(0,)]:
+        if [camera.wire.numbers(message.body) for message in answers] != [(0,)]:
             shown = "; ".join(map(camera.wire.spell, inspection.came)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", shown)
 
@@ -180,8 +180,8 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         camera.stop(client)
         client.fence()
         mark = len(client.received)
-        came = client.listen(2 * camera.options.quiet)
-        if of_kind(came, MessageId.RESULT_CONTAINER):
+        messages = client.listen(2 * camera.options.quiet)
+        if of_kind(messages, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.words(mark))
 
 

@@ -113,9 +113,9 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
         )
         done = (0, other)
         client.until(
-            lambda one: (
-                camera.wire.numbers(one.body) == done
-                and one.message_id == MessageId.SWITCH_APPLICATION
+            lambda message: (
+                camera.wire.numbers(message.body) == done
+                and message.message_id == MessageId.SWITCH_APPLICATION
             ),
             camera.options.switch_timeout,
             "the answer to the first switch",
@@ -129,7 +129,7 @@ def _judge_second(
     camera: CameraUnderTest, client: RawClient, mark: int, query: Heard, active: int
 ) -> None:
     switched = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
-    answers = [camera.wire.numbers(one.body) for one in switched]
+    answers = [camera.wire.numbers(message.body) for message in switched]
     numbers = camera.wire.numbers(query.body)
     if camera.wire.is_bid:
         if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:

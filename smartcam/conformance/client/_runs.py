@@ -81,13 +81,13 @@ class ClientRun:
     @property
     def sent_turns(self) -> list[int]:
         """Turns of the results that really came from the application, in order."""
-        found: list[int] = []
+        turns: list[int] = []
         for message in self.messages:
             if isinstance(message.message, ResultContainer) and not message.lost:
                 content = read_container(message.message.data)
                 if content is not None and content[0] == self.scene.application:
-                    found.append(content[1])
-        return found
+                    turns.append(content[1])
+        return turns
 
     def status_before(self, place: int) -> Status | None:
         """Return the last status that the camera had sent before a place, None for none."""
@@ -152,7 +152,7 @@ async def perform(
         began = camera.clock.now
         outcome = await client.perform(task, timeout)
         await _settle(camera)
-        messages = tuple(_message_of(camera.spoken, one, began) for one in _merged(camera.log))
+        messages = tuple(_message_of(camera.spoken, entry, began) for entry in _merged(camera.log))
     return ClientRun(
         scene=scene,
         task=task,
@@ -180,20 +180,20 @@ async def _settle(camera: EmulatedCamera) -> None:
 def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
     """Join the entry of an ignored frame with the entry that gives the reason."""
     merged: list[LogEntry] = []
-    for one in log:
+    for entry in log:
         before = merged[-1] if merged else None
         if (
-            one.error is not None
+            entry.error is not None
             and before is not None
-            and before.direction == one.direction
-            and before.peer == one.peer
+            and before.direction == entry.direction
+            and before.peer == entry.peer
             and before.message_id is not None
             and before.error is None
-            and before.hex == one.hex
+            and before.hex == entry.hex
         ):
-            merged[-1] = before._replace(error=one.error)
+            merged[-1] = before._replace(error=entry.error)
         else:
-            merged.append(one)
+            merged.append(entry)
     return merged
 
 

@@ -58,11 +58,11 @@ def _names(config: Any, option: str, known: Sequence[str]) -> tuple[str, ...] | 
     text: str | None = config.getoption(option, default=None)
     if text is None:
         return None
-    found = tuple(name.strip() for name in text.split(",") if name.strip())
-    for name in found:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
         if name not in known:
             raise pytest.UsageError(f"{option}: {name!r}; known are {', '.join(known)}")
-    return found or None
+    return names or None
 
 
 class ClientConformance:

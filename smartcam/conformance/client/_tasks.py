@@ -194,7 +194,7 @@ class _Worker:
             given = asyncio.run(self._await_it())
         else:
             given = cast("Iterable[bytes]", self._function(self._task))
-        return tuple(bytes(one) for one in given)
+        return tuple(bytes(result) for result in given)
 
     async def _await_it(self) -> Iterable[bytes]:
         current = asyncio.current_task()
@@ -226,7 +226,7 @@ class CommandClient(Client):
         else:
             expected = "a text, or the program and its arguments"
             given = check_all(command, "client command", expected)
-            words = [check_text(one, "client command") for one in given]
+            words = [check_text(text, "client command") for text in given]
         self._template = words
         self._cwd = None if cwd is None else str(check_path(cwd, "cwd", "client command"))
         text = " ".join(self._template)
@@ -276,16 +276,16 @@ class CommandClient(Client):
             return Outcome(ended=False, seconds=time.monotonic() - began)
         finally:
             await _end(process)
-        seconds, said = time.monotonic() - began, _shorten(err)
+        seconds, errors = time.monotonic() - began, _shorten(err)
         if process.returncode == UNSUPPORTED:
-            return Outcome(supported=False, seconds=seconds, said=said)
+            return Outcome(supported=False, seconds=seconds, said=errors)
         try:
             results, error = read_results(out), None
         except ValueError as exc:
             results, error = (), str(exc)
         if process.returncode:
             error = f"exit code {process.returncode}"
-        return Outcome(results, error, seconds=seconds, said=said)
+        return Outcome(results, error, seconds=seconds, said=errors)
 
 
 async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:

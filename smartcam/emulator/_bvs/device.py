@@ -384,7 +384,7 @@ class Device:
         Raises:
             ConfigurationError: no application has that id.
         """
-        application = check_application(application, who="device")
+        application = check_application(application, caller="device")
         running = check_flag(running, "running", "device")
         target = self._applications[self._known(application)]
         with self.around():
@@ -457,7 +457,7 @@ class Device:
 
     def drop_triggers(self, count: int) -> None:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
-        self._trigger_drops += check_integer(count, "count", 0, who="device")
+        self._trigger_drops += check_integer(count, "count", 0, caller="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the running inspection, or else the next one.
@@ -753,19 +753,19 @@ class Device:
         self._inspector = application.inspector
         application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
 
-    def _inspected(self, run: _Inspection, found: Values | None) -> None:
+    def _inspected(self, run: _Inspection, values: Values | None) -> None:
         """Use an inspector's result; a fault may delay the run's end."""
         self._inspector = None
         with self.around():
-            finish = functools.partial(self._finish_run, run, found)
+            finish = functools.partial(self._finish_run, run, values)
             self._events[_Event.INSPECTED] = (self._now + run.change.late, finish)
             self._advance(self._now)
 
-    def _finish_run(self, run: _Inspection, found: Values | None = None) -> None:
+    def _finish_run(self, run: _Inspection, values: Values | None = None) -> None:
         """Send the result, and set Waiting for Trigger (the order is a quirk)."""
         self._processing = False
         self._change = RunChange()
-        result = self._result(run, found)
+        result = self._result(run, values)
         if self.quirks.waiting_before_result:
             self._report()
         if result is not None and not run.change.silent:
@@ -774,19 +774,19 @@ class Device:
                 self._send(result)
         self._report()
 
-    def _result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
+    def _result(self, run: _Inspection, values: Values | None) -> m.ResultContainer | None:
         """Return the result; a repeated one is built only once."""
         if self._period is None:
-            return self._build_result(run, found)
+            return self._build_result(run, values)
         key = (run.turn % self._period, self._byte_order)
         result = self._containers.get(key)
         if result is None:
-            result = self._build_result(run, found)
+            result = self._build_result(run, values)
             if result is not None:
                 self._containers[key] = result
         return result
 
-    def _build_result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
+    def _build_result(self, run: _Inspection, values: Values | None) -> m.ResultContainer | None:
         application = self._active
         order = self._byte_order
         try:
@@ -799,8 +799,8 @@ class Device:
                     values=run.input,
                     byte_order=order,
                 )
-            elif found is not None:
-                data = application.container_of(found, number=run.number, byte_order=order)
+            elif values is not None:
+                data = application.container_of(values, number=run.number, byte_order=order)
             else:
                 data = None  # the inspection failed
         except ENDS_PROGRAM:
@@ -844,8 +844,8 @@ class Device:
         except InterpretationError as exc:
             _log.debug("= input data dropped: %s", exc)
             return None
-        found: Mapping[str, Any] = values._asdict()
-        return found
+        inputs: Mapping[str, Any] = values._asdict()
+        return inputs
 
     def _next_input(self) -> Mapping[str, Any] | None:
         inspected = isinstance(self._active, InspectedApplication)

@@ -115,15 +115,15 @@ class EmulatedInSight(LineCamera):
         quirks: InSightQuirks | Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        who = "emulator"
-        online = check_flag(online, "online", who)
-        model = check_text(model, "model", who, least=1, most=100)
+        caller = "emulator"
+        online = check_flag(online, "online", caller)
+        model = check_text(model, "model", caller, least=1, most=100)
         if active is not None:
-            active = check_application_or_name(active, "active", who)
-        jobs = check_all(jobs, "jobs", "a list of jobs", who)
+            active = check_application_or_name(active, "active", caller)
+        jobs = check_all(jobs, "jobs", "a list of jobs", caller)
         users, evaluations, info = (
-            None if given is None else check_texts(given, what, who)
-            for what, given in (("users", users), ("evaluations", evaluations), ("info", info))
+            None if given is None else check_texts(given, option, caller)
+            for option, given in (("users", users), ("evaluations", evaluations), ("info", info))
         )
         self.device = InSightDevice(jobs, active=active, online=online, image=image)
         self.refuse_login: bool = False
@@ -219,12 +219,12 @@ class EmulatedInSight(LineCamera):
     @property
     def sessions(self) -> list[str]:
         """Address and port of the clients that are logged in, the oldest session first."""
-        return [one.peer for one in self._by_number() if one.logged_in]
+        return [client.peer for client in self._by_number() if client.logged_in]
 
     @property
     def links(self) -> list[str]:
         """Address and port of all clients that are connected."""
-        return [one.peer for one in self._by_number()]
+        return [client.peer for client in self._by_number()]
 
     @classmethod
     def image_answer(cls, image: NDArray[np.uint8]) -> bytes:
@@ -279,8 +279,8 @@ class EmulatedInSight(LineCamera):
 
     def drop_connections(self) -> None:
         """End every connection at once, like a broken network. Running events continue."""
-        for one in self._by_number():
-            one.close("dropped")
+        for client in self._by_number():
+            client.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
         """Wait until clients have sent a command ``count`` times since the beginning.
@@ -299,7 +299,7 @@ class EmulatedInSight(LineCamera):
         Cancellation: safe.
         """
         mnemonic = check_text(command, "command", "wait_heard", least=1, most=100).upper()
-        count = check_integer(count, "count", 0, who="wait_heard")
+        count = check_integer(count, "count", 0, caller="wait_heard")
         timeout = check_seconds(timeout, "timeout", "wait_heard")
         try:
             await self._heard.wait(mnemonic, count, timeout)
@@ -324,8 +324,8 @@ class EmulatedInSight(LineCamera):
 
     def make_client(self, link: ClientLink, server: LineServer) -> TelnetClient:
         """Return a new client."""
-        taken = {one.number for one in self._by_number()}
-        number = next(one for one in range(MAX_SESSIONS + 1) if one not in taken)
+        taken = {client.number for client in self._by_number()}
+        number = next(number for number in range(MAX_SESSIONS + 1) if number not in taken)
         return TelnetClient(self, link, server, number)
 
     def greet(self, client: LineClient) -> None:
@@ -379,7 +379,7 @@ class EmulatedInSight(LineCamera):
 
     def _by_number(self) -> list[TelnetClient]:
         clients = [client for client in self._clients.values() if isinstance(client, TelnetClient)]
-        return sorted(clients, key=lambda one: one.number)
+        return sorted(clients, key=lambda client: client.number)
 
     def _after_start(self) -> None:
         self._offset = nanoseconds(self.clock.now) - self.device.now
@@ -396,5 +396,5 @@ class EmulatedInSight(LineCamera):
 
     def _due(self) -> int | None:
         due, later = self.device.due, super()._due()
-        mine = None if due is None else due + self._offset
-        return min((one for one in (mine, later) if one is not None), default=None)
+        own_time = None if due is None else due + self._offset
+        return min((time for time in (own_time, later) if time is not None), default=None)

@@ -125,14 +125,14 @@ class DelayLine(Generic[T]):
         """
         now = self._now
         gatherer = self._count(amount, now)
-        for one in sent:
-            self.size += one.size
-            if gatherer is not None and not one.delay:
-                gatherer.company.append(one)
-            elif self.ordered and not one.overtaken:
-                self._queue.append(_Waiting(one, now))
+        for message in sent:
+            self.size += message.size
+            if gatherer is not None and not message.delay:
+                gatherer.company.append(message)
+            elif self.ordered and not message.overtaken:
+                self._queue.append(_Waiting(message, now))
             else:
-                self._loose.append(_Waiting(one, now))
+                self._loose.append(_Waiting(message, now))
 
     def run(self) -> None:
         """Let all transmissions pass whose time has come."""
@@ -164,8 +164,8 @@ class DelayLine(Generic[T]):
         self._queue.clear()
         self._loose.clear()
         for waiting in left:
-            for one in (waiting.sent, *waiting.company):
-                self.lost(one)
+            for message in (waiting.sent, *waiting.company):
+                self.lost(message)
 
     @property
     def _now(self) -> int:
@@ -173,66 +173,76 @@ class DelayLine(Generic[T]):
 
     def _count(self, amount: int, now: int) -> _Waiting[T] | None:
         """Count new transmissions for those that wait; return the one to join."""
-        waiting = [one for one in (*self._queue, *self._loose) if one.missing > 0]
-        for one in waiting:
-            one.missing -= amount
-            if one.sent.behind and one.missing <= 0:
-                one.due = max(one.due, now)
-        together = [one for one in waiting if not self.ordered and not one.sent.behind]
+        waiting = [
+            waiting_message
+            for waiting_message in (*self._queue, *self._loose)
+            if waiting_message.missing > 0
+        ]
+        for waiting_message in waiting:
+            waiting_message.missing -= amount
+            if waiting_message.sent.behind and waiting_message.missing <= 0:
+                waiting_message.due = max(waiting_message.due, now)
+        together = [
+            waiting_message
+            for waiting_message in waiting
+            if not self.ordered and not waiting_message.sent.behind
+        ]
         return together[0] if together else None
 
     def _run_loose(self) -> None:
         """Pass transmissions that may be overtaken, and all without an order."""
         now = self._now
-        due = [one for one in self._loose if one.when <= now]
-        for one in sorted(due, key=lambda one: (one.when, one.sent.behind)):
-            if one not in self._loose:  # closed meanwhile
+        due = [waiting_message for waiting_message in self._loose if waiting_message.when <= now]
+        for waiting_message in sorted(
+            due, key=lambda waiting_message: (waiting_message.when, waiting_message.sent.behind)
+        ):
+            if waiting_message not in self._loose:  # closed meanwhile
                 return
             if self.ordered:
-                self._loose.remove(one)
-                self._queue.append(one)
+                self._loose.remove(waiting_message)
+                self._queue.append(waiting_message)
             else:
-                self._pass_datagrams(one)
+                self._pass_datagrams(waiting_message)
 
-    def _pass_datagrams(self, one: _Waiting[T]) -> None:
+    def _pass_datagrams(self, waiting_message: _Waiting[T]) -> None:
         """Pass the due parts, one datagram each; joined parts are one datagram."""
-        sent = one.sent
+        sent = waiting_message.sent
         if sent.gather is not None and not sent.behind:
-            self._loose.remove(one)
-            together = [sent, *one.company]
+            self._loose.remove(waiting_message)
+            together = [sent, *waiting_message.company]
             self._hand_over([self._next(each, whole=True) for each in together])
             for each in together:
                 self._finish(each)
             return
-        one.missing = 0
-        while one in self._loose and one.due <= self._now:
+        waiting_message.missing = 0
+        while waiting_message in self._loose and waiting_message.due <= self._now:
             self._hand_over([self._next(sent)])
             if sent.parts:
-                one.pause(self._now, 0)
-            elif one in self._loose:
-                self._loose.remove(one)
+                waiting_message.pause(self._now, 0)
+            elif waiting_message in self._loose:
+                self._loose.remove(waiting_message)
                 self._finish(sent)
 
     def _run_queue(self) -> None:
         batch: list[tuple[T, bytes]] = []
         while self._queue and not self.stopped and self._queue[0].when <= self._now:
-            one = self._queue[0]
-            if one.paused:
-                one.pause(self._now, self.turns)
-            if one.turns or one.due > self._now:
+            first = self._queue[0]
+            if first.paused:
+                first.pause(self._now, self.turns)
+            if first.turns or first.due > self._now:
                 break
-            one.missing = 0
-            sent = one.sent
+            first.missing = 0
+            sent = first.sent
             batch.append(self._next(sent))
             if sent.parts:
-                one.paused = True
+                first.paused = True
                 batch = self._hand_over(batch)
                 continue
             self._queue.popleft()
             if sent.end is not None:
                 batch = self._hand_over(batch)
                 if self.stopped:  # bytes before the end have not passed yet
-                    self._queue.appendleft(one)
+                    self._queue.appendleft(first)
                 else:
                     self._finish(sent)
         self._hand_over(batch)
@@ -257,7 +267,7 @@ class DelayLine(Generic[T]):
     def _arm(self) -> None:
         """Set the timer for the next transmission."""
         waiting = [*list(self._queue)[:1], *self._loose]
-        when = min((one.when for one in waiting), default=None)
+        when = min((waiting_message.when for waiting_message in waiting), default=None)
         self._timer.set(None if self.stopped else when)
 
     def _tick(self) -> None:

@@ -121,9 +121,9 @@ class CallNumbers:
             return False
         self._known.add(call)
         if len(self._known) > KNOWN_CALLS:
-            kept = sorted(self._known)[KNOWN_CALLS // 2 :]
-            self.floor = kept[0] - 1
-            self._known = set(kept)
+            newest = sorted(self._known)[KNOWN_CALLS // 2 :]
+            self.floor = newest[0] - 1
+            self._known = set(newest)
         return True
 
 
@@ -341,10 +341,10 @@ class Agent:
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         if frames_of is not None:
             self._frames[name] = frames_of
-        found = self._frames.get(name, NO_FRAMES)
-        reporter = found.reporter
+        state = self._frames.get(name, NO_FRAMES)
+        reporter = state.reporter
         frames = SharedFrames(
-            name, found.make, self._sender, self._encoder, found.url, reporter is not None
+            name, state.make, self._sender, self._encoder, state.url, reporter is not None
         )
         events = self._on_camera_event
         host = Host(
@@ -474,19 +474,19 @@ class Agent:
 
     def _on_program(self, key: str, present: bool) -> None:
         token = self._keys.tail(key, "presence/program")[-1]
-        who = ProgramName.of(token)
-        if not who.genuine:
+        name = ProgramName.of(token)
+        if not name.genuine:
             return
-        there, guest = self._present[who.role], self._programs.get(who.name)
+        names_present, guest = self._present[name.role], self._programs.get(name.name)
         if not present:
-            there.discard(token)
-        elif len(there) < MAX_PROGRAMS_PER_ROLE:
-            there.add(token)
-        if guest is None or guest.who != who:
+            names_present.discard(token)
+        elif len(names_present) < MAX_PROGRAMS_PER_ROLE:
+            names_present.add(token)
+        if guest is None or guest.who != name:
             return
         guest.present = present
         if not present:
-            self._forget(who.name)
+            self._forget(name.name)
 
     def _forget(self, program: str, *, going_back: bool = True) -> None:
         """End the calls and reservations of a lost program."""
@@ -509,23 +509,23 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _known(self, who: ProgramName) -> Guest | None:
+    def _known(self, name: ProgramName) -> Guest | None:
         """Return a known program; None also if another one uses its name."""
-        guest = self._programs.get(who.name)
-        return guest if guest is not None and guest.who == who else None
+        guest = self._programs.get(name.name)
+        return guest if guest is not None and guest.who == name else None
 
-    def _guest(self, who: ProgramName, call: int) -> Guest | None:
+    def _guest(self, name: ProgramName, call: int) -> Guest | None:
         """Return the program that sent a hello; None if the program has left since then."""
-        known, role = self._known(who), who.role
-        left = self._gone[role].get(who.name, 0)
+        known, role = self._known(name), name.role
+        left = self._gone[role].get(name.name, 0)
         if known is None and call > left:
             if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
                 raise LocalProtocolError(
                     f"{self.name}: {MAX_PROGRAMS_PER_ROLE} programs of role {role} are here already"
                 )
-            present = who.token in self._present[role]
+            present = name.token in self._present[role]
             numbers = CallNumbers(left), CallNumbers(left)
-            known = self._programs[who.name] = Guest(who, self.next_program(), present, *numbers)
+            known = self._programs[name.name] = Guest(name, self.next_program(), present, *numbers)
             self._of_role[role] += 1
             if not present:
                 loop = asyncio.get_running_loop()
@@ -577,36 +577,45 @@ class Agent:
         Raises:
             ProtocolError: the program uses another's name, or a key for another role than its own.
         """
-        who = ProgramName.of(token)
-        if not who.genuine or role not in {None, who.role}:
-            raise ProtocolError(f"{self.name}: a call as {who.name:.80}, by another program")
-        return who
+        program = ProgramName.of(token)
+        if not program.genuine or role not in {None, program.role}:
+            raise ProtocolError(f"{self.name}: a call as {program.name:.80}, by another program")
+        return program
 
     def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
-        who, number = self._who(str(fields["program"]), role), int(fields["call"])
+        program, number = self._who(str(fields["program"]), role), int(fields["call"])
         if "come" in fields:
-            self._sender.come(who.name, number, fields["come"])
+            self._sender.come(program.name, number, fields["come"])
             return
         if "cancel" in fields:
-            self._cancel(host, who.name, int(fields["cancel"]), command)
-            self._reply(who.name, number, {"answer": {}})
+            self._cancel(host, program.name, int(fields["cancel"]), command)
+            self._reply(program.name, number, {"answer": {}})
             return
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(who, number) if action == "hello" else self._known(who)
+        guest = self._guest(program, number) if action == "hello" else self._known(program)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
         left = self._admit(
-            host, guest, who.name, number, epoch, action, deadline, timeout, command, reservation
+            host,
+            guest,
+            program.name,
+            number,
+            epoch,
+            action,
+            deadline,
+            timeout,
+            command,
+            reservation,
         )
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
             blobs, entered = message.blobs, guest.entered
             call = ProgramCall(
-                host, who.name, owner, arguments, blobs, left, entered, None, reservation
+                host, program.name, owner, arguments, blobs, left, entered, None, reservation
             )
             self._start(action, call, guest, command)
 

@@ -142,8 +142,8 @@ class AgentBundle:
             head = _HEAD.pack(_MAGIC, self._epoch, number, self._number, count)
             self._out.put(b"".join((head, *parts)))
 
-    def _on_heard(self, heard: bool) -> None:
-        if heard:
+    def _on_heard(self, has_subscribers: bool) -> None:
+        if has_subscribers:
             self._remind(0)
 
     def _end_reminding(self) -> None:

@@ -77,7 +77,7 @@ class ProgramCall(NamedTuple):
             ConfigurationError: the value is not valid.
         """
         value = self.arguments.get(name)
-        return None if value is None else check(value, name, *bounds, who=self.host.name)
+        return None if value is None else check(value, name, *bounds, caller=self.host.name)
 
     def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
         """Return a required argument."""

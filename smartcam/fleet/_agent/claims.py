@@ -262,15 +262,15 @@ class Claims:
             if not contested:
                 return
             standby_of = {
-                (one.summary.camera, one.summary.agent): one.standby
+                (answer.summary.camera, answer.summary.agent): answer.standby
                 for agent in sorted({agent for _, agent in contested})
-                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
+                for answer in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
-            if all(standby_of.get(one) for one in contested):
+            if all(standby_of.get(camera) for camera in contested):
                 return
             silent = not contested & standby_of.keys()
             if not silent or loop.time() > patience:
-                name, agent = min(one for one in contested if not standby_of.get(one))
+                name, agent = min(camera for camera in contested if not standby_of.get(camera))
                 more = f", and {len(contested) - 1} more cameras" if len(contested) > 1 else ""
                 says = ", which does not answer" if silent else ""
                 raise ConfigurationError(
@@ -436,14 +436,14 @@ def _order(start: str) -> tuple[int, str]:
 
 async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
     """Return the addresses of each host, or its name if it has none; bounded."""
-    found: dict[str, set[str]] = {}
+    places: dict[str, set[str]] = {}
     names: list[str] = []
     for host in hosts:
         try:
-            found[host] = {ipaddress.ip_address(host).compressed}
+            places[host] = {ipaddress.ip_address(host).compressed}
         except ValueError:
             names.append(host)
-            found[host] = {host.lower()}
+            places[host] = {host.lower()}
 
     async def resolve(host: str) -> None:
         loop = asyncio.get_running_loop()
@@ -451,7 +451,7 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
             addresses = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             return  # the client reports an unknown host
-        found[host] |= {str(address[4][0]) for address in addresses}
+        places[host] |= {str(address[4][0]) for address in addresses}
 
     if names:
         tasks = [asyncio.create_task(resolve(name)) for name in names]
@@ -460,7 +460,7 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
         finally:
             for task in tasks:
                 task.cancel()
-    return found
+    return places
 
 
 def _is_taken(host: Host) -> bool:

@@ -329,8 +329,13 @@ class Host:
     def _not_granted(self, action: str, timeout: float) -> SmartCamError:
         """Return the error for a program that waited in vain for others to let go of the camera."""
         holder = self.gate.holder
-        who = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
-        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {action} was not done"
+        holder_text = (
+            "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
+        )
+        text = (
+            f"{self.name}: {holder_text} did not let go within {timeout:.3g} s; "
+            f"{action} was not done"
+        )
         return late(action, text)
 
     # ------------------------------------------------------------------ what the camera is
@@ -521,8 +526,8 @@ class Host:
                 self._results_out.put(payload)
                 self._remind(0)
 
-    def _on_heard(self, heard: bool) -> None:
-        if heard:
+    def _on_heard(self, has_subscribers: bool) -> None:
+        if has_subscribers:
             self._remind(0)
 
     def _remind(self, step: int) -> None:

@@ -59,9 +59,9 @@ class FleetChanges:
 
     def __str__(self) -> str:
         parts = [
-            f"{len(names)} {what} ({_some(names)})"
-            for what in ("added", "removed", "changed")
-            if (names := getattr(self, what))
+            f"{len(names)} {change} ({_some(names)})"
+            for change in ("added", "removed", "changed")
+            if (names := getattr(self, change))
         ]
         return ", ".join([*parts, f"{self.kept} kept"])
 
@@ -136,9 +136,9 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
 def _files_in(given: object, folder: Path) -> list[str | None]:
     """Return the texts in a camera's programs that are names of files."""
     if isinstance(given, dict):
-        return [one for part in given.values() for one in _files_in(part, folder)]
+        return [path for part in given.values() for path in _files_in(part, folder)]
     if isinstance(given, list):
-        return [one for part in given for one in _files_in(part, folder)]
+        return [path for part in given for path in _files_in(part, folder)]
     try:
         return [given] if isinstance(given, str) and (folder / given).is_file() else []
     except (OSError, ValueError):  # not the name of a file

@@ -176,13 +176,13 @@ class FleetServer(Server):
                 self._bus,
                 Keys(file.fleet),
                 lambda: self.outlet_states(),
-                lambda asked: self.stored_results(asked),
+                lambda request: self.stored_results(request),
             )
             stack.callback(outlets.close)
             stack.push_async_callback(self._leave_ros)
             await self._enter_ros()
             if isinstance(self._bus, ZenohEnd):
-                ports = frozenset(int(one.rpartition(":")[2]) for one in self._listen)
+                ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in self._listen)
                 door = Door(ports, self._bus.linked)
                 door.open()
                 stack.callback(door.close)
@@ -290,7 +290,7 @@ class FleetServer(Server):
     def _ros_fleet(self, bus: ZenohEnd) -> RosFleet:
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
-        file, own = self.file, self.file.agent_name
+        file, own_name = self.file, self.file.agent_name
         cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
         calibrations = {
             name: camera.load_calibration(self.folder) for name, camera in cameras.items()
@@ -313,7 +313,7 @@ class FleetServer(Server):
             hand_eyes={
                 name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
             },
-            wanted=lambda agent, _camera: agent == own,
+            wanted=lambda agent, _camera: agent == own_name,
             desks=self.calibrations,
         )
 
@@ -558,8 +558,8 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
     # with roles each program needs a certificate of its own: that of the agent may not command
-    own = scheme == "fleet+tls" and file.access == "any-certificate"
-    certificates = file.certificates if own else None
+    own_authority = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if own_authority else None
     # a router of several agents may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

@@ -168,9 +168,9 @@ def by_name(
     cameras: Iterable[ReportedCamera], better: Callable[[ReportedCamera], Any]
 ) -> dict[str, Any]:
     """Return one camera for each name: if two agents have it for a moment, the better one."""
-    found: dict[str, ReportedCamera] = {}
+    reported: dict[str, ReportedCamera] = {}
     for camera in cameras:
-        known = found.get(camera.summary.camera)
+        known = reported.get(camera.summary.camera)
         if known is None or better(camera) > better(known):
-            found[camera.summary.camera] = camera
-    return found
+            reported[camera.summary.camera] = camera
+    return reported

@@ -224,19 +224,21 @@ class _ByPattern(Generic[P]):
         for same in (*self._exact.values(), self._wild):
             yield from tuple(same)
 
-    def __contains__(self, one: P) -> bool:
-        return one in self._wild or one in self._exact.get(one.pattern, ())
+    def __contains__(self, declared: P) -> bool:
+        return declared in self._wild or declared in self._exact.get(declared.pattern, ())
 
-    def add(self, one: P) -> None:
-        same = self._wild if "*" in one.pattern else self._exact.setdefault(one.pattern, {})
-        same[one] = None
+    def add(self, declared: P) -> None:
+        same = (
+            self._wild if "*" in declared.pattern else self._exact.setdefault(declared.pattern, {})
+        )
+        same[declared] = None
 
-    def remove(self, one: P) -> None:
-        self._wild.pop(one, None)
-        same = self._exact.get(one.pattern, {})
-        same.pop(one, None)
+    def remove(self, declared: P) -> None:
+        self._wild.pop(declared, None)
+        same = self._exact.get(declared.pattern, {})
+        same.pop(declared, None)
         if not same:
-            self._exact.pop(one.pattern, None)
+            self._exact.pop(declared.pattern, None)
 
     def clear(self) -> None:
         self._exact.clear()
@@ -245,8 +247,8 @@ class _ByPattern(Generic[P]):
     def meeting(self, pattern: str) -> list[P]:
         """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
-            return [one for one in self if meets(one.pattern, pattern)]
-        wild = [one for one in self._wild if meets(one.pattern, pattern)]
+            return [declared for declared in self if meets(declared.pattern, pattern)]
+        wild = [declared for declared in self._wild if meets(declared.pattern, pattern)]
         return [*self._exact.get(pattern, ()), *wild]
 
 
@@ -328,13 +330,13 @@ class MemoryEnd(Bus):
 
     def put(self, key: str, payload: bytes) -> None:
         for end in self._others():
-            for one in end.heard.meeting(key):
-                self._loop.call_soon(_call, one, key, payload)
+            for subscription in end.heard.meeting(key):
+                self._loop.call_soon(_call, subscription, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         for end in self._others():
-            for one in end.heard_parts.meeting(key):
-                self._loop.call_soon(_call, one, key, head, data)
+            for subscription in end.heard_parts.meeting(key):
+                self._loop.call_soon(_call, subscription, key, head, data)
 
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
         return _MemoryDeclared(self.heard_parts, pattern, hear)
@@ -362,12 +364,12 @@ class MemoryEnd(Bus):
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         questions = [
-            (one, _MemoryQuestion(pattern, payload))
+            (answerer, _MemoryQuestion(pattern, payload))
             for end in self._others()
-            for one in end.answered.meeting(pattern)
+            for answerer in end.answered.meeting(pattern)
         ]
-        for one, question in questions:
-            self._loop.call_soon(_call, one, question)
+        for answerer, question in questions:
+            self._loop.call_soon(_call, answerer, question)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 for _, question in questions:
@@ -380,13 +382,15 @@ class MemoryEnd(Bus):
         return made.then(lambda: self._tell(key, False))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        return [one.pattern for end in self._others() for one in end.present_here.meeting(pattern)]
+        return [
+            token.pattern for end in self._others() for token in end.present_here.meeting(pattern)
+        ]
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         made = _MemoryDeclared(self.watched, pattern, see)
         for end in self._others():
-            for one in end.present_here.meeting(pattern):
-                self._loop.call_soon(_call, made, one.pattern, True)
+            for token in end.present_here.meeting(pattern):
+                self._loop.call_soon(_call, made, token.pattern, True)
         return made
 
     # ------------------------------------------------------------------ among ends
@@ -398,23 +402,23 @@ class MemoryEnd(Bus):
     def _tell_presence(self, present: bool) -> None:
         """Report this end's presences to all ends, and theirs to this one."""
         for end in self._others():
-            for one in end.present_here:
+            for watcher in end.present_here:
                 if end is not self:
-                    for watch in self.watched.meeting(one.pattern):
-                        self._loop.call_soon(_call, watch, one.pattern, present)
-        for one in self.present_here:
-            self._tell(one.pattern, present)
+                    for watch in self.watched.meeting(watcher.pattern):
+                        self._loop.call_soon(_call, watch, watcher.pattern, present)
+        for token in self.present_here:
+            self._tell(token.pattern, present)
 
     def _tell(self, key: str, present: bool) -> None:
         for end in self._others():
-            for one in end.watched.meeting(key):
-                self._loop.call_soon(_call, one, key, present)
+            for watcher in end.watched.meeting(key):
+                self._loop.call_soon(_call, watcher, key, present)
 
     def _tell_heard(self, pattern: str) -> None:
         """Make the publishers under a pattern check for subscribers."""
         for end in self._bus.ends:
-            for one in end.publishers.meeting(pattern):
-                one.look()
+            for publisher in end.publishers.meeting(pattern):
+                publisher.look()
 
     def is_heard(self, key: str) -> bool:
         """Return True if this end's messages under ``key`` have a subscriber."""
@@ -437,11 +441,11 @@ class _MemoryPublisher(Publisher):
 
     def look(self) -> None:
         """Check for subscribers, and report a change."""
-        heard = self._end.is_heard(self.pattern)
-        if heard != self.heard:
-            self.heard = heard
+        has_subscribers = self._end.is_heard(self.pattern)
+        if has_subscribers != self.heard:
+            self.heard = has_subscribers
             if self._on_heard is not None:
-                self._on_heard(heard)
+                self._on_heard(has_subscribers)
 
     def put(self, payload: bytes) -> None:
         self._end.put(self.pattern, payload)
@@ -464,10 +468,10 @@ class _MemoryQuestion(BusQuestion):
         self.done.set()
 
 
-def _call(one: _MemoryDeclared, *arguments: object) -> None:
+def _call(declared: _MemoryDeclared, *arguments: object) -> None:
     """Call a callback of an open declaration; log its error."""
-    if not one.closed:
-        one.call(*arguments)
+    if not declared.closed:
+        declared.call(*arguments)
 
 
 def _nothing(*_: object) -> None:

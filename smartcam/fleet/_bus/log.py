@@ -110,15 +110,15 @@ class AgentLog:
         An entry that contains ``first`` is returned completely.
         """
         begin = max(first, self.first)
-        found: list[bytes] = []
+        parts: list[bytes] = []
         for _, following, _, data in self._entries:
             if following <= begin:
                 continue
             most_bytes -= len(data)
-            if found and most_bytes < 0:
+            if parts and most_bytes < 0:
                 break
-            found.append(data)
-        return LogPart(begin, found, self.following)
+            parts.append(data)
+        return LogPart(begin, parts, self.following)
 
     def first_since(self, clock: float) -> int:
         """Return the number of the first message at ``clock`` or later."""

@@ -90,10 +90,14 @@ class ZenohEnd(ZenohSession, Bus):
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
             {
-                express: {"priority": priority, "express": express, "congestion_control": one}
+                express: {
+                    "priority": priority,
+                    "express": express,
+                    "congestion_control": congestion,
+                }
                 for express in (False, True)
             }
-            for one in (control.DROP, control.BLOCK)
+            for congestion in (control.DROP, control.BLOCK)
         )
         self._behind_all = {
             "priority": zenoh.Priority.DATA_LOW,
@@ -182,9 +186,9 @@ class ZenohEnd(ZenohSession, Bus):
             kind, _, place = endpoint.partition("/")
             host, _, port = place.rpartition(":")
             if kind == "tls":
-                found = await shake_hands(host.strip("[]"), int(port), folder, each)
-                if found.trouble:
-                    return found.trouble
+                refusal = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if refusal.trouble:
+                    return refusal.trouble
         return ""
 
     @property
@@ -199,8 +203,8 @@ class ZenohEnd(ZenohSession, Bus):
         """Return the addresses of connected ends; None while they are not known."""
         if self._session is None:
             return None
-        found = (place_of(str(link.dst)) for link in self._session.info.links())
-        return {place for place in found if place is not None}
+        places = (place_of(str(link.dst)) for link in self._session.info.links())
+        return {place for place in places if place is not None}
 
     # ------------------------------------------------------------------ sending
 
@@ -277,7 +281,7 @@ class ZenohEnd(ZenohSession, Bus):
 
     def _hand_over(
         self,
-        way: str,
+        method: str,
         session: Any,
         key: str,
         payload: bytes,
@@ -288,7 +292,7 @@ class ZenohEnd(ZenohSession, Bus):
         """Let a thread send a message, which waits for room; and later ones of the same way.
 
         Args:
-            way: key of messages that are sent in order.
+            method: key of messages that are sent in order.
             session: the engine's session.
             key: key of the message.
             payload: the message.
@@ -304,7 +308,7 @@ class ZenohEnd(ZenohSession, Bus):
                 "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
             )
             return
-        lane = hash(way) % SENDERS
+        lane = hash(method) % SENDERS
         sender = self._senders.get(lane)
         if sender is None:
             sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
@@ -317,14 +321,14 @@ class ZenohEnd(ZenohSession, Bus):
                 with self._lock:
                     self._sending -= size
                     self._doubtful -= doubtful
-                    self._behind[way] -= 1
-                    if not self._behind[way]:
-                        del self._behind[way]
+                    self._behind[method] -= 1
+                    if not self._behind[method]:
+                        del self._behind[method]
 
         with self._lock:
             self._sending += size
             self._doubtful += doubtful
-            self._behind[way] += 1
+            self._behind[method] += 1
         sender.submit(send)
 
     def publisher(
@@ -419,25 +423,25 @@ class ZenohEnd(ZenohSession, Bus):
         return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        found = await self._answers(
+        answers = await self._answers(
             lambda session, hear: session.liveliness().get(pattern, hear, timeout=timeout), timeout
         )
-        return [key for key, _ in found]
+        return [key for key, _ in answers]
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
-        there: dict[str, None] = {}
+        names_present: dict[str, None] = {}
 
         def on_presence(key: str, present: bool) -> None:
             if present:
-                there[key] = None
+                names_present[key] = None
             else:
-                there.pop(key, None)
+                names_present.pop(key, None)
             see(key, present)
 
         def lost() -> None:  # a new session does not report ends that have gone meanwhile
-            for key in [*there]:
+            for key in [*names_present]:
                 on_presence(key, False)
 
         def on_sample(sample: Any) -> None:
@@ -530,17 +534,17 @@ class _ZenohPublisher(Publisher):
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
         again, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
-        heard = bool(publisher.matching_status.matching)
+        has_subscribers = bool(publisher.matching_status.matching)
         if again:
-            self._end.later(self._declared.call, self._on_heard, heard)
+            self._end.later(self._declared.call, self._on_heard, has_subscribers)
         else:
-            self.heard = heard
+            self.heard = has_subscribers
         return publisher
 
-    def _on_heard(self, heard: bool) -> None:
-        self.heard = heard
+    def _on_heard(self, has_subscribers: bool) -> None:
+        self.heard = has_subscribers
         if self._on_change is not None:
-            self._on_change(heard)
+            self._on_change(has_subscribers)
 
     def put(self, payload: bytes) -> None:
         self._end.publish(self._publisher, payload, self._urgent_key)
@@ -569,8 +573,8 @@ class _ZenohQuestion(BusQuestion):
 
 def place_of(text: str) -> tuple[str, int] | None:
     """Return address and port in the engine's text; None if there are none."""
-    there = LINK.match(text)
-    return None if there is None else (plain_host(there["host"]), int(there["port"]))
+    match = LINK.match(text)
+    return None if match is None else (plain_host(match["host"]), int(match["port"]))
 
 
 def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:

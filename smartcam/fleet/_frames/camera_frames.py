@@ -201,10 +201,10 @@ class SharedFrames:
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
         """Send one frame, as :meth:`get` has it."""
-        came = asyncio.get_running_loop().time()
+        asked_at = asyncio.get_running_loop().time()
         frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
         self._send([frame], order)
-        return {"came": came, "frame": self._frame_fields(frame, took)}
+        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
 
     async def get(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
@@ -231,10 +231,10 @@ class SharedFrames:
 
     async def trigger(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
         """Trigger the device, and send the picture that this trigger caused."""
-        came = asyncio.get_running_loop().time()
+        asked_at = asyncio.get_running_loop().time()
         frame, took = await self.triggered(order, wait=wait)
         self._send([frame], order)
-        return {"came": came, "frame": self._frame_fields(frame, took)}
+        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
 
     async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
         """Trigger the device; return its picture, and the seconds that it took to encode it."""
@@ -257,12 +257,12 @@ class SharedFrames:
         if names_only:
             return {"names": await features.names(timeout=timeout)}
         if name is None:
-            found = [*(await features.describe(timeout=timeout)).values()]
+            descriptions = [*(await features.describe(timeout=timeout)).values()]
         elif value_only:
             return {"value": await features[name].get(timeout=timeout)}
         else:
-            found = [await features[name].describe(timeout=timeout)]
-        return {"features": [feature_fields(one) for one in found]}
+            descriptions = [await features[name].describe(timeout=timeout)]
+        return {"features": [feature_fields(feature) for feature in descriptions]}
 
     async def set_feature(self, name: str, value: Any, timeout: float) -> dict[str, Any]:
         """Set a feature; return the value that the device has then."""
@@ -281,7 +281,7 @@ class SharedFrames:
 
     async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
         """Send the new frames of a stream; after a while without any, send that there are none."""
-        came = asyncio.get_running_loop().time()
+        asked_at = asyncio.get_running_loop().time()
         key = order.program, stream
         with self._counted(order):
             viewer = self._viewers.get(key)
@@ -297,18 +297,23 @@ class SharedFrames:
             except FrameTimeoutError:
                 raise
             except TimeoutError:
-                return {"came": came}
+                return {"came": asked_at}
             except StopAsyncIteration:
                 self._leave(key, viewer)
-                return {"came": came, "ended": True}
+                return {"came": asked_at, "ended": True}
             except Exception:
                 self._leave(key, viewer)
                 raise
             finally:
                 if self._viewers.get(key) is viewer:
                     viewer.rest(lambda: self._leave(key, viewer))
-        self._send([one.frame for one in taken], order)
-        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_fields(taken)}
+        self._send([picture.frame for picture in taken], order)
+        return {
+            "came": asked_at,
+            "stream": viewer.number,
+            **viewer.counts(),
+            **self._all_fields(taken),
+        }
 
     async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
         """Begin a stream."""
@@ -317,13 +322,14 @@ class SharedFrames:
                 source = await self.source()
         if key in self._viewers:
             return self._viewers[key]
-        theirs = sum(program == key[0] for program, _ in self._viewers)
+        streams_of_program = sum(program == key[0] for program, _ in self._viewers)
         role = role_of(key[0])
         like = sum(role_of(program) == role for program, _ in self._viewers)
-        if like >= MAX_STREAMS_PER_ROLE or theirs >= MAX_STREAMS_PER_PROGRAM:
+        if like >= MAX_STREAMS_PER_ROLE or streams_of_program >= MAX_STREAMS_PER_PROGRAM:
             raise LocalProtocolError(
-                f"{self.name}: {like} streams of frames of role {role}, {theirs} of them this "
-                "program's; no more are possible"
+                f"{self.name}: {like} streams of frames of role {role}, "
+                f"{streams_of_program} of them "
+                "this program's; no more are possible"
             )
         number = next(self._numbers)
         viewer: FrameStream
@@ -356,7 +362,9 @@ class SharedFrames:
         video.viewers -= 1
         if video.viewers:
             return
-        for form in [form for form, one in self._videos.items() if one is video]:
+        for form in [
+            form for form, video_of_form in self._videos.items() if video_of_form is video
+        ]:
             del self._videos[form]
         ending = video.end()
         self._tasks.add(ending)
@@ -405,7 +413,10 @@ class SharedFrames:
         """Return the fields that describe all frames that go together."""
         if not taken[-1].number:
             return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
-        units = [{**self._frame_fields(one.frame, one.took), "number": one.number} for one in taken]
+        units = [
+            {**self._frame_fields(picture.frame, picture.took), "number": picture.number}
+            for picture in taken
+        ]
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
@@ -424,10 +435,10 @@ class SharedFrames:
         made = await asyncio.shield(last.task)
         return made, 0.0 if made is frame else time.perf_counter() - began
 
-    def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+    def _begin(self, work: Coroutine[Any, Any, T], name: str) -> asyncio.Task[T]:
         """Start work for tasks that wait for it; it ends with the agent."""
         task = asyncio.get_running_loop().create_task(
-            work, name=f"smartcam.fleet.{self.name}.{what}"
+            work, name=f"smartcam.fleet.{self.name}.{name}"
         )
         self._tasks.add(task)
         task.add_done_callback(self._done)
@@ -469,7 +480,7 @@ class SharedFrames:
                 del self._asking[order.program]
 
     @contextlib.contextmanager
-    def _within(self, seconds: float, what: str) -> Iterator[None]:
+    def _within(self, seconds: float, operation: str) -> Iterator[None]:
         """Make a timeout name what it waited for."""
         try:
             yield
@@ -477,5 +488,5 @@ class SharedFrames:
             if isinstance(exc, FrameTimeoutError):
                 raise
             raise FrameTimeoutError(
-                f"{self.name}: waited {seconds:.3g} s for {what}, in vain", source=self.name
+                f"{self.name}: waited {seconds:.3g} s for {operation}, in vain", source=self.name
             ) from None

@@ -70,6 +70,6 @@ def _split(url: str) -> tuple[str, dict[str, str]]:
     """Return a fleet URL, and the options for frames from its query."""
     parts = urlsplit(url)
     pairs = parse_qsl(parts.query, keep_blank_values=True)
-    own = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
-    query = urlencode([(key, value) for key, value in pairs if key not in own])
-    return urlunsplit(parts._replace(query=query)), own
+    own_options = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
+    query = urlencode([(key, value) for key, value in pairs if key not in own_options])
+    return urlunsplit(parts._replace(query=query)), own_options

@@ -30,23 +30,23 @@ class FramePace:
         self._due = -math.inf
         self._rest = 0.0
 
-    def window(self, now: float, arrived_at: float, rest: float = 0.0) -> tuple[float, float]:
+    def window(self, now: float, arrived_at: float, remaining: float = 0.0) -> tuple[float, float]:
         """Return the time after which the next frame must have come, and the end of the wait.
 
         Args:
             now: time of the request for the next frame, when the last one has arrived.
             arrived_at: time at which the newest frame arrived.
-            rest: least number of seconds from one frame to the next.
+            remaining: least number of seconds from one frame to the next.
         """
         if self._given_at is not None:
             self._transit_times = (self._transit_times[1], now - self._given_at)
             self._given_at = None
-        self._rest = rest
-        way = min(self._transit_times)
-        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
-        if 0 < self._period <= way:  # otherwise the link is free before the next frame comes
+        self._rest = remaining
+        least = min(self._transit_times)
+        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * least), now
+        if 0 < self._period <= least:  # otherwise the link is free before the next frame comes
             until = arrived_at + MAX_WAIT_PERIODS * self._period
-        if rest and now < self._due:
+        if remaining and now < self._due:
             since = max(since, self._due - self._period / 2)
             until = max(until, self._due + MAX_WAIT_PERIODS * self._period)
         return since, until

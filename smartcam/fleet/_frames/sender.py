@@ -101,11 +101,11 @@ class FrameSender:
             return
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
-        for one in [*window.transfers.values()]:
+        for transfer in [*window.transfers.values()]:
             # a frame that was begun stays, unless it is old
-            full = window.waiting + total > MAX_WAITING_BYTES and not one.under_way
-            if full or now - one.moved_at > STALE_AFTER:
-                del window.transfers[one.call]
+            full = window.waiting + total > MAX_WAITING_BYTES and not transfer.under_way
+            if full or now - transfer.moved_at > STALE_AFTER:
+                del window.transfers[transfer.call]
         window.transfers[call] = _Transfer(call, memoryview(data), now)
         self._push(program, window)
 

@@ -111,8 +111,8 @@ class SharedVideo:
             StopAsyncIteration: the video ended.
         """
         while True:
-            if found := self._following(have):
-                return found
+            if following := self._following(have):
+                return following
             if self._over is not None:
                 if self._over[0] is not None:
                     raise self._over[0]
@@ -121,12 +121,12 @@ class SharedVideo:
             await self._stirred.wait()
 
     def _following(self, have: int) -> list[VideoUnit]:
-        kept = self._kept
-        if not kept or kept[-1].number == have:
+        pictures_kept = self._kept
+        if not pictures_kept or pictures_kept[-1].number == have:
             return []
         fresh = asyncio.get_running_loop().time() - LATE_SECONDS
         units: list[VideoUnit] = []
-        for unit in reversed(kept):
+        for unit in reversed(pictures_kept):
             if unit.made < fresh and units:
                 break  # the reader is too late for all of these
             units.append(unit)

@@ -288,8 +288,8 @@ class CameraTopics:
         if hearing:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})
-            for one in hearing:
-                one.put(data)
+            for listener in hearing:
+                listener.put(data)
 
     def on_status(self, status: Status) -> None:
         """Handle a status of the camera; publish its change as an event."""

@@ -277,23 +277,23 @@ class Caller:
     async def _choose(self, agents: list[str], met: Met | None) -> None:
         """Choose an agent: of several, or instead of another, one that has a session."""
         only_linked = met is not None
-        heard: list[_HelloHeard] = []
+        hellos: list[_HelloHeard] = []
         failed: SmartCamError | None = None
         for agent in agents:
             try:
-                heard.append(await self._say_hello(agent))
+                hellos.append(await self._say_hello(agent))
             except SmartCamError as error:
                 failed = error
                 continue
-            if heard[-1].hello.get("connected") and not heard[-1].hello.get("trying"):
+            if hellos[-1].hello.get("connected") and not hellos[-1].hello.get("trying"):
                 break  # a camera has one session
         if self.met is not met:
             return  # the agent came or went meanwhile
-        if not heard:
+        if not hellos:
             if failed is not None:
                 raise failed
             return
-        best = heard[-1] if heard[-1].hello.get("connected") else heard[0]
+        best = hellos[-1] if hellos[-1].hello.get("connected") else hellos[0]
         if only_linked and not best.hello.get("connected"):
             return
         if met is not None:
@@ -303,9 +303,9 @@ class Caller:
     async def _ask_anew(self, met: Met) -> None:
         """Ask the agent again, and take its state if it has a session by now."""
         with contextlib.suppress(SmartCamError):
-            heard = await self._say_hello(met.agent)
-            if self.met is met and not self.linked and heard.hello.get("connected"):
-                self._meet(heard)
+            hello = await self._say_hello(met.agent)
+            if self.met is met and not self.linked and hello.hello.get("connected"):
+                self._meet(hello)
 
     async def _say_hello(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
@@ -319,15 +319,15 @@ class Caller:
             raise RemoteProtocolError(f"the agent {agent} sent an invalid hello: {exc}") from exc
         return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
 
-    def _meet(self, heard: _HelloHeard) -> None:
-        self._ahead, self._measured = heard.clock - heard.at, heard.at
+    def _meet(self, hello: _HelloHeard) -> None:
+        self._ahead, self._measured = hello.clock - hello.at, hello.at
         self._most = math.inf
-        self.bound(heard.clock, heard.begun)
-        if heard.agent in self._agents:
-            self._epochs[heard.agent] = heard.epoch
+        self.bound(hello.clock, hello.begun)
+        if hello.agent in self._agents:
+            self._epochs[hello.agent] = hello.epoch
             if len(self._epochs) > MAX_AGENTS_REMEMBERED:
                 del self._epochs[next(iter(self._epochs))]
-            self.met = Met(heard.agent, heard.epoch, heard.hello)
+            self.met = Met(hello.agent, hello.epoch, hello.hello)
             self._removed = ""
             self.trouble = None
             self._on_met(self.met)
@@ -337,7 +337,11 @@ class Caller:
         met = self.met
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
-        return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
+        return all(
+            known_epoch != epoch
+            for agent, known_epoch in self._epochs.items()
+            if agent != met.agent
+        )
 
     def unlink(self) -> None:
         """Leave an agent without a session: another one may have a session, or this one later."""
@@ -404,8 +408,8 @@ class Caller:
     def report_leases_lost(self) -> None:
         """Report that this program's reservations are lost, unless that was reported before."""
         unreported = [lease for lease in self.leases.values() if not lease.reported]
-        for one in unreported:
-            one.reported = True
+        for call in unreported:
+            call.reported = True
         if unreported:
             self._on_lease_lost()
 

@@ -161,12 +161,12 @@ class FleetCamera(Camera[ValueT]):
     def _make_listeners(self) -> Listeners:
         return FleetListeners(self.settings.name, self._observers)
 
-    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+    def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         if spec is None:
             spec = self._agents_layout
         if self._met:
-            return super()._interpretation(spec, own=own)
-        return self._provisional(spec, own)
+            return super()._interpretation(spec, of_camera=of_camera)
+        return self._provisional(spec, of_camera)
 
     def _provisional(self, spec: object, own: bool) -> Interpretation:
         """Return the interpretation of results until the agent's answer.
@@ -402,7 +402,7 @@ class FleetCamera(Camera[ValueT]):
         self._interpretations.clear()
         self._met, self._unreadable = True, None
         try:
-            self._default = self._interpretation(self._default_spec, own=True)
+            self._default = self._interpretation(self._default_spec, of_camera=True)
         except ConfigurationError as exc:
             self._unreadable = exc
 

@@ -493,7 +493,9 @@ class Fleet:
         self._require_open()
         program = self._program
         summaries = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
-        best = by_name(summaries, lambda one: (one.summary.connected, one.summary.agent))
+        best = by_name(
+            summaries, lambda reported: (reported.summary.connected, reported.summary.agent)
+        )
         return {name: best[name].summary for name in sorted(best)}
 
     async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
@@ -536,15 +538,15 @@ class Fleet:
 
         Cancellation: safe.
         """
-        who = "stored_results"
-        at = check_instant(since, "since", who)
+        caller = "stored_results"
+        at = check_instant(since, "since", caller)
         request = StoredRequest(
             since=None if at is None else at.astimezone(UTC).isoformat(),
-            failed=check_flag(failed, "failed", who),
+            failed=check_flag(failed, "failed", caller),
             camera=check_pattern(pattern),
-            most=check_integer(most, "most", 0, MAX_STORED_ROWS, who),
+            most=check_integer(most, "most", 0, MAX_STORED_ROWS, caller),
         )
-        timeout = check_seconds(timeout, "timeout", who)
+        timeout = check_seconds(timeout, "timeout", caller)
         self._require_open()
         return await ask_stores(self._program.bus, self._program.keys, request, timeout)
 
@@ -624,8 +626,8 @@ class Fleet:
         return (self._address or FleetAddress("fleet", "", 0)).of(name)
 
     def _make(self, name: str) -> FleetCamera[Any]:
-        own = {"name": name, "connect_timeout": self._timeout}
-        settings = CameraSettings.of(self._address_of(name), {**self._options, **own})
+        own_options = {"name": name, "connect_timeout": self._timeout}
+        settings = CameraSettings.of(self._address_of(name), {**self._options, **own_options})
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
     def _meet(self, name: str) -> FleetCamera[Any]:
@@ -674,7 +676,7 @@ class Fleet:
 
         Cancellation: cancels each; which cameras were triggered is unknown.
         """
-        return await self._each(pattern, lambda one: one.trigger(timeout=timeout, **options))
+        return await self._each(pattern, lambda camera: camera.trigger(timeout=timeout, **options))
 
     async def reload(
         self, agent: str | None = None, *, timeout: float = 30.0
@@ -728,10 +730,13 @@ class Fleet:
         doing = {camera.name: do(camera) for camera in cameras}
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = {name: group.create_task(outcome(one)) for name, one in doing.items()}
+                tasks = {
+                    name: group.create_task(outcome(doing_of_camera))
+                    for name, doing_of_camera in doing.items()
+                }
         finally:
-            for one in doing.values():
-                one.close()  # its task may never have begun
+            for doing_of_camera in doing.values():
+                doing_of_camera.close()  # its task may never have begun
         outcomes = {name: task.result() for name, task in tasks.items()}
         if all(isinstance(outcome, ConfigurationError) for outcome in outcomes.values()):
             raise next(iter(outcomes.values()))

@@ -95,7 +95,7 @@ class FleetListeners(Listeners):
         taken = super()._take_next_results()
         if late:
             self._next_results.update(late)
-            taken = [one for one in taken if one not in late]
+            taken = [result for result in taken if result not in late]
         return taken
 
     def miss(self, count: int, then: ResultRun | None) -> None:
@@ -257,8 +257,8 @@ class Receiver:
 
     def has(self, states: int, results: int) -> bool:
         """Return True if all states, and subscribed results, before these numbers were received."""
-        heard = "results" not in self._handles or self._results.expected >= results
-        return heard and self._states.expected >= states
+        enough = "results" not in self._handles or self._results.expected >= results
+        return enough and self._states.expected >= states
 
     def _wake(self, *, everyone: bool = False) -> None:
         if not self._reaching:
@@ -318,9 +318,9 @@ class Receiver:
     # ------------------------------------------------------------------ messages
 
     def _hear_states(self, key: str, payload: bytes) -> None:
-        what = f"the agent's message about {self._camera}"
+        origin = f"the agent's message about {self._camera}"
         try:
-            message = decode(payload, what)
+            message = decode(payload, origin)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
             self._count(payload)
             known = 0  # states that came with replies
@@ -328,7 +328,7 @@ class Receiver:
                 known = max(0, self._states.expected - following + len(message.blobs))
             states = [state(blob) for blob in message.blobs[known:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
-            logger.warning("%s ! %s: %s", self._name, what, exc)
+            logger.warning("%s ! %s: %s", self._name, origin, exc)
             return
         self._see(epoch)
         self._states.receive(epoch, following, states)
@@ -339,7 +339,7 @@ class Receiver:
         if not reply.new_states:
             return
         try:
-            states = [state(one) for one in reply.new_states]
+            states = [state(reported) for reported in reply.new_states]
         except ValueError as exc:
             logger.warning("%s ! the states in a reply are not valid: %s", self._camera, exc)
             return
@@ -377,45 +377,47 @@ class Receiver:
 
     # ------------------------------------------------------------------ results
 
-    def outcomes(self, own: Own, batch: Batch) -> list[Result]:
+    def outcomes(self, own_call: Own, batch: Batch) -> list[Result]:
         """Return a trigger's results.
 
         Raises:
             InterpretationError: a result cannot be interpreted; the error of the first one.
         """
-        found: list[Result] = []
+        results: list[Result] = []
         error, latency = None, math.nan
         for run in batch.runs:
-            outcome, latency = self._outcome(own, run), run.latency
+            outcome, latency = self._outcome(own_call, run), run.latency
             if not isinstance(outcome, InterpretationError):
-                found.append(outcome)
+                results.append(outcome)
             elif error is None:
                 error = outcome
         if not math.isnan(latency):
             self._counters.processing.add(latency)
         if error is not None:
             raise error
-        return found
+        return results
 
-    def _outcome(self, own: Own, run: ResultRun) -> Result | InterpretationError:
+    def _outcome(self, own_call: Own, run: ResultRun) -> Result | InterpretationError:
         """Return a trigger's result, made and counted once, though it comes in two ways."""
-        known = own.outcomes.get(run.number)
+        known = own_call.outcomes.get(run.number)
         if known is not None:
             return known
         counters = self._counters
         try:
-            if own.expected is not None and run.application != own.expected:
+            if own_call.expected is not None and run.application != own_call.expected:
                 counters.count("wrong_application")
-                raise self._wrong_application(run, own.expected)
+                raise self._wrong_application(run, own_call.expected)
             try:
-                outcome: Result | InterpretationError = self._interpret(run, own.interpretation)
+                outcome: Result | InterpretationError = self._interpret(
+                    run, own_call.interpretation
+                )
             except InterpretationError:
                 counters.count("uninterpretable")
                 raise
             counters.count("triggered")
         except InterpretationError as error:
             outcome = error
-        own.outcomes[run.number] = outcome
+        own_call.outcomes[run.number] = outcome
         return outcome
 
     def _take_run(self, run: ResultRun) -> None:
@@ -424,9 +426,9 @@ class Receiver:
         listeners.results.horizon = run.clock
         try:
             now = asyncio.get_running_loop().time()
-            own = self.own.get(run.call) if run.owner and run.owner == self._program else None
-            if own is not None:
-                self._offer(run, self._outcome(own, run), now, owned=True)
+            own_call = self.own.get(run.call) if run.owner and run.owner == self._program else None
+            if own_call is not None:
+                self._offer(run, self._outcome(own_call, run), now, owned=True)
                 return
             expected = self._expected()
             if expected is not None and run.application != expected:

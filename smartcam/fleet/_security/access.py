@@ -145,9 +145,9 @@ def access_control(domain: int | None = None) -> dict[str, Any]:
             "messages": [message],
             "flows": [flow],
             "permission": "allow",
-            "key_exprs": [*found],
+            "key_exprs": [*entry],
         }
-        for (role, message, flow), found in keys.items()
+        for (role, message, flow), entry in keys.items()
     }
     return {
         "enabled": True,

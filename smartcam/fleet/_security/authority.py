@@ -134,15 +134,15 @@ class _Authority:
         from cryptography import x509
 
         place = folder / AUTHORITY
-        own = (place / CA_FILE).exists()
+        has_authority = (place / CA_FILE).exists()
         foreign = (folder / CA_FILE).exists()
-        if foreign or (own and not (place / KEY_FILE).exists()):
+        if foreign or (has_authority and not (place / KEY_FILE).exists()):
             raise ConfigurationError(
                 f"certificates: {(folder if foreign else place) / CA_FILE} is of an authority "
                 f"whose key is not in {place}, and it is not overwritten: expected a folder that "
                 "this command made, or an empty one"
             )
-        if not own:
+        if not has_authority:
             cls._found(place)
         try:
             made = x509.load_pem_x509_certificate((place / CA_FILE).read_bytes())
@@ -184,8 +184,8 @@ class _Authority:
         done = "kept"
         if role in LISTENING:
             had = [] if old is None else _hosts_of(old)
-            asked = [*HERE, *(hosts or ([] if had else [socket.gethostname()]))]
-            hosts = [*dict.fromkeys([*had, *asked])]
+            names = [*HERE, *(hosts or ([] if had else [socket.gethostname()]))]
+            hosts = [*dict.fromkeys([*had, *names])]
             stale = bool({*hosts} - {*had})
         else:
             hosts, stale = [], False
@@ -315,7 +315,7 @@ def _hosts_of(certificate: Any) -> list[str]:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
     except x509.ExtensionNotFound:
         return []
-    return [str(one.value) for one in extension.value]
+    return [str(name.value) for name in extension.value]
 
 
 def _ends_soon(certificate: Any) -> bool:
@@ -388,7 +388,7 @@ def _router(place: Path) -> bytes:
     for path, value in link.settings(10.0).items():
         inner: dict[str, Any] = wanted
         *above, last = path.split("/")
-        for one in above:
-            inner = inner.setdefault(one, {})
+        for part in above:
+            inner = inner.setdefault(part, {})
         inner[last] = value
     return json.dumps(wanted, indent=2).encode()

@@ -112,8 +112,8 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
     if shut:
         return [_DROP]
     steps: list[_Instruction] = []
-    for one in blocked:
-        address = ipaddress.ip_address(one)
+    for network in blocked:
+        address = ipaddress.ip_address(network)
         offset, words = (12, 1) if address.version == 4 else (8, 4)
         steps += [
             _Instruction(LOAD_BYTE, IP_HEADER),
@@ -276,10 +276,10 @@ class Door:
     def _connected(self) -> set[Place]:
         """Return the other ends of all connections of the ports."""
         ends: set[Place] = set()
-        for one in _sockets():
+        for sock in _sockets():
             with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
-                if one.getsockname()[1] in self._ports and not _listens(one):
-                    host, port, *_ = one.getpeername()
+                if sock.getsockname()[1] in self._ports and not _listens(sock):
+                    host, port, *_ = sock.getpeername()
                     ends.add((plain_host(host), port))
         return ends
 
@@ -336,18 +336,18 @@ class Door:
     def _find(self) -> list[int]:
         """Return the descriptors of the engine's listening sockets."""
         numbers: list[int] = []
-        for found in _sockets():
+        for sock in _sockets():
             with contextlib.suppress(OSError):
-                if self._is_ours(found):
-                    found.listen(BACKLOG)
-                    numbers.append(found.fileno())
+                if self._is_ours(sock):
+                    sock.listen(BACKLOG)
+                    numbers.append(sock.fileno())
         return numbers
 
-    def _is_ours(self, found: socket.socket) -> bool:
-        return _listens(found) and found.getsockname()[1] in self._ports
+    def _is_ours(self, sock: socket.socket) -> bool:
+        return _listens(sock) and sock.getsockname()[1] in self._ports
 
 
-def attach(found: socket.socket, steps: list[_Instruction]) -> None:
+def attach(sock: socket.socket, steps: list[_Instruction]) -> None:
     """Set the filter of a socket in the system.
 
     Raises:
@@ -356,9 +356,9 @@ def attach(found: socket.socket, steps: list[_Instruction]) -> None:
     packed = b"".join(
         struct.pack("HBBI", step.code, step.yes, step.no, step.value) for step in steps
     )
-    kept = ctypes.create_string_buffer(packed, len(packed))
-    program = struct.pack("HP", len(steps), ctypes.addressof(kept))
-    found.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy
+    program_buffer = ctypes.create_string_buffer(packed, len(packed))
+    program = struct.pack("HP", len(steps), ctypes.addressof(program_buffer))
+    sock.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy
 
 
 def plain_host(text: str) -> str:
@@ -367,9 +367,9 @@ def plain_host(text: str) -> str:
     return str(getattr(address, "ipv4_mapped", None) or address)
 
 
-def _listens(found: socket.socket) -> bool:
-    internet = found.family in {socket.AF_INET, socket.AF_INET6}
-    return internet and bool(found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+def _listens(sock: socket.socket) -> bool:
+    internet = sock.family in {socket.AF_INET, socket.AF_INET6}
+    return internet and bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
 
 def _sockets() -> Iterator[socket.socket]:

@@ -52,12 +52,12 @@ class H264Encoder:
         self, run: Runs, *, fps: float, keyint: int, crf: float, bitrate: int | None
     ) -> None:
         load("av")
-        who = "h264_encoder"
-        fps = check_number(fps, "fps", 0.01, 1000.0, who)
-        keyint = check_integer(keyint, "keyint", 2, 600, who)
-        crf = check_number(crf, "crf", 0, 51, who)
+        caller = "h264_encoder"
+        fps = check_number(fps, "fps", 0.01, 1000.0, caller)
+        keyint = check_integer(keyint, "keyint", 2, 600, caller)
+        crf = check_number(crf, "crf", 0, 51, caller)
         if bitrate is not None:
-            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
+            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, caller)
         self._run = run
         self._rate = Fraction(fps).limit_denominator(1000)
         self._time_base = 1 / self._rate
@@ -263,10 +263,10 @@ class H264Decoder:
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
 
-    def _damaged(self, frame: Frame, got: str) -> FrameFormatError:
+    def _damaged(self, frame: Frame, actual: str) -> FrameFormatError:
         return FrameFormatError(
             f"{frame.source}: {self.NAME} {frame.width}x{frame.height}: expected a whole encoded "
-            f"frame, got {len(frame.data)} bytes: {got}",
+            f"frame, got {len(frame.data)} bytes: {actual}",
             source=frame.source,
         )
 
@@ -288,8 +288,8 @@ def entry_point(data: bytes) -> tuple[bool, int | None]:
             return kind == KEY, refresh
         if kind == SEI:
             end = after if after >= 0 else len(data)
-            found = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
-            refresh = refresh if found is None else found
+            frames_to_recovery = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
+            refresh = refresh if frames_to_recovery is None else frames_to_recovery
         place = after
     return False, refresh
 

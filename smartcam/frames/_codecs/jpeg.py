@@ -82,7 +82,7 @@ def decode_jpeg(
         return DecodedJpeg(decode(data, colours), "")
     except ValueError as exc:
         remark = str(exc)
-        if not remark.strip() or any(one in remark.lower() for one in DAMAGE):
+        if not remark.strip() or any(text in remark.lower() for text in DAMAGE):
             raise _wrong(what, data, exc) from exc
         _check_restarts(data, what, exc)
         return DecodedJpeg(_decode_tolerantly(decode, data, colours, what), remark)
@@ -103,7 +103,7 @@ def _joined_segments(data: bytes) -> bytes:
     Even in its tolerant mode simplejpeg 1.9 refuses such bytes, and a JFIF segment of an unknown
     revision, which does not affect the pixels.
     """
-    kept, place = [data[:2]], 2
+    segments, place = [data[:2]], 2
     while place + 4 <= len(data):
         begin = data.find(b"\xff", place)
         if begin < 0 or data[begin + 1 : begin + 2] in (b"", b"\xda"):
@@ -113,9 +113,9 @@ def _joined_segments(data: bytes) -> bytes:
             continue
         place = begin + 2 + int.from_bytes(data[begin + 2 : begin + 4], "big")
         if not data[begin:].startswith(b"\xff\xe0") or data[begin + 4 : begin + 10] in _JFIF:
-            kept.append(data[begin:place])
+            segments.append(data[begin:place])
     scan = data.find(b"\xff\xda", place)
-    return b"".join([*kept, data[scan:]]) if scan >= 0 else data
+    return b"".join([*segments, data[scan:]]) if scan >= 0 else data
 
 
 def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Exception) -> None:
@@ -124,10 +124,10 @@ def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Ex
     Raises:
         FrameFormatError: the markers are not in sequence, or the end marker is missing.
     """
-    whole = bytes(data)
-    scan = whole.rfind(b"\xff\xda")
-    marks = [found[0] - 0xD0 for found in _RESTART.findall(whole, max(scan, 0))]
-    if scan < 0 or b"\xff\xd9" not in whole[scan:]:
+    remaining = bytes(data)
+    scan = remaining.rfind(b"\xff\xda")
+    marks = [number[0] - 0xD0 for number in _RESTART.findall(remaining, max(scan, 0))]
+    if scan < 0 or b"\xff\xd9" not in remaining[scan:]:
         raise _wrong(what, data, warning)
     if marks != [place % 8 for place in range(len(marks))]:
         raise _wrong(what, data, ValueError(f"a restart mark is missing; {warning}"))

@@ -196,7 +196,7 @@ class Assembler:
             if self._deadline(block) <= now:
                 self._overdue(block, now, wanted)
         self._settle()
-        self.counts.requested += sum(one.last - one.first + 1 for one in wanted)
+        self.counts.requested += sum(span.last - span.first + 1 for span in wanted)
         return wanted
 
     def _open_blocks(self) -> list[Block]:
@@ -309,10 +309,10 @@ class Assembler:
 
     def _open(self, number: int, extended: bool, now: float) -> Block:
         """Open a block, and earlier blocks of which no packet came."""
-        for one in self._blocks.values():
-            if one.number < number and not one.over:
-                one.over = True
-                one.missing_since = min(one.missing_since, now)
+        for older in self._blocks.values():
+            if older.number < number and not older.over:
+                older.over = True
+                older.missing_since = min(older.missing_since, now)
         for missing in range(max(self._newest + 1, number - MAX_OPEN_BLOCKS + 1), number):
             self._make(missing, extended, now).over = True
             self._blocks[missing].missing_since = now

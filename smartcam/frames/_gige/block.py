@@ -220,14 +220,14 @@ class Block:
             end = self.trailer
         elif self.over:
             end = self._expected_packets() + 1
-        found: list[tuple[int, int]] = []
+        holes: list[tuple[int, int]] = []
         first = self.seen.find(0, 0, end + 1)
-        while first >= 0 and len(found) < most:
+        while first >= 0 and len(holes) < most:
             past = self.seen.find(1, first, end + 1)
             last = end if past < 0 else past - 1
-            found.append((first, last))
+            holes.append((first, last))
             first = self.seen.find(0, last + 1, end + 1)
-        return found
+        return holes
 
     def _expected_packets(self) -> int:
         if self.short is not None:
@@ -244,20 +244,20 @@ class Block:
             return None
         rows = min(trailer_content.rows or leader.height, leader.height)
         need = picture_bytes(leader, rows)
-        there = (self.trailer - 1) * self.full
+        trailer_place = (self.trailer - 1) * self.full
         if self.trailer > 1 and self.seen[self.trailer - 1]:
-            there += self.last_size - self.full
-        there = min(there, trailer_content.length or there)
+            trailer_place += self.last_size - self.full
+        trailer_place = min(trailer_place, trailer_content.length or trailer_place)
         if not rows or not leader.width or self.buffer is None:
             return None
-        if need > there and leader.payload_type != PayloadType.CHUNK:
+        if need > trailer_place and leader.payload_type != PayloadType.CHUNK:
             # for chunk data the size is from the features: a wrong size is reported, not counted as
             # lost
             return None
         stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x
-        data = self.buffer[: min(need, there)]
+        data = self.buffer[: min(need, trailer_place)]
         arrived = self.arrived if self.arrived is not None else 0.0
-        payload = self.buffer[:there] if leader.has_chunks else None
+        payload = self.buffer[:trailer_place] if leader.has_chunks else None
         return WholePicture(
             self.number, lost, leader, rows, stride, data, arrived, payload, self.block_id
         )

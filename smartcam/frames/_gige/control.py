@@ -121,8 +121,8 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     async def write_register(self, address: int, value: int) -> None:
         """Write a register; errors as in :meth:`read_register`."""
-        what = f"{address:#06x} = {value:#x}"
-        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, what)
+        operation = f"{address:#06x} = {value:#x}"
+        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, operation)
 
     async def read(self, address: int, length: int) -> bytes:
         """Return bytes of the camera's memory; errors as in :meth:`read_register`."""

@@ -108,10 +108,10 @@ class GenicamFeatures:
     def names(self) -> list[str]:
         """Return the names of the features in the description's categories."""
         listed = [
-            one.text
+            feature.text
             for node in self._nodes.values()
             if node.kind == "Category"
-            for one in node.all("pFeature")
+            for feature in node.all("pFeature")
         ]
         return sorted({name for name in listed if self._kind(name) not in ("", "Category")})
 
@@ -260,10 +260,10 @@ class GenicamFeatures:
     async def _begin(self, name: str) -> Element:
         node = self._named(name)
         try:
-            there = await self._is_available(node, 0)
+            available = await self._is_available(node, 0)
         except MessageError as exc:
             raise self._wrong(name, str(exc)) from exc
-        if not there:
+        if not available:
             raise self._wrong(name, "it is not available now")
         return node
 
@@ -272,8 +272,8 @@ class GenicamFeatures:
         return implemented and await self._condition(node, "pIsAvailable", True, depth)
 
     async def _condition(self, node: Element, kind: str, default: bool, depth: int) -> bool:
-        found = node.first(kind)
-        return default if found is None else bool(await self._numbered(found.text, depth + 1))
+        child = node.first(kind)
+        return default if child is None else bool(await self._numbered(child.text, depth + 1))
 
     async def _entries_now(self, node: Element) -> dict[str, int]:
         return {
@@ -415,38 +415,39 @@ class GenicamFeatures:
     async def _indexed(self, node: Element, depth: int) -> int | float:
         """Return the description's number for the value of an index."""
         wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
-        for one in node.all("ValueIndexed"):
-            if _number(one.attributes.get("Index", "-1")) == wanted:
-                return _number(one.text)
+        for child in node.all("ValueIndexed"):
+            if _number(child.attributes.get("Index", "-1")) == wanted:
+                return _number(child.text)
         return await self._field(node, "ValueDefault", depth)
 
     async def _target(self, node: Element, depth: int) -> Element | None:
         """Return the node that holds a node's value; None: the node itself."""
-        found = node.first("pValue")
+        element = node.first("pValue")
         index = node.first("pIndex")
         if index is not None and node.kind in ("Integer", "Float"):
             wanted = await self._numbered(index.text, depth + 1)
-            for one in node.all("pValueIndexed"):
-                if _number(one.attributes.get("Index", "-1")) == wanted:
-                    found = one
+            for child in node.all("pValueIndexed"):
+                if _number(child.attributes.get("Index", "-1")) == wanted:
+                    element = child
                     break
             else:
                 chosen = wanted in [
-                    _number(one.attributes.get("Index", "-1")) for one in node.all("ValueIndexed")
+                    _number(child.attributes.get("Index", "-1"))
+                    for child in node.all("ValueIndexed")
                 ]
-                found = None if chosen else node.first("pValueDefault") or found
-        if found is None:
+                element = None if chosen else node.first("pValueDefault") or element
+        if element is None:
             return None
-        target = self._nodes.get(found.text)
+        target = self._nodes.get(element.text)
         if target is None:
-            raise MessageError(f"{node.kind} {node.name}: there is no node {found.text[:80]!r}")
+            raise MessageError(f"{node.kind} {node.name}: there is no node {element.text[:80]!r}")
         return target
 
     async def _worked_out(
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
         """Evaluate a formula with the node's variables."""
-        whole = node.kind.startswith("Int")
+        integral = node.kind.startswith("Int")
         self._spend(node, len(formula))
         for child in node.children:
             if child.kind == "pVariable":
@@ -455,20 +456,20 @@ class GenicamFeatures:
                 variables[child.name] = _number(child.text)
             elif child.kind == "Expression":
                 self._spend(node, len(child.text))
-                variables[child.name] = evaluate(child.text, variables, whole=whole)
-        return evaluate(formula, variables, whole=whole)
+                variables[child.name] = evaluate(child.text, variables, integral=integral)
+        return evaluate(formula, variables, integral=integral)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
         """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
-        _, _, what = variable.name.partition(".")
-        if what in ("", "Value"):
+        _, _, property_ = variable.name.partition(".")
+        if property_ in ("", "Value"):
             return await self._numbered(variable.text, depth + 1)
         node = self._nodes.get(variable.text)
         if node is None:
             raise MessageError(f"the description has no node {variable.text[:80]!r}")
-        if what in ("Min", "Max", "Inc"):
-            return await self._limit(node, what, depth + 1)
-        kind, _, entry = what.partition(".")
+        if property_ in ("Min", "Max", "Inc"):
+            return await self._limit(node, property_, depth + 1)
+        kind, _, entry = property_.partition(".")
         if kind == "Entry":
             entries = _entries(node)
             if entry not in entries:
@@ -482,31 +483,31 @@ class GenicamFeatures:
             "after its name"
         )
 
-    async def _limit(self, node: Element, what: str, depth: int) -> int | float:
+    async def _limit(self, node: Element, bound: str, depth: int) -> int | float:
         """Return the smallest or largest value of a node, or its step.
 
         A node without limits has the limits of the node that holds its value; without these, they
         follow from its bits (GenApi 2.0, 2.8.4 and 2.8.6).
         """
         self._step(node, depth)
-        if node.first(what, "p" + what) is not None:
-            return await self._field(node, what, depth)
+        if node.first(bound, "p" + bound) is not None:
+            return await self._field(node, bound, depth)
         has_own_value = node.kind in ("Integer", "Float", "Enumeration")
         target = await self._target(node, depth) if has_own_value else None
         if target is not None:
-            return await self._limit(target, what, depth + 1)
-        if what == "Inc" and node.kind in _WHOLE:
+            return await self._limit(target, bound, depth + 1)
+        if bound == "Inc" and node.kind in _WHOLE:
             return 1
-        if node.kind in ("Float", "FloatReg") and what != "Inc":
-            return -sys.float_info.max if what == "Min" else sys.float_info.max
-        if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and what != "Inc":
-            return -(1 << 63) if what == "Min" else (1 << 63) - 1
-        if node.kind in _REGISTERS and what != "Inc":
+        if node.kind in ("Float", "FloatReg") and bound != "Inc":
+            return -sys.float_info.max if bound == "Min" else sys.float_info.max
+        if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and bound != "Inc":
+            return -(1 << 63) if bound == "Min" else (1 << 63) - 1
+        if node.kind in _REGISTERS and bound != "Inc":
             _, length = await self._place(node, depth)
             _, bits = _span(node, length)
             signed = int(_signed(node))
-            return -(1 << bits - 1) * signed if what == "Min" else (1 << bits - signed) - 1
-        raise NoLimitError(f"{node.kind} {node.name}: it has no <{what}>")
+            return -(1 << bits - 1) * signed if bound == "Min" else (1 << bits - signed) - 1
+        raise NoLimitError(f"{node.kind} {node.name}: it has no <{bound}>")
 
     async def _set(self, node: Element, value: FeatureValue, depth: int) -> None:
         self._step(node, depth)
@@ -560,10 +561,10 @@ class GenicamFeatures:
         if kind == "enumeration":
             parts["entries"] = tuple(await self._noted(self._entries_now(node), problems) or ())
         elif kind in ("integer", "float"):
-            for part, what in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
-                if what == "Inc" and kind == "float":
+            for part, bound in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
+                if bound == "Inc" and kind == "float":
                     continue
-                limit = await self._noted(self._limit(node, what, 0), problems)
+                limit = await self._noted(self._limit(node, bound, 0), problems)
                 endless = limit is None or abs(limit) >= (
                     sys.float_info.max if kind == "float" else (1 << 63) - 1
                 )
@@ -594,12 +595,12 @@ class GenicamFeatures:
             modes = _access(node)
             readable = readable and "WO" not in modes
             writable = writable and "RO" not in modes and node.kind not in _KNIVES
-            found = None
+            access = None
             if node.kind in (*_HOLDERS, *_CONVERTERS):
-                found = await self._target(node, depth)
-            if found is None:
+                access = await self._target(node, depth)
+            if access is None:
                 break
-            node = found
+            node = access
             if not await self._is_available(node, depth):
                 return ""
             writable = writable and not await self._condition(node, "pIsLocked", False, depth)
@@ -620,11 +621,13 @@ class GenicamFeatures:
     def _selected_by(self, name: str) -> tuple[str, ...]:
         """Return the features that select the instance of a feature."""
         if self._selectors is None:
-            found: dict[str, list[str]] = {}
+            names_by_selector: dict[str, list[str]] = {}
             for node in self._nodes.values():
-                for one in node.all("pSelected"):
-                    found.setdefault(one.text, []).append(node.name)
-            self._selectors = {selected: tuple(names) for selected, names in found.items()}
+                for child in node.all("pSelected"):
+                    names_by_selector.setdefault(child.text, []).append(node.name)
+            self._selectors = {
+                selected: tuple(names) for selected, names in names_by_selector.items()
+            }
         return self._selectors.get(name, ())
 
     # registers
@@ -686,17 +689,17 @@ class GenicamFeatures:
         elif node.kind == "FloatReg":
             data = struct.pack(_float_format(node, length), value)
         else:
-            whole = round(value)
+            number = round(value)
             shift, bits = _span(node, length)
             least = -(1 << bits - 1) if _signed(node) else 0
-            if not least <= whole < least + (1 << bits):
-                raise MessageError(f"{whole} does not fit into {bits} bits")
+            if not least <= number < least + (1 << bits):
+                raise MessageError(f"{number} does not fit into {bits} bits")
             order = _order(node)
             if bits < 8 * length:
                 before = int.from_bytes(await self._bytes(node, address, length), order)
                 mask = (1 << bits) - 1 << shift
-                whole = before & ~mask | whole << shift & mask
-            data = (whole & (1 << 8 * length) - 1).to_bytes(length, order)
+                number = before & ~mask | number << shift & mask
+            data = (number & (1 << 8 * length) - 1).to_bytes(length, order)
         memory = self._memory(node)
         self._read.clear()
         if self._writing is not None:

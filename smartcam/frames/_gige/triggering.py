@@ -65,14 +65,14 @@ async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
     if "TriggerSelector" not in features:
         return await _setting(features, "")
     chosen = await features.get("TriggerSelector")
-    found: list[TriggerSetting] = []
+    settings: list[TriggerSetting] = []
     try:
         for selector in await features.entries("TriggerSelector"):
             await features.set("TriggerSelector", selector)
-            found += await _setting(features, selector)
+            settings += await _setting(features, selector)
     finally:
         await features.set("TriggerSelector", chosen)
-    return found
+    return settings
 
 
 async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:

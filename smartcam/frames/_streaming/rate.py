@@ -203,11 +203,11 @@ class RateControl:
 
     def _learn(self, busy: float) -> None:
         """Estimate the source's frame rate if neither the link nor this control limits it."""
-        came = self._flow.frames / self._flow.seconds
+        rate = self._flow.frames / self._flow.seconds
         if busy < BUSY_SHARE and (
-            self._fps >= self._rates[1] or came * SLOW_SOURCE_FACTOR < self._fps
+            self._fps >= self._rates[1] or rate * SLOW_SOURCE_FACTOR < self._fps
         ):
-            self._comes = came
+            self._comes = rate
 
     def _follow(self, seconds: float) -> None:
         """Move towards the target values: down at once, up slowly."""
@@ -237,19 +237,19 @@ class RateControl:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
-        found: list[tuple[float, float, str]] = []
+        limits: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
             comes = min(most, max(fewest, self._comes or most))
-            found.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
+            limits.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
         if self._latency is not None:
             size = max(1.0, (self._latency - self._age.value) / self._way.value)
-            found.append(
+            limits.append(
                 (size, max(most * size / smallest, FREE_SHARE / self._took.value), "latency")
             )
-        size, _, name = min(found)
+        size, _, name = min(limits)
         if size >= smallest:
             return size, most, name
-        fps = min(fps for one, fps, _ in found if one < smallest)
+        fps = min(fps for time, fps, _ in limits if time < smallest)
         if fps < fewest:
             return size, fewest, f"{name}: no frame may be smaller, nor fewer"
         return size, min(most, fps), f"{name}, at the lowest quality"
@@ -301,5 +301,5 @@ def _check_pair(value: tuple[float, float], name: str) -> None:
     """Raise unless a value is a pair of numbers; the caller checks their range."""
     if not isinstance(value, tuple) or len(value) != 2:
         raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
-    for one in value:
-        check_number(one, name, 0, 1e9, "RateControl")
+    for number in value:
+        check_number(number, name, 0, 1e9, "RateControl")

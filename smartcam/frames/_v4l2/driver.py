@@ -190,8 +190,10 @@ class V4L2Driver(FrameDriver):
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        asked = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
-        self._wanted = WantedSetting(asked, size, self._wanted.rate)  # keep the device's choice
+        asked_format = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
+        self._wanted = WantedSetting(
+            asked_format, size, self._wanted.rate
+        )  # keep the device's choice
         return StreamFormat(setting.format, *size, rates)
 
     def _begin(self) -> CaptureStream:
@@ -223,14 +225,14 @@ class V4L2Driver(FrameDriver):
             return job(device)
 
     def _another(self, device: CaptureDevice) -> FrameSourceError:
-        expected, got = (
-            "nothing" if one is None else " at ".join(one)
-            for one in (self._identity, device.identity)
+        expected, actual = (
+            "nothing" if identity is None else " at ".join(identity)
+            for identity in (self._identity, device.identity)
         )
         return FrameSourceError(
-            f"{self.name}: expected {expected}, as when it was opened, got {got}",
+            f"{self.name}: expected {expected}, as when it was opened, got {actual}",
             source=self.name,
-            available=(got,),
+            available=(actual,),
         )
 
 

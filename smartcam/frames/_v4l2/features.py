@@ -161,15 +161,15 @@ class V4L2Features(DeviceFeatures):
         self._driver = driver
 
     async def _all(self) -> list[ControlFeature]:
-        return [ControlFeature(one) for one in (await self._driver.controls()).values()]
+        return [ControlFeature(control) for control in (await self._driver.controls()).values()]
 
     async def names(self) -> list[str]:
         """Return the names of all features."""
-        return [one.name for one in await self._all()]
+        return [feature.name for feature in await self._all()]
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
-        return {one.name: one.described() for one in await self._all()}
+        return {feature.name: feature.described() for feature in await self._all()}
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
@@ -177,30 +177,30 @@ class V4L2Features(DeviceFeatures):
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""
-        found = await self._found(name)
-        value = found.value(found.control.value)
+        feature = await self._found(name)
+        value = feature.value(feature.control.value)
         if value is None:
-            raise self._wrong(found, "it has no value that can be read")
+            raise self._wrong(feature, "it has no value that can be read")
         return value
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a feature; return the device's new value."""
-        found = await self._found(name)
-        if found.control.kind == "button":
-            raise self._wrong(found, "it is a command: it is executed")
-        number = found.number(value)
+        feature = await self._found(name)
+        if feature.control.kind == "button":
+            raise self._wrong(feature, "it is a command: it is executed")
+        number = feature.number(value)
         if number is None:
-            raise self._wrong(found, f"expected {found.described().range}, got {value!r}")
-        has = await self._driver.set_control(found.control.name, number)
-        got = found.value(has)
-        return value if got is None else got
+            raise self._wrong(feature, f"expected {feature.described().range}, got {value!r}")
+        has = await self._driver.set_control(feature.control.name, number)
+        actual = feature.value(has)
+        return value if actual is None else actual
 
     async def execute(self, name: str) -> None:
         """Execute a command."""
-        found = await self._found(name)
-        if found.control.kind != "button":
-            raise self._wrong(found, "it is no command: it is set")
-        await self._driver.set_control(found.control.name, 1)
+        feature = await self._found(name)
+        if feature.control.kind != "button":
+            raise self._wrong(feature, "it is no command: it is set")
+        await self._driver.set_control(feature.control.name, 1)
 
     async def _found(self, name: str) -> ControlFeature:
         features = await self._all()
@@ -216,9 +216,9 @@ class V4L2Features(DeviceFeatures):
             available=tuple(names),
         )
 
-    def _wrong(self, found: ControlFeature, text: str) -> FrameFeatureError:
+    def _wrong(self, feature: ControlFeature, text: str) -> FrameFeatureError:
         return FrameFeatureError(
-            f"{self._driver.name}: feature {found.name}: {text}",
+            f"{self._driver.name}: feature {feature.name}: {text}",
             source=self._driver.name,
-            available=(str(found.described()),),
+            available=(str(feature.described()),),
         )

@@ -89,8 +89,8 @@ class PictureCutter:
             self._drop(surplus)
             self._seen -= surplus
             return False
-        found = _LENGTH.findall(self._data[max(0, place - MAX_HEAD_BYTES) : place])
-        self._length = int(found[-1]) if found else None
+        lengths = _LENGTH.findall(self._data[max(0, place - MAX_HEAD_BYTES) : place])
+        self._length = int(lengths[-1]) if lengths else None
         self._drop(place)
         self._begun, self._in_scan, self._seen = True, False, len(START)
         return True
@@ -130,20 +130,20 @@ class PictureCutter:
         """
         data, at = self._data, self._seen
         if self._in_scan:
-            found = _NEXT_MARKER.search(data, at)
-            self._seen = at = found.start() if found else max(at, len(data) - 1)
-            self._in_scan = found is None
-            if found is None:
+            match = _NEXT_MARKER.search(data, at)
+            self._seen = at = match.start() if match else max(at, len(data) - 1)
+            self._in_scan = match is None
+            if match is None:
                 return None
         while data[at : at + 2] == b"\xff\xff":
             at += 1
         if len(data) > at + 1 and (data[at] != 0xFF or not data[at + 1]):  # as some webcams send
             if data.find(PICTURE_START, len(START), at + len(PICTURE_START) - 1) >= 0:
                 return -at  # a cut segment ran into another picture
-            found = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
-            if found is None:
+            match = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
+            if match is None:
                 return None if len(data) < at + MAX_STRAY_BYTES else -at
-            at = found.start()
+            at = match.start()
         self._seen = at
         self._over = data[at : at + 2] == END
         if self._over:

@@ -145,8 +145,8 @@ class _PartsStream:
         """Start cutting and decoding pictures."""
         await self._decoding.begin(self)
         self._tasks = [
-            asyncio.create_task(work, name=f"{what} of {self._name}")
-            for work, what in ((self._read(), "parts"), (self._watch(), "silence"))
+            asyncio.create_task(work, name=f"{label} of {self._name}")
+            for work, label in ((self._read(), "parts"), (self._watch(), "silence"))
         ]
 
     async def end(self) -> None:

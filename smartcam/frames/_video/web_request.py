@@ -161,16 +161,16 @@ class WebStream:
         return answer
 
     async def _head(self) -> WebAnswer:
-        came = bytearray()
+        received = bytearray()
         looked = 0
-        while (ends := _HEAD_ENDS.search(came, max(0, looked - 10))) is None:
-            looked = len(came)
+        while (ends := _HEAD_ENDS.search(received, max(0, looked - 10))) is None:
+            looked = len(received)
             piece = await self._some()
-            came += piece
-            if not piece or len(came) > MAX_HEAD_BYTES:
+            received += piece
+            if not piece or len(received) > MAX_HEAD_BYTES:
                 raise ValueError("no head")
-        self._rest = bytes(came[ends.end() :])
-        return _answer(bytes(came[: ends.start()]))
+        self._rest = bytes(received[ends.end() :])
+        return _answer(bytes(received[: ends.start()]))
 
     async def _some(self, most: int = PIECE_BYTES) -> bytes:
         if self._rest:
@@ -196,12 +196,12 @@ class WebStream:
 
 def _answer(head: bytes) -> WebAnswer:
     first, *lines = head.decode("latin-1").replace("\r", "").split("\n")
-    found = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
-    if found is None:
+    match = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
+    if match is None:
         raise ValueError("no answer")
     headers: dict[str, list[str]] = {}
     for line in lines:
         key, colon, value = line.partition(":")
         if colon:
             headers.setdefault(key.strip().lower(), []).append(value.strip())
-    return WebAnswer(int(found[1]), found[2].strip(), headers)
+    return WebAnswer(int(match[1]), match[2].strip(), headers)

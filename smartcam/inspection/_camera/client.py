@@ -64,7 +64,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         }
         given = {
             **usual,
-            **{name: one for name, one in options.items() if one or name not in usual},
+            **{name: value for name, value in options.items() if value or name not in usual},
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)

@@ -228,7 +228,7 @@ class FrameInspector(Inspector):
 
     async def _follow(self, source: FrameSource) -> bool:
         """Pass frames to waiting runs until the source ends; return whether any frame came."""
-        came = False
+        arrived = False
         held: Frame | None = None  # frame of a recording, whose run was cancelled
         async with source.reader(timeout=None) as reader:
             while True:
@@ -237,8 +237,8 @@ class FrameInspector(Inspector):
                 try:
                     frame: Frame = await anext(reader) if held is None else held
                 except StopAsyncIteration:
-                    return came
-                came, held = True, None
+                    return arrived
+                arrived, held = True, None
                 if self._recorded and frame.lost:  # a run with a damaged picture has no result
                     held = dataclasses.replace(frame, lost=0)
                     why = f"{frame.lost} damaged pictures before picture {frame.sequence}"

@@ -49,11 +49,11 @@ class JudgedResults(Observer):
         self,
         session: Callable[[], tuple[int, LastReport | None]],
         received: Callable[[], int],
-        found: Callable[[Result, Judged], None],
+        on_found: Callable[[Result, Judged], None],
         *,
         max_kept: int = MAX_KEPT,
     ) -> None:
-        self._session, self._received, self._found = session, received, found
+        self._session, self._received, self._found = session, received, on_found
         self._max_kept = max_kept
         self._number = 0  # number of the session
         self._sent = 0  # number of containers sent in the session
@@ -87,7 +87,7 @@ class JudgedResults(Observer):
         """Find the picture of a result."""
         count = result.number - self._before
         sent = self._pending.pop(count, None)
-        for older in [one for one in self._pending if one < count]:
+        for older in [count_before for count_before in self._pending if count_before < count]:
             del self._pending[older]  # their results were not awaited
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return

@@ -200,10 +200,10 @@ def _steps(
     places, blurs = _places(pixels, segments, shape, widened)
     if first is not None:
         blurs = np.full_like(blurs, first)
-    count, own = len(segments.halves), blurs[pixels.owners]
+    count, blurs_of_pixels = len(segments.halves), blurs[pixels.owners]
     if ground is None:
-        return fit_bands(places[0], own, pixels, count), blurs
-    return fit_on_ground(places, own, pixels, ground, noise), blurs
+        return fit_bands(places[0], blurs_of_pixels, pixels, count), blurs
+    return fit_on_ground(places, blurs_of_pixels, pixels, ground, noise), blurs
 
 
 def _places(
@@ -280,11 +280,11 @@ def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blu
     """Return the standard deviation of each shift: of both pictures' noise, and of a misfit."""
     # a band whose pixels stray more than by chance from a step has more than noise in it
     beyond = fit.variances > noise**2 * (1 + 2.5 * np.sqrt(2 / fit.freedoms))
-    own = np.where(beyond, fit.variances, noise**2)
+    variances = np.where(beyond, fit.variances, noise**2)
     # and what it has may move the edge, by as much as it is at the steepest place
     steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)
     misfit = np.where(beyond, fit.variances - noise**2, 0.0) / steepest**2
-    return np.sqrt(own * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
+    return np.sqrt(variances * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
 
 
 Equations = tuple["Array", "Array", "Array"]
@@ -292,11 +292,12 @@ Equations = tuple["Array", "Array", "Array"]
 
 
 def _solve(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
     """Return the robust solution (7,) and its covariance (7, 7); None: too little is seen.
 
-    ``off`` (4,): how far size, stretch, shear and growth are off what is expected, by ``sigmas``.
+    ``residuals`` (4,): how far size, stretch, shear and growth are off their expected values, by
+    ``sigmas``.
     """
     rows, shifts, weights = equations
     used = weights > 0
@@ -305,23 +306,23 @@ def _solve(
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
     for _ in range(4):
-        solved = _least_squares((a, y, w * robust), free, off, sigmas)
+        solved = _least_squares((a, y, w * robust), free, residuals, sigmas)
         if solved is None:
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
         robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
-    return _least_squares((a, y, w * robust), free, off, sigmas)
+    return _least_squares((a, y, w * robust), free, residuals, sigmas)
 
 
 def _least_squares(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
     rows, values, weights = equations
     weighted = rows * weights[:, None]
     square, right = rows.T @ weighted, weighted.T @ values
     square[range(3, 7), range(3, 7)] += 1 / sigmas**2
-    right[3:] -= off / sigmas**2
+    right[3:] -= residuals / sigmas**2
     square, right = square[np.ix_(free, free)], right[free]
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
@@ -332,10 +333,10 @@ def _least_squares(
     if not np.abs(inverse).max() < MAX_INVERSE:
         return None
     inverse = inverse / np.outer(scale, scale)
-    found, covariance = np.zeros(7), np.zeros((7, 7))
-    found[free] = inverse @ right
+    solution, covariance = np.zeros(7), np.zeros((7, 7))
+    solution[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
-    return found, covariance
+    return solution, covariance
 
 
 def _result(
@@ -351,10 +352,10 @@ def _result(
     fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
     # as much of each edge counts as it is where it should be, and a step
-    off = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
-    seen = edges & (off <= 1)
+    deviations = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
+    seen = edges & (deviations <= 1)
     lengths = segments.halves / segments.halves.sum()
-    score = float((lengths * (1 - off**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
+    score = float((lengths * (1 - deviations**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
     wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     ground = None
     if score >= use.least_score:
@@ -373,9 +374,9 @@ def _result(
     settled = _settled(weighted, free, expected.off(shape), expected.sigmas)
     if settled is None:
         return None
-    move, covariance, kept, chi_square = settled
+    move, covariance, used, chi_square = settled
     left = (fit.shifts - rows @ move) * np.sqrt(weights)
-    covariance = covariance * common_error(segments, left, kept, sure=ground is not None)
+    covariance = covariance * common_error(segments, left, used, sure=ground is not None)
     pose = shape.moved(move).pose
     if covariance[3, 3] == 0:
         pose = pose._replace(scale=expected.scale)
@@ -388,7 +389,7 @@ def _result(
         covariance,
         score,
         seen,
-        kept,
+        used,
         noise,
         chi_square,
         float(lengths[wrong].sum()),
@@ -397,7 +398,7 @@ def _result(
 
 
 def _settled(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
     """Return the last move (7,), the pose's covariance (4, 4), and the segments it follows from.
 
@@ -405,48 +406,52 @@ def _settled(
     """
     rows, shifts, weights = equations
     away = np.abs(shifts) * np.sqrt(weights)
-    kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
-    if kept.any():  # where the whole part is not quite the taught one, as in too much light
-        spread = max(1.4826 * float(np.median(away[kept])), 1.0)
+    used, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
+    if used.any():  # where the whole part is not quite the taught one, as in too much light
+        spread = max(1.4826 * float(np.median(away[used])), 1.0)
     for _ in range(3):
-        kept = (weights > 0) & (away <= CUT * spread)
-        if np.count_nonzero(kept) < MIN_SEEN:
+        used = (weights > 0) & (away <= CUT * spread)
+        if np.count_nonzero(used) < MIN_SEEN:
             return None
-        freedom = max(int(kept.sum()) - 4, 1)
-        chi_square = float((away[kept] ** 2).sum()) / freedom
+        freedom = max(int(used.sum()) - 4, 1)
+        chi_square = float((away[used] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
     misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part is not quite the taught one
-    weighted = rows[kept], shifts[kept], weights[kept]
-    solved = _changed(weighted, free, off, sigmas, max(chi_square, 1.0))
+    weighted = rows[used], shifts[used], weights[used]
+    solved = _changed(weighted, free, residuals, sigmas, max(chi_square, 1.0))
     if solved is None:
         return None
     move, covariance = solved
-    return move, covariance[:4, :4] * (chi_square if misfit else 1.0), kept, chi_square
+    return move, covariance[:4, :4] * (chi_square if misfit else 1.0), used, chi_square
 
 
 def _changed(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array, chi_square: float
+    equations: Equations,
+    free: NDArray[np.bool_],
+    residuals: Array,
+    sigmas: Array,
+    chi_square: float,
 ) -> tuple[Array, Array] | None:
     """Return the solution in which the part is as it is expected where it may be.
 
     What the edges say of a change beyond their own error says how large that change may be.
     """
     rows, shifts, weights = equations
-    solved = _least_squares(equations, free, off, sigmas)
+    solved = _least_squares(equations, free, residuals, sigmas)
     if solved is None:
         return None
     move, covariance = solved
     by_edges = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
-    beyond = (off + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
+    beyond = (residuals + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
     none = (beyond <= 0) & np.isfinite(sigmas)
     known = np.minimum(np.sqrt(np.maximum(beyond, 1e-12)), sigmas)
     known = np.where(np.isfinite(sigmas), known, sigmas)
-    shifts = shifts + rows[:, 3:] @ np.where(none, off, 0.0)
-    kept = free.copy()
-    kept[3:] &= ~none
-    solved = _least_squares((rows, shifts, weights), kept, off, known)
+    shifts = shifts + rows[:, 3:] @ np.where(none, residuals, 0.0)
+    freed = free.copy()
+    freed[3:] &= ~none
+    solved = _least_squares((rows, shifts, weights), freed, residuals, known)
     if solved is not None:
-        solved[0][3:][none] = -off[none]
+        solved[0][3:][none] = -residuals[none]
     return solved
 
 

@@ -123,7 +123,7 @@ def _centre(segments: Segments, count: int) -> Array:
     centre = np.zeros(2)
     index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
     for step in range(CENTRE_STEPS):
-        near = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
+        reach = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
         rows, values = [], []
         for number in range(1, count):
             angle = 2 * math.pi * number / count
@@ -131,12 +131,12 @@ def _centre(segments: Segments, count: int) -> Array:
             turn = np.array([[cos, -sin], [sin, cos]])
             moved = (segments.middles - centre) @ turn.T + centre
             met = index.query(moved)[1]
-            off, along = segments.places(moved, met)
+            across, along = segments.places(moved, met)
             agreed = (segments.normals @ turn.T * segments.normals[met]).sum(axis=1)
-            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(off) <= near)
+            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(across) <= reach)
             used &= np.abs(along) <= segments.halves[met] + 1
             rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
-            values.append(-off[used])
+            values.append(-across[used])
         if sum(map(len, values)) < MIN_PAIRED_SEGMENTS:
             return np.zeros(2)
         centre = centre + np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
@@ -173,6 +173,8 @@ def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
     inside = shares[:period]
     before, after = np.roll(inside, 1), np.roll(inside, -1)
     peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= MIN_ALIKE_SHARE))
-    far = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
-    order = far[np.argsort(-inside[far], kind="stable")][:8]
-    return tuple((2 * math.pi * one / ANGLE_COUNT, float(shares[one])) for one in order.tolist())
+    distant = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
+    order = distant[np.argsort(-inside[distant], kind="stable")][:8]
+    return tuple(
+        (2 * math.pi * place / ANGLE_COUNT, float(shares[place])) for place in order.tolist()
+    )

@@ -67,7 +67,7 @@ def with_bools(layout: Layout, data: bytes) -> bytes:
     """Return a result's bytes with the bools of smartcam's layouts: 1 becomes 0xFF."""
     if not any(field.type == "bool" for field in (*layout.head, *layout.fields)):
         return data
-    begin, size = (sum(field.size for field in some) for some in (layout.head, layout.fields))
+    begin, size = (sum(field.size for field in fields) for fields in (layout.head, layout.fields))
     starts = range(begin, len(data), size) if layout.repeat is not None else (begin,)
     changed = bytearray(data)
     for start, fields in ((0, layout.head), *((start, layout.fields) for start in starts)):

@@ -66,8 +66,8 @@ class EmulatedSr(LineCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
         call = client.keep()
-        word, _, rest = line.partition(",")
-        bank = rest.isdecimal() and len(rest) == 2 and int(rest) <= LAST_BANK
+        word, _, argument = line.partition(",")
+        bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK
         if line == "LON" or (word == "LON" and bank):
             self._begin(call)
         elif line == "LOFF":

@@ -92,9 +92,9 @@ class Events:
                 raise KeyError(f"{kind} has no field {field}")
             setattr(event, field, value)
         for node in (source, ua.NodeId(ua.ObjectIds.Server)):
-            one = copy.copy(event)
-            one.emitting_node = node
-            await self._server.iserver.subscription_service.trigger_event(one)
+            emitted = copy.copy(event)
+            emitted.emitting_node = node
+            await self._server.iserver.subscription_service.trigger_event(emitted)
 
     async def _template(self, kind: str) -> Any:
         known = self._templates.get(kind)

@@ -44,8 +44,8 @@ class TransferFiles:
         own: index of the namespace that contains the cameras' nodes.
     """
 
-    def __init__(self, server: Any, own: int) -> None:
-        self._server, self._own = server, own
+    def __init__(self, server: Any, own_index: int) -> None:
+        self._server, self._own = server, own_index
         self._files: dict[int, _OpenFile] = {}
         self._numbers = itertools.count(1)
         self._closing: set[asyncio.Task[None]] = set()
@@ -69,10 +69,10 @@ class TransferFiles:
         await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
 
     async def _generate(self, nodes: CameraNodes, book: ResultBook, options: Any) -> Any:
-        asked = getattr(getattr(options, "Value", None), "Id", None)
-        key = getattr(asked, "Id", asked)
-        kept = book.get(key, nodes.name) if isinstance(key, str) else None
-        path = None if kept is None else kept.result.picture
+        key_asked = getattr(getattr(options, "Value", None), "Id", None)
+        key = getattr(key_asked, "Id", key_asked)
+        kept_result = book.get(key, nodes.name) if isinstance(key, str) else None
+        path = None if kept_result is None else kept_result.result.picture
         if path is None:
             return _status(ua.StatusCodes.BadNotFound)
         if len(self._files) >= MAX_FILES:

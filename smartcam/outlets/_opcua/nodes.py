@@ -126,8 +126,11 @@ class CameraNodes:
                 self.id(f"Plain.{name}"),
                 ua.QualifiedName(name, self._own),
                 _nothing,
-                [_argument(one, kind) for one, kind in inputs],
-                [_argument(one, kind) for one, kind in (*outputs, ("Error", ua.VariantType.Int32))],
+                [_argument(argument_name, kind) for argument_name, kind in inputs],
+                [
+                    _argument(argument_name, kind)
+                    for argument_name, kind in (*outputs, ("Error", ua.VariantType.Int32))
+                ],
             )
         await self._show_states(states.vision, states.automatic)
 
@@ -151,10 +154,10 @@ class CameraNodes:
         """Add an optional method to an instance, as a copy of its type's node."""
         of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         pattern = await of.get_child(f"{self._vision}:{method}")
-        found: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
-        for one in await pattern.get_properties():
-            found[(await one.read_browse_name()).Name] = await one.read_value()
-        inputs, outputs = found["InputArguments"], found["OutputArguments"]
+        arguments: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
+        for property_ in await pattern.get_properties():
+            arguments[(await property_.read_browse_name()).Name] = await property_.read_value()
+        inputs, outputs = arguments["InputArguments"], arguments["OutputArguments"]
         name = ua.QualifiedName(method, self._vision)
         await self._node(path).add_method(
             self.id(f"{path}.{method}"), name, _nothing, inputs, outputs
@@ -327,8 +330,8 @@ class CameraNodes:
             "Records": len(records),
             "Value": text,
         }
-        for name, one in shown.items():
-            await self._write(f"Plain.{name}", ua.Variant(one, _PLAIN[name][0]))
+        for name, value in shown.items():
+            await self._write(f"Plain.{name}", ua.Variant(value, _PLAIN[name][0]))
         if columns and result.application is not None:
             first = records[0] if records and not result.error else {}
             await self._show_columns(f"App{result.application}", columns[:MAX_FIELDS], first)

@@ -142,7 +142,11 @@ class FailedLogins:
             ServiceError: too many logins from this address have failed.
         """
         now = self._clock()
-        failed = [one for one in self._failed.get(address, ()) if now - one < LOGIN_SECONDS]
+        failed = [
+            attempt_at
+            for attempt_at in self._failed.get(address, ())
+            if now - attempt_at < LOGIN_SECONDS
+        ]
         if len(failed) >= MAX_FAILED_LOGINS:
             raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
         try:

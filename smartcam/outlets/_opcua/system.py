@@ -208,8 +208,10 @@ class VisionSystem:
     def recipes(self) -> Mapping[str, int]:
         """Names of applications: those of the settings, which win, and the camera's own."""
         named = self.settings.recipes
-        own = {name: number for name, number in self._names().items() if name not in named}
-        return {**named, **own}
+        recipes_unnamed = {
+            name: number for name, number in self._names().items() if name not in named
+        }
+        return {**named, **recipes_unnamed}
 
     def application_of(self, external: str, internal: str = "") -> int:
         """Return the application of a recipe.
@@ -221,19 +223,19 @@ class VisionSystem:
         Raises:
             UnknownRecipeError: there is no such recipe, or the two ids name different ones.
         """
-        found: set[int] = set()
+        applications: set[int] = set()
         recipes = self.recipes
         for text, names in ((external, recipes), (internal, dict[str, int]())):
             if text in names:
-                found.add(names[text])
+                applications.add(names[text])
             elif text.isascii() and text.isdecimal() and int(text[:11]) <= 0xFFFFFFFF:
-                found.add(int(text))
+                applications.add(int(text))
             elif text:
                 known = ", ".join(recipes) or "no names"
                 raise UnknownRecipeError(f"there is no recipe {text!r:.80}; known: {known}")
-        if len(found) != 1:
+        if len(applications) != 1:
             raise UnknownRecipeError(f"expected one recipe, got {external!r:.80}, {internal!r:.80}")
-        return found.pop()
+        return applications.pop()
 
     def recipe_name(self, application: int | None) -> str:
         """Return the first name of an application, else its number."""
@@ -504,9 +506,9 @@ class VisionSystem:
         """Return the job of a result; None if it is uncertain."""
         trigger = _time(fields.get("triggered_at"))
         if trigger is not None:
-            found = self._by_trigger.pop(trigger, None)
-            if found is not None:
-                return found
+            job_of_trigger = self._by_trigger.pop(trigger, None)
+            if job_of_trigger is not None:
+                return job_of_trigger
         clock = asyncio.get_running_loop().time()
         job = self.job or self._last_continuous
         if job is None or job.single or at < job.started or (trigger and trigger < job.started):

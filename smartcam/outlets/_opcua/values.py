@@ -99,7 +99,9 @@ class Structure(NamedTuple):
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):
             return None
         kind = ua.VariantType.ExtensionObject
-        return [ua.Variant(ua.ExtensionObject(self.encoding, one), kind) for one in packed]
+        return [
+            ua.Variant(ua.ExtensionObject(self.encoding, structure), kind) for structure in packed
+        ]
 
     def _pack(self, record: Mapping[str, Any]) -> bytes:
         parts: list[bytes] = []
@@ -121,8 +123,8 @@ class VisionValues:
         own: index of the namespace of cameras.
     """
 
-    def __init__(self, server: Any, machine_vision: int, own: int) -> None:
-        self._server, self._vision, self._own = server, machine_vision, own
+    def __init__(self, server: Any, machine_vision: int, own_index: int) -> None:
+        self._server, self._vision, self._own = server, machine_vision, own_index
         self._structures: dict[tuple[str, int, tuple[Column, ...]], Structure] = {}
         base: Any = getattr(ua, "BinaryIdBaseDataType")  # noqa: B009 - made from the nodeset
         self._classes: dict[str, Any] = {

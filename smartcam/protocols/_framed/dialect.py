@@ -99,14 +99,14 @@ class StatusBits:
         """Return the status for a word on the wire."""
         if not self.others:
             return as_status(word)
-        status, rest = int(self.always), word
+        status, payload = int(self.always), word
         for bit, meaning in self.named.items():
             status |= meaning if word & bit else 0
-            rest &= ~bit
+            payload &= ~bit
         for bit, meaning in self.without.items():
             status |= 0 if word & bit else meaning
-            rest &= ~bit
-        return Status(status | rest << self.others)
+            payload &= ~bit
+        return Status(status | payload << self.others)
 
     def write(self, status: Status) -> int:
         """Return the word on the wire; bits without a place there are left out."""
@@ -173,9 +173,9 @@ class Codec:
         # fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [_filler(row.type, name) for name in self.names]
         self._omitted = [
-            (_filler(row.type, one.name), one.default)
-            for one in dataclasses.fields(row.type)
-            if one.name not in self.names
+            (_filler(row.type, attribute.name), attribute.default)
+            for attribute in dataclasses.fields(row.type)
+            if attribute.name not in self.names
         ]
 
     @property
@@ -251,7 +251,9 @@ class Codec:
     def like(self, message: Message) -> Callable[[bytes], Message]:
         """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
-        names = [one.name for one in dataclasses.fields(kind) if one.name != data_name]
+        names = [
+            attribute.name for attribute in dataclasses.fields(kind) if attribute.name != data_name
+        ]
         others = [(_filler(kind, name), getattr(message, name)) for name in names]
         fill_data = _filler(kind, data_name)
 
@@ -288,7 +290,7 @@ class Codec:
 
 def _filler(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
     """Return the setter of a field's slot, from the class that declares the slot."""
-    owner = next(one for one in message_type.__mro__ if name in vars(one))
+    owner = next(base for base in message_type.__mro__ if name in vars(base))
     fill: Callable[[Message, Any], None] = vars(owner)[name].__set__
     return fill
 

@@ -295,11 +295,11 @@ class Machine:
         Raises:
             LocalProtocolError: the dialect is not in :attr:`kin`.
         """
-        found = [one for one in self.kin if one is dialect]
-        if not found:
+        candidates = [dialect_ for dialect_ in self.kin if dialect_ is dialect]
+        if not candidates:
             raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
-        self.kin = found
-        self._take_up(found[0])
+        self.kin = candidates
+        self._take_up(candidates[0])
 
     def _take_up(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
@@ -418,8 +418,8 @@ class Machine:
         if cut:
             before = self.counters.frames_received
             left = self._receive_frames()
-            came = self.counters.frames_received - before
-            if came > MANY_FRAMES or len(self._events) > MANY_EVENTS:
+            received = self.counters.frames_received - before
+            if received > MANY_FRAMES or len(self._events) > MANY_EVENTS:
                 self._framer.read_less()
         if left and self._bounded:
             number = self.counters.frames_received
@@ -547,19 +547,19 @@ class Machine:
         self._receive_familiar()
         while framer.start < len(framer.buffer):
             try:
-                found = framer.cut()
+                frame = framer.cut()
             except RemoteProtocolError as error:
                 if self._reject(error):
                     return False
                 framer.resync()
                 continue
-            if found is None:
+            if frame is None:
                 return True
-            message = self._receive_frame(*found)
+            message = self._receive_frame(*frame)
             if framer.start == len(framer.buffer):
                 break
             if self._takes_bursts and isinstance(message, m.ResultContainer):
-                self._receive_burst(message, found[1])
+                self._receive_burst(message, frame[1])
             self._receive_familiar()
         return False
 
@@ -581,12 +581,12 @@ class Machine:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
-                found = self._find_result(buffer, start)
-                if found is None and self._open:
-                    found = self._find_answer(buffer, start)
-                if found is None:
+                result = self._find_result(buffer, start)
+                if result is None and self._open:
+                    result = self._find_answer(buffer, start)
+                if result is None:
                     break
-                message, end = found
+                message, end = result
             elif status_id in self._open:
                 self._close(status_id)
             events.append(message)
@@ -703,12 +703,12 @@ class Machine:
         header = self.dialect.header
         message_id, size = framer.unfinished() or (None, header.size)
         which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
-        there = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
+        shortage = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
         other = framer.header_within(begun.searched)
         if other is not None:
-            text = f"{which} holds another header at byte {other}; {there}"
+            text = f"{which} holds another header at byte {other}; {shortage}"
         elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
-            text = f"{which} does not become whole: {there}"
+            text = f"{which} does not become whole: {shortage}"
         else:
             begun.searched = max(framer.buffered - header.size + 1, 0)
             return False
@@ -725,8 +725,8 @@ class Machine:
                 framer.clear()
                 return
         try:
-            found = framer.cut()
-            if found is None or framer.buffered:
+            frame = framer.cut()
+            if frame is None or framer.buffered:
                 raise MessageError(
                     f"a datagram is not one whole frame: {hex_excerpt(framer.pending)}",
                     data=framer.pending,
@@ -734,7 +734,7 @@ class Machine:
         except RemoteProtocolError as error:
             self._reject(error)
         else:
-            self._receive_frame(*found)
+            self._receive_frame(*frame)
         framer.clear()
 
     def _receive_frame(self, message_id: int, begin: int, end: int) -> Message | None:

@@ -177,8 +177,8 @@ class InSightDialect(Dialect):
             return Spelled(None, "password", {"text": "***"}, b"")
         if frame.message_id == Piece.TEXT:
             return Spelled(None, "text", {"text": text}, frame.payload)
-        what = "command" if sender is m.Sender.CLIENT else "line"
-        return Spelled(None, what, {"text": text}, frame.payload + LINE_END)
+        label = "command" if sender is m.Sender.CLIENT else "line"
+        return Spelled(None, label, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
         """Return a command of the user, such as ``GVA001``; the payload follows it.
@@ -219,7 +219,7 @@ def _cell_names(text: str) -> list[str]:
     Raises ConfigurationError: one is neither a cell, a range, nor a name; or there are too many.
     """
     names: list[str] = []
-    for part in filter(None, (one.strip() for one in text.split(","))):
+    for part in filter(None, (name.strip() for name in text.split(","))):
         if ":" in part or part[1:2].isdecimal():
             names += [cell.wire for cell in parse_cells(part)]
         else:

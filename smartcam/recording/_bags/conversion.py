@@ -103,11 +103,11 @@ class BagConversion:
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
         again = self.interpret_as is not None or self.calibration is not None
-        self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
+        self._readers = {name.name: self._reader(name) for name in chosen} if again else {}
         self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
-        for one in chosen:
-            facts = {"interpret_as": self._spec(one)} if again else one.facts
-            self._items.describe({**facts, "camera": one.name})
+        for camera in chosen:
+            facts = {"interpret_as": self._spec(camera)} if again else camera.facts
+            self._items.describe({**facts, "camera": camera.name})
 
     @property
     def counts(self) -> BagCounts:

@@ -78,12 +78,12 @@ class FolderFiles:
         """
         done = written = 0
         try:
-            for place, one in enumerate(given):
+            for place, item in enumerate(given):
                 if track.file is None or (not place % ITEMS_PER_LOOK and self._is_over(track)):
                     self._flush(track, written)
                     done, written = place, 0
-                    self._begin(track, one)
-                written += self._add(track, one)
+                    self._begin(track, item)
+                written += self._add(track, item)
             self._flush(track, written)
             done = len(given)
         except BaseException:
@@ -213,10 +213,10 @@ class FolderFiles:
         """Delete the oldest files until the rest is within the bound."""
         folder = self._folder
         while folder.bytes > self._limits.keep:
-            found = [file for file in folder.files.values() if file.name not in self._stuck]
-            if not found:
+            old_files = [file for file in folder.files.values() if file.name not in self._stuck]
+            if not old_files:
                 return
-            oldest = min(found)
+            oldest = min(old_files)
             for track in tracks:
                 if track.file is not None and track.file.path.name == oldest.name:
                     self.finish(track)  # the camera's next record begins a new one

@@ -232,8 +232,8 @@ class _Hooks(Observer):
         if track is not None:
             text = str(error)
             kind = type(error).__name__
-            came = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
-            self._writer.put(track, came, len(text))
+            recorded = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
+            self._writer.put(track, recorded, len(text))
 
     def _endian(self, camera: str) -> int | None:
         host = self._server.hosts.get(camera)

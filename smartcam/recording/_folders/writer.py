@@ -89,10 +89,10 @@ class FolderWriter:
         folder: RecordingFolder,
         limits: Limits,
         compress: Callable[[bytes], bytes],
-        tell: Callable[[RecordingError | None], None],
+        report: Callable[[RecordingError | None], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._tell, self._clock = folder, tell, clock
+        self._folder, self._tell, self._clock = folder, report, clock
         self._files = FolderFiles(folder, limits, compress, clock)
         self._more = threading.Condition()
         self._waiting = _DiskQueue()
@@ -226,21 +226,21 @@ class FolderWriter:
             for track in self._tracks.values():
                 track.overflow = None
             over = self._closing
-        found: dict[CameraTrack, list[Any]] = {}
+        items_of_track: dict[CameraTrack, list[Any]] = {}
         for track, item in taken.items:
-            found.setdefault(track, []).append(item)
-        return found, over
+            items_of_track.setdefault(track, []).append(item)
+        return items_of_track, over
 
-    def _write(self, found: dict[CameraTrack, list[Any]]) -> None:
+    def _write(self, items_of_track: dict[CameraTrack, list[Any]]) -> None:
         """Write records, or count them as lost; never raises."""
         try:
-            if self._ready(found):
-                for track, given in found.items():
+            if self._ready(items_of_track):
+                for track, given in items_of_track.items():
                     self._files.write(track, given)
                 tracks = self._all_tracks()
                 self._files.end_old(tracks)
                 self._files.delete_old(tracks)
-                if found:
+                if items_of_track:
                     self._heal()
         except (OSError, ConfigurationError) as exc:
             self._fail(exc)
@@ -249,10 +249,10 @@ class FolderWriter:
             self._fail(exc)
         trouble = self._trouble
         if trouble is not None:
-            for track, given in found.items():
+            for track, given in items_of_track.items():
                 track.lose(given, trouble.reason)
 
-    def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
+    def _ready(self, items_of_track: dict[CameraTrack, list[Any]]) -> bool:
         """Return True if the disk should be tried; after a failure, check its free room first.
 
         Raises:
@@ -262,7 +262,7 @@ class FolderWriter:
         trouble, now = self._trouble, self._clock()
         if trouble is None:
             return True
-        if now < trouble.again or not found:
+        if now < trouble.again or not items_of_track:
             return False
         self._files.enter()
         if trouble.full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:

@@ -137,20 +137,22 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         ValueError: the message is not valid.
     """
     lists = values_of(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
-    found: dict[int, Drawing] = {}
-    for one in lists.get("points", ()):
-        values = values_of(_MESSAGES["PointsAnnotation"], one, MAX_POINTS + 100)
+    drawings: dict[int, Drawing] = {}
+    for annotation in lists.get("points", ()):
+        values = values_of(_MESSAGES["PointsAnnotation"], annotation, MAX_POINTS + 100)
         kind = _KINDS.get(values.get("type", 0))
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
         points = tuple(map(_coordinates, values.get("points", ())))
-        found[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
-    for one in lists.get("texts", ()):
-        values = values_of(_MESSAGES["TextAnnotation"], one, 100)
+        drawings[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+    for annotation in lists.get("texts", ()):
+        values = values_of(_MESSAGES["TextAnnotation"], annotation, 100)
         if "place" in values:  # others are the words of points
             point = _coordinates(values.get("position", memoryview(b"")))
-            found[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
-    return tuple(one for _, one in sorted(found.items()))
+            drawings[_number(values)] = Drawing(
+                "text", (point,), _role(values), _text(values, "text")
+            )
+    return tuple(drawing for _, drawing in sorted(drawings.items()))
 
 
 def _point(x: float, y: float) -> bytes:
@@ -178,10 +180,12 @@ def _number(values: dict[str, Any]) -> int:
 
 
 def _role(values: dict[str, Any]) -> Role:
-    came = _text(values, "role")
-    role: Role | None = next((argument for argument in get_args(Role) if argument == came), None)
+    role_text = _text(values, "role")
+    role: Role | None = next(
+        (argument for argument in get_args(Role) if argument == role_text), None
+    )
     if role is None:
-        raise ValueError(f"role: {came!r:.60} came, expected {', '.join(get_args(Role))}")
+        raise ValueError(f"role: {role_text!r:.60} came, expected {', '.join(get_args(Role))}")
     return role
 
 

@@ -121,10 +121,10 @@ SCHEMAS: Final[dict[str, Fields]] = {
 
 def schema_of(picture: RecordedPicture) -> str:
     """Return the name of the schema of a picture's message."""
-    found = picture.frame.format
-    if not found.compressed:
+    pixel_format = picture.frame.format
+    if not pixel_format.compressed:
         return RAW
-    return VIDEO if found.name == "H264" else COMPRESSED
+    return VIDEO if pixel_format.name == "H264" else COMPRESSED
 
 
 def check_readable(frame: Frame) -> None:
@@ -237,10 +237,10 @@ def picture_of(
     values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
     fields = _Values(values)
     try:
-        found = find_format(fields.text("pixel_format", 100))
+        pixel_format = find_format(fields.text("pixel_format", 100))
         marks = drawings if number and fields.whole("annotations_from") == number else ()
-        frame = _frame(fields, found, marks)
-        found.check(frame.data, frame.width, frame.height, frame.stride)
+        frame = _frame(fields, pixel_format, marks)
+        pixel_format.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
         received = fields.result_received_at()
     except (FrameFormatError, OverflowError, OSError) as exc:
@@ -250,7 +250,7 @@ def picture_of(
     return RecordedPicture(camera, at, frame, fields.whole("left_out"), *made)
 
 
-def _frame(fields: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
+def _frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
     moment = fields.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")
@@ -260,7 +260,7 @@ def _frame(fields: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -
     width, height = fields.side("picture_width"), fields.side("picture_height")
     return Frame(
         data=fields.data(),
-        format=found,
+        format=pixel_format,
         width=width,
         height=height,
         stride=fields.whole("stride"),
@@ -287,30 +287,30 @@ class _Values:
         return name in self._values
 
     def data(self) -> memoryview:
-        found: memoryview = self._values.get("data", memoryview(b""))
-        return found
+        data: memoryview = self._values.get("data", memoryview(b""))
+        return data
 
     def text(self, name: str, most: int) -> str:
-        found = self._values.get(name, memoryview(b""))
-        if len(found) > 4 * most:
-            raise ValueError(f"{name}: {len(found)} bytes, expected {4 * most} at most")
-        return str(found, "utf-8")
+        text = self._values.get(name, memoryview(b""))
+        if len(text) > 4 * most:
+            raise ValueError(f"{name}: {len(text)} bytes, expected {4 * most} at most")
+        return str(text, "utf-8")
 
     def whole(self, name: str) -> int:
-        found: int = self._values.get(name, 0)
-        return found
+        number: int = self._values.get(name, 0)
+        return number
 
     def side(self, name: str) -> int:
-        found = self.whole(name)
-        if not 1 <= found <= MAX_SIDE_PX:
-            raise ValueError(f"{name}: {found} came, expected 1 to {MAX_SIDE_PX} pixels")
-        return found
+        side = self.whole(name)
+        if not 1 <= side <= MAX_SIDE_PX:
+            raise ValueError(f"{name}: {side} came, expected 1 to {MAX_SIDE_PX} pixels")
+        return side
 
     def real(self, name: str, *, endless: bool = False) -> float:
-        found: float = self._values.get(name, 0.0)
-        if math.isnan(found) or (math.isinf(found) and not endless):
-            raise ValueError(f"{name}: {found} came, expected seconds")
-        return found
+        number: float = self._values.get(name, 0.0)
+        if math.isnan(number) or (math.isinf(number) and not endless):
+            raise ValueError(f"{name}: {number} came, expected seconds")
+        return number
 
     def number_of_result(self) -> int | None:
         return self.whole("result_number") or None

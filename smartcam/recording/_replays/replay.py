@@ -213,11 +213,11 @@ class ReplayedCamera(EmulatedCamera):
         self._on_over = None if loop else on_over
         self._tracks = {
             number: _Track(
-                found.waits,
-                _PendingRuns(found.triggered, loop),
-                _PendingRuns(found.untriggered, loop),
+                runs.waits,
+                _PendingRuns(runs.triggered, loop),
+                _PendingRuns(runs.untriggered, loop),
             )
-            for number, found in self.plan.applications.items()
+            for number, runs in self.plan.applications.items()
         }
         recorded: dict[str, Any] = {}
         if quirks is None:
@@ -229,8 +229,8 @@ class ReplayedCamera(EmulatedCamera):
             recorded = dict.fromkeys(self.plan.quirks, True)
         super().__init__(
             [
-                _application(found, speed).play(self._tracks[number])
-                for number, found in self.plan.applications.items()
+                _application(runs, speed).play(self._tracks[number])
+                for number, runs in self.plan.applications.items()
             ],
             builtins=False,
             host=host,
@@ -314,13 +314,13 @@ class ReplayedCamera(EmulatedCamera):
         elif track.waits and track.current is None:
             self._begin(track, track.triggered.pop())
         if track.rest:
-            rest, track.rest = track.rest, []
-            self._send(rest)
+            pending, track.rest = track.rest, []
+            self._send(pending)
         self._arm_drops(track)
         self._play_unasked(track)
         if self._on_over is not None and not self.remaining and not self.device.processing:
-            tell, self._on_over = self._on_over, None
-            tell()
+            on_over, self._on_over = self._on_over, None
+            on_over()
 
     def _begin(self, track: _Track, take: RecordedRun | None) -> None:
         """Begin an inspection with the recorded duration."""
@@ -426,18 +426,18 @@ def _numbers(interpret_as: str | None) -> _Numbers | None:
     if layout is None:
         return None
     offset = 0
-    for one in (*layout.head, *layout.fields):
-        if one.sequence:
-            return _Numbers(one, offset)
-        offset += one.size
+    for part in (*layout.head, *layout.fields):
+        if part.sequence:
+            return _Numbers(part, offset)
+        offset += part.size
     return None
 
 
-def _application(found: ApplicationRuns, speed: float) -> _PlayedApplication:
-    fields: dict[str, Any] = {"id": found.application, "name": "recorded"}
-    if found.load_time is not None:
-        fields["load_time"] = min(found.load_time / speed, MAX_LOAD_TIME)
-    if found.waits:
+def _application(runs: ApplicationRuns, speed: float) -> _PlayedApplication:
+    fields: dict[str, Any] = {"id": runs.application, "name": "recorded"}
+    if runs.load_time is not None:
+        fields["load_time"] = min(runs.load_time / speed, MAX_LOAD_TIME)
+    if runs.waits:
         fields["processing_time"] = MIN_INSPECTION_TIME
     else:
         fields["rate"] = FREE_RUN_RATE

@@ -147,10 +147,10 @@ def _fitting(
 ) -> dict[int, ApplicationRuns]:
     """Return the applications that can be emulated; others must have no containers."""
     fitting: dict[int, ApplicationRuns] = {}
-    for number, found in lists.items():
+    for number, runs in lists.items():
         if number in dialect.application_ids and number >= 1:
-            fitting[number] = found
-        elif found.triggered or found.untriggered:
+            fitting[number] = runs
+        elif runs.triggered or runs.untriggered:
             raise ConfigurationError(
                 f"recording {recording.path}: application id {number} cannot be emulated in "
                 f"dialect {dialect.name}"
@@ -167,14 +167,14 @@ def _dialect_of(
             f"recording {recording.path}: there was no session with camera {camera.name!r}"
         )
     if is_fleet(camera.url):
-        found = BVS.dialects.get(camera.dialect or HANDBOOK.name)
-        if found is None:
+        spoken = BVS.dialects.get(camera.dialect or HANDBOOK.name)
+        if spoken is None:
             raise ConfigurationError(
                 f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
                 f"{camera.dialect}, expected one of bvs; no frames of it are recorded, which would "
                 "be played line by line"
             )
-        return found, "tcp"
+        return spoken, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
@@ -256,12 +256,12 @@ class _GapSteps:
         if self._whole:
             return []
         self._whole = True
-        found = [_ReplayStep(at, _StepKind.CONNECTED)]
+        steps = [_ReplayStep(at, _StepKind.CONNECTED)]
         if item.application is not None:
-            found.append(_ReplayStep(at, _StepKind.NAMED, item.application))
+            steps.append(_ReplayStep(at, _StepKind.NAMED, item.application))
         if item.status is not None:
-            found.append(_ReplayStep(at, _StepKind.STATUS, item.endian, item.status))
-        return found
+            steps.append(_ReplayStep(at, _StepKind.STATUS, item.endian, item.status))
+        return steps
 
 
 def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Iterator[_ReplayStep]:
@@ -370,14 +370,14 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
             most = min(most, by_program - by_agent)
     # a status follows most results at once
     offset = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
-    found: list[_ReplayStep] = []
+    replay_steps: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
         at = step.at + offset if step.kind in _BY_AGENT else step.at
         if step.kind is not _StepKind.TRIGGER:
             at = last = max(at, last)
-        found.append(step._replace(at=at, recorded_at=step.at))
-    return found
+        replay_steps.append(step._replace(at=at, recorded_at=step.at))
+    return replay_steps
 
 
 def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
@@ -561,22 +561,22 @@ class _ScheduleMaker:
         if self.first is None:
             self.first = step.number
         self._name(step.number)
-        found = self._list(step.number)
-        if not found.waits:
+        runs = self._list(step.number)
+        if not runs.waits:
             self._triggers.clear()  # a free-running application ignores them
-            found.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
+            runs.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
         elif self._triggers:
             began = self._triggers.pop(0)
             self._open = RecordedRun([step.data], self.now - began, drops=self._drops)
             self._drops = 0
-            found.triggered.append(self._open)
+            runs.triggered.append(self._open)
         elif self._open is not None and not self._is_over():
             self._open.containers.append(step.data)
         else:
             seen = self._began_untriggered is not None or not self._waits
             began = self.now if self._began_untriggered is None else self._began_untriggered
             take = RecordedRun([step.data], self.now - began, gap=self._gap(began))
-            found.untriggered.append(take)
+            runs.untriggered.append(take)
             self._open = take if seen else None
         if self._open is not None and len(self._open.containers) == 1:
             self._opened = self.now

@@ -105,10 +105,10 @@ class RosCalibrationFace:
         names = [field for field in service.request.model_fields if hasattr(message, field)]
         fields = {name: _plain(getattr(message, name)) for name in names}
         request = validated(service.request, fields, f"{self.name}: {name}")
-        found = await service.do(CalibrationCall(self, request, service.timeout))
-        if "pose" in found:
-            found["pose"] = _stamped(found["pose"])
-        return found
+        answer = await service.do(CalibrationCall(self, request, service.timeout))
+        if "pose" in answer:
+            answer["pose"] = _stamped(answer["pose"])
+        return answer
 
 
 def _plain(value: Any) -> Any:

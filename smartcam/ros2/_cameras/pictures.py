@@ -187,15 +187,17 @@ class CameraPictures:
 
     async def _publish_small(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        way = compression(frame)
+        compressed_form = compression(frame)
         small = frame
-        if way.first:
-            small = await self._codecs.converted(small, way.first)
-        if way.how == "png":
+        if compressed_form.first:
+            small = await self._codecs.converted(small, compressed_form.first)
+        if compressed_form.how == "png":
             small = await self._codecs.png(small)
-        elif way.how == "jpeg":
+        elif compressed_form.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        await publish_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
+        await publish_newest(
+            self._small, compressed_fields(small, compressed_form.text(), self.frame_id)
+        )
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:

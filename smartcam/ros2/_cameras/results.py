@@ -92,7 +92,7 @@ class CameraResults:
     def heard(self) -> bool:
         """True if one of the topics has a subscriber."""
         outlet = () if self._outlet is None else (self._outlet,)
-        return any(_heard(one) for one in (*self._publishers.values(), *outlet))
+        return any(_heard(publisher) for publisher in (*self._publishers.values(), *outlet))
 
     def start(self) -> None:
         """Declare the topics, and publish results from now on. Idempotent.
@@ -177,11 +177,11 @@ class CameraResults:
 
     def _other_topic(self, topic: str, depth: int) -> Any:
         publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
-        own = self._publishers.get("results")
-        if own is not None and _name(publisher) == _name(own):
+        general = self._publishers.get("results")
+        if general is not None and _name(publisher) == _name(general):
             publisher.close()
             raise ConfigurationError(
-                f"{self._camera.name}: {_name(own)} has its results already: expected another "
+                f"{self._camera.name}: {_name(general)} has its results already: expected another "
                 "topic, or none"
             )
         return publisher

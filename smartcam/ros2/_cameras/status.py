@@ -112,10 +112,10 @@ class CameraStatus:
         if tasks:
             await asyncio.wait(tasks)
 
-    def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
-        """Call ``heard`` at each change of the status; return a function that ends that."""
-        self._heard.append(heard)
-        return lambda: self._heard.remove(heard) if heard in self._heard else None
+    def listen(self, on_change: Callable[[], None]) -> Callable[[], None]:
+        """Call ``on_change`` at each change of the status; return a function that ends that."""
+        self._heard.append(on_change)
+        return lambda: self._heard.remove(on_change) if on_change in self._heard else None
 
     def set_period(self, seconds: float) -> None:
         """Publish diagnostics in this period from now on."""
@@ -162,8 +162,8 @@ class CameraStatus:
         self._due = asyncio.get_running_loop().time() + self._least
         self._status.publish({"header": self._header(), **fields})
         self._published = fields
-        for heard in tuple(self._heard):
-            self._guarded(heard)
+        for on_change in tuple(self._heard):
+            self._guarded(on_change)
 
     # ------------------------------------------------------------------ diagnostics
 
@@ -194,7 +194,7 @@ class CameraStatus:
         streams = [subscriber for subscriber in counted.subscribers if subscriber.name == "results"]
         counts["dropped"] = sum(stream.dropped for stream in streams)
         known = KnownState.of(self._camera)
-        how = health(known, heard=self._is_heard(counted))
+        how = health(known, session_alive=self._is_heard(counted))
         before, self._before = self._before, counts
         rose = [name for name in RISING if counts[name] > before.get(name, counts[name])]
         if how.level == OK and rose:

@@ -80,14 +80,14 @@ class CameraFrames:
 
         If there are several applications, each one's child has ``_APPLICATION`` at its end.
         """
-        found = [] if self._place is None else [self._of_pictures(self._place)]
+        transforms = [] if self._place is None else [self._of_pictures(self._place)]
         if self._calibrated_at is not None:
             seen_from = self._calibrated_at.inverse()
-            return [*found, _named(seen_from, self._flange or seen_from.target, self.robot)]
+            return [*transforms, _named(seen_from, self._flange or seen_from.target, self.robot)]
         for application, calibration in self._calibrations.items():
             end = "" if application is None else f"_{application}"
-            found += self._of_plane(calibration, end)
-        return found
+            transforms += self._of_plane(calibration, end)
+        return transforms
 
     def _of_pictures(self, place: Any) -> Transform:
         pose: Transform = place.camera_pose
@@ -114,8 +114,10 @@ def _named(transform: Transform, parent: str, child: str) -> Transform:
 
 def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
     """Return ``geometry_msgs/TransformStamped``: the source's pose in the target, its parent."""
-    x, y, z, w = (float(one) for one in transform.quaternion / np.linalg.norm(transform.quaternion))
-    across, down, ahead = (float(one) for one in transform.translation)
+    x, y, z, w = (
+        float(number) for number in transform.quaternion / np.linalg.norm(transform.quaternion)
+    )
+    across, down, ahead = (float(number) for number in transform.translation)
     return {
         "header": {"stamp": stamp_fields(utc), "frame_id": transform.target},
         "child_frame_id": transform.source,
@@ -178,7 +180,7 @@ class StaticTransforms:
 
 
 def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
-    kept: dict[str, Transform] = {}
+    checked: dict[str, Transform] = {}
     for transform in transforms:
         for name in (transform.target, transform.source):
             if not name or name.startswith("/"):
@@ -186,11 +188,15 @@ def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
                     f"tf: {transform.label}: expected names of frames without / in front, "
                     f"got {name!r}"
                 )
-        if transform.target == transform.source or transform.source in kept:
-            other = kept[transform.source].target if transform.source in kept else transform.target
+        if transform.target == transform.source or transform.source in checked:
+            other = (
+                checked[transform.source].target
+                if transform.source in checked
+                else transform.target
+            )
             raise ConfigurationError(
                 f"tf: {transform.source}: expected one parent that is another frame, "
                 f"got {transform.target} and {other}"
             )
-        kept[transform.source] = transform
-    return tuple(kept.values())
+        checked[transform.source] = transform
+    return tuple(checked.values())

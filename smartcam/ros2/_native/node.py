@@ -234,11 +234,11 @@ class NativeNode(NamedNode):
         except Exception as exc:
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
-    def unmade(self, what: str, end: Any) -> None:
+    def unmade(self, end_text: str, end: Any) -> None:
         """Destroy an endpoint of rclpy."""
         ros = self.ros
         if ros is not None:
-            getattr(ros, f"destroy_{what}")(end)
+            getattr(ros, f"destroy_{end_text}")(end)
 
     def forget(self, end: Any) -> None:
         """Note that an endpoint was closed."""

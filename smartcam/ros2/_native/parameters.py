@@ -63,16 +63,16 @@ class NativeParameters(RosParameters):
 
     # ------------------------------------------------------------------ from here to ROS
 
-    def _tell(self, **what: Any) -> None:
+    def _tell(self, **lists: Any) -> None:
         """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
-        for name in what.get("new", ()):
+        for name in lists.get("new", ()):
             self._declare_in_ros(name)
-        changed = what.get("changed", ())
+        changed = lists.get("changed", ())
         if changed and not _asked_by_ros.get():
-            self._put(lambda: self._ros.set_parameters([self._parameter(one) for one in changed]))
-        for name in what.get("deleted", ()):
+            self._put(lambda: self._ros.set_parameters([self._parameter(name) for name in changed]))
+        for name in lists.get("deleted", ()):
             if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
                 self._put(lambda name=name: self._ros.undeclare_parameter(name))
 
@@ -123,7 +123,7 @@ class NativeParameters(RosParameters):
         value = self._of(name).value
         plain: Any = value.value
         if isinstance(plain, bytes):
-            plain = [bytes([one]) for one in plain]
+            plain = [bytes([byte]) for byte in plain]
         kinds = rclpy("parameter").Parameter
         plain = list(plain) if isinstance(plain, tuple) else plain
         return kinds(name, kinds.Type(value.number), plain)
@@ -151,8 +151,8 @@ class NativeParameters(RosParameters):
 
     def _carry_out(self, given: Mapping[str, Any]) -> None:
         values = {
-            name: decode_value(one.get_parameter_value())
-            for name, one in given.items()
+            name: decode_value(value.get_parameter_value())
+            for name, value in given.items()
             if self.find(name) is not None  # others are rclpy's own
         }
         if not values:

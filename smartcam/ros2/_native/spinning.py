@@ -294,5 +294,5 @@ _open: weakref.WeakSet[SpunNode] = weakref.WeakSet()
 
 @atexit.register
 def _abandon() -> None:
-    for one in tuple(_open):
-        one.abandon()
+    for future in tuple(_open):
+        future.abandon()

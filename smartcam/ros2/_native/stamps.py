@@ -62,8 +62,8 @@ def headers(kind: MessageType, message: Any) -> Iterator[Any]:
         if not field.nested:
             continue
         value = getattr(message, field.attribute)
-        for one in value if field.shape else (value,):
+        for header in value if field.shape else (value,):
             if field.type == HEADER:
-                yield one
+                yield header
             else:
-                yield from headers(kind.nested[field.type], one)
+                yield from headers(kind.nested[field.type], header)

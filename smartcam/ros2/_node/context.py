@@ -98,9 +98,9 @@ class RosContext:
         self.types: RosTypes = RosTypes(distribution)
         self._owns = session is None
         if session is None:
-            heard = _endpoints(listen)
-            link = BusLink(heard, () if heard else _endpoints(connect))
-            session = ZenohSession(link, SETTINGS, what="ROS 2")
+            listening = _endpoints(listen)
+            link = BusLink(listening, () if listening else _endpoints(connect))
+            session = ZenohSession(link, SETTINGS, bus_text="ROS 2")
         self.zenoh: ZenohSession = session
         self.graph: RosGraph = RosGraph(self.domain)
         self.zid: str = ""
@@ -183,12 +183,12 @@ class RosContext:
         Returns:
             A function that ends this.
         """
-        found = self._watchers.setdefault((name, kind), [])
-        found.append(watcher)
+        watchers = self._watchers.setdefault((name, kind), [])
+        watchers.append(watcher)
 
         def end() -> None:
-            found.remove(watcher)
-            if not found and self._watchers.get((name, kind)) is found:
+            watchers.remove(watcher)
+            if not watchers and self._watchers.get((name, kind)) is watchers:
                 del self._watchers[name, kind]
 
         return end
@@ -197,8 +197,8 @@ class RosContext:
         for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
             watcher(other, present)
         if present and other.kind in OTHER_END:
-            for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
-                self._differ(one, other)
+            for end_of_other in self._ends.get((other.name, OTHER_END[other.kind]), ()):
+                self._differ(end_of_other, other)
 
     def _differ(self, one: Entity, other: Entity) -> None:
         if (one.type, one.hash) != (other.type, other.hash):

@@ -255,12 +255,12 @@ class Node(NamedNode):
         self,
         kind: Kind,
         name: str,
-        what: str,
+        kind_text: str,
         dds: str,
         hashed: str,
         qos: QoS,
     ) -> Entity:
-        full = self._resolved(name, what)
+        full = self._resolved(name, kind_text)
         return self._entity(kind, self.context.next_id(), full, dds, hashed, qos)
 
     def _entity(self, kind: Kind, number: int, *more: Any) -> Entity:

@@ -83,9 +83,9 @@ class ParameterServices:
         """Publish that parameters are new, changed or deleted."""
         if self._events is None or not (new or changed or deleted):
             return
-        seconds, rest = divmod(time.time_ns(), 1_000_000_000)
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
         self._events.publish(
-            stamp={"sec": seconds, "nanosec": rest},
+            stamp={"sec": seconds, "nanosec": nanoseconds},
             node=self._node.full_name,
             new_parameters=self._messages(new),
             changed_parameters=self._messages(changed),
@@ -95,8 +95,12 @@ class ParameterServices:
         )
 
     def _messages(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        found = ((name, self._parameters.find(name)) for name in names)
-        return [{"name": name, "value": encode_value(one)} for name, one in found if one]
+        parameters_found = ((name, self._parameters.find(name)) for name in names)
+        return [
+            {"name": name, "value": encode_value(parameter)}
+            for name, parameter in parameters_found
+            if parameter
+        ]
 
     # ------------------------------------------------------------------ reading
 

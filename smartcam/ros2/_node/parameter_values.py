@@ -87,7 +87,7 @@ class ParameterDescription:
 
     def encode(self) -> dict[str, Any]:
         """Return the fields of a ``rcl_interfaces/msg/ParameterDescriptor``."""
-        found: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "name": self.name,
             "type": TYPES.index(self.type),
             "description": self.description,
@@ -97,10 +97,10 @@ class ParameterDescription:
         }
         if self.minimum is not None and self.maximum is not None:
             field = "integer_range" if self.type == TYPES[INTEGER] else "floating_point_range"
-            found[field] = [
+            fields[field] = [
                 {"from_value": self.minimum, "to_value": self.maximum, "step": self.step or 0}
             ]
-        return found
+        return fields
 
     @classmethod
     def decode(cls, message: Any) -> ParameterDescription:
@@ -159,7 +159,7 @@ def range_of(
             f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
         )
     if number == INTEGER:
-        wrong = [one for one in (first, last, step) if one is not None and not _whole(one)]
+        wrong = [bound for bound in (first, last, step) if bound is not None and not _whole(bound)]
         if wrong:
             raise ConfigurationError(
                 f"parameter {name!r}: a range of {wrong[0]}: expected whole numbers of 64 bits"
@@ -239,10 +239,10 @@ def _array(name: str, given: Sequence[Any], declared: int) -> Typed:
                 f"parameter {name!r}: a list without elements: expected its type, too"
             )
         return Typed(declared, b"" if declared == BYTES else ())
-    numbers = {_number_of(one) for one in set(map(type, given))}
+    numbers = {_number_of(kind) for kind in set(map(type, given))}
     number = numbers.pop()
     if numbers or not BOOL <= number <= STRING:
-        names = sorted({type(one).__name__ for one in given})
+        names = sorted({type(value).__name__ for value in given})
         raise ConfigurationError(
             f"parameter {name!r}: expected a list of bool, of int, of float or of str, got "
             f"{', '.join(names)}"
@@ -257,8 +257,8 @@ _PLAIN: Final[dict[int, Callable[[Any], Any]]] = {
 
 
 def _number_of(kind: type) -> int:
-    for number, one in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
-        if issubclass(kind, one):
+    for number, type_ in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
+        if issubclass(kind, type_):
             return number
     return BYTES if issubclass(kind, bytes | bytearray) else NOT_SET
 

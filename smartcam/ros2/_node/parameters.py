@@ -210,17 +210,17 @@ class RosParameters:
 
     def find(self, name: str) -> Typed | None:
         """Return a value with its type; None if there is no parameter of this name."""
-        found = self._declared.get(name)
-        return None if found is None else found.value
+        parameter = self._declared.get(name)
+        return None if parameter is None else parameter.value
 
     def _of(self, name: str) -> _Declared:
-        found = self._declared.get(name)
-        if found is None:
+        parameter = self._declared.get(name)
+        if parameter is None:
             raise ConfigurationError(
                 f"parameter {name!r:.80} of {self._node.full_name} is not declared"
                 f"{did_you_mean(name[:MAX_NAME_CHARACTERS], self._declared)}"
             )
-        return found
+        return parameter
 
     # ------------------------------------------------------------------ setting
 
@@ -231,9 +231,9 @@ class RosParameters:
             ConfigurationError: there is no parameter of this name, or it cannot have the value.
         """
         declared = self._of(name)
-        kept = declared.fitting(value, by_node=True)
-        if kept != declared.value:
-            declared.value = kept
+        fitted = declared.fitting(value, by_node=True)
+        if fitted != declared.value:
+            declared.value = fitted
             self._tell(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
@@ -343,9 +343,9 @@ class RosParameters:
             logger.exception("%s ! on_set of parameter %r failed", self._node.full_name, name)
             raise RosError(f"parameter {name!r}: {type(exc).__name__}: {exc!s:.200}") from exc
 
-    def _tell(self, **what: Any) -> None:
+    def _tell(self, **lists: Any) -> None:
         if self._services is not None:
-            self._services.tell(**what)
+            self._services.tell(**lists)
 
 
 def _refuse_sim_time(value: bool) -> None:

@@ -114,10 +114,10 @@ class RosOut:
                 self._loop.call_soon_threadsafe(self._publish)
 
     def _fields(self, record: logging.LogRecord) -> dict[str, Any]:
-        seconds, rest = divmod(round(record.created * 1e9), 1_000_000_000)
+        seconds, nanoseconds = divmod(round(record.created * 1e9), 1_000_000_000)
         below = record.name.removeprefix(self._logger.name)
         return {
-            "stamp": {"sec": seconds, "nanosec": rest},
+            "stamp": {"sec": seconds, "nanosec": nanoseconds},
             "level": min(max(record.levelno // 10 * 10, DEBUG), FATAL),
             "name": _plain(self._name + below if below.startswith(".") else self._name),
             "msg": _plain(_text(record)),

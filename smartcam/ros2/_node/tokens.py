@@ -67,9 +67,9 @@ class Entity:
     def token(self) -> str:
         """The entity's liveliness token."""
         parts = [ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.id), self.kind]
-        parts += [_mangled(one) for one in (self.enclave, self.namespace, self.node)]
+        parts += [_mangled(part) for part in (self.enclave, self.namespace, self.node)]
         if self.kind != NODE:
-            parts += [_mangled(one) for one in (self.name, self.type, self.hash)]
+            parts += [_mangled(part) for part in (self.name, self.type, self.hash)]
             parts.append(self.qos.encode())
         return "/".join(parts)
 

@@ -229,7 +229,7 @@ class RosPublisher(RosEnd):
         Cancellation: the message is published or not.
         """
         self._check_open()
-        what = message_of(message, fields)
+        encoded = message_of(message, fields)
         if self._slot is None:
             self._slot = self._context.slot()
             self._lane = self._slot.lane
@@ -239,7 +239,7 @@ class RosPublisher(RosEnd):
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._send_newest(self.type.encode(what))
+                self._send_newest(self.type.encode(encoded))
             except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
                 done.set_exception(exc)
             else:
@@ -317,9 +317,9 @@ class RosPublisher(RosEnd):
             self._take_back()
 
     def _take_back(self) -> None:
-        for one in (*self._patient.values(), self._hasty):
-            if one is not None:
-                quietly(one.undeclare)
+        for publisher in (*self._patient.values(), self._hasty):
+            if publisher is not None:
+                quietly(publisher.undeclare)
         self._patient, self._hasty = {}, None
         self._publisher = None
         self._outlet.close()

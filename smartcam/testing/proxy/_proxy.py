@@ -82,8 +82,8 @@ class LinkProxy:
             OSError: the target's name does not resolve, or no port is free.
         """
         loop = asyncio.get_running_loop()
-        found = await loop.getaddrinfo(*self._target, type=self._relay.kind)
-        family, _, _, _, address = found[0]
+        addresses = await loop.getaddrinfo(*self._target, type=self._relay.kind)
+        family, _, _, _, address = addresses[0]
         self.port = self._relay.open(HOST, family, address)
         return self
 
@@ -182,5 +182,5 @@ class LinkProxy:
         self.refuse()
         self.reset()
 
-    def _note(self, what: str, connection: int | None, direction: str = "") -> None:
-        self._log.note(what, connection or 0, direction)
+    def _note(self, kind: str, connection: int | None, direction: str = "") -> None:
+        self._log.note(kind, connection or 0, direction)

@@ -77,18 +77,18 @@ class Relay(ABC, Generic[C]):
 
     def add(self, rules: Sequence[Rule]) -> None:
         """Apply rules from here on."""
-        for one in self.chosen(None):
-            one.add(rules)
+        for connection_ in self.chosen(None):
+            connection_.add(rules)
 
     def cut(self, connection: int | None) -> None:
         """End connections in order."""
-        for one in self.chosen(connection):
-            one.cut()
+        for relayed in self.chosen(connection):
+            relayed.cut()
 
     def reset(self, connection: int | None) -> None:
         """End connections hard."""
-        for one in self.chosen(connection):
-            one.reset()
+        for relayed in self.chosen(connection):
+            relayed.reset()
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""

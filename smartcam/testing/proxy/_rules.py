@@ -43,7 +43,7 @@ _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
 """Text on the allowed values, and the function that checks a value."""
 
 _BOUNDS: Mapping[str, _Bound] = {
-    "direction": ("direction must be 'up' or 'down'", lambda way: way in DIRECTIONS),
+    "direction": ("direction must be 'up' or 'down'", lambda direction: direction in DIRECTIONS),
     "connection": ("connections count from 1", lambda number: number is None or number >= 1),
     "at": ("at must be 0 or more bytes", lambda place: place >= 0),
     "count": ("count must be 1 or more bytes", lambda count: count is None or count >= 1),

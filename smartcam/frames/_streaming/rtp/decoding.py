@@ -153,8 +153,8 @@ class UnitDecoding:
         if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
             self._skipped += len(self._units)
-            self._missed += sum(self._pace.lost(one) for one, _ in self._units)
-            self._anew |= any(one.begins for one, _ in self._units)
+            self._missed += sum(self._pace.lost(unit) for unit, _ in self._units)
+            self._anew |= any(unit.begins for unit, _ in self._units)
             self._units.clear()
             source.want_picture()
         if self._idle and self._units and self._run.short and not self._ended:

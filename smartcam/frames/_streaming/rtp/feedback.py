@@ -89,19 +89,21 @@ class Audience:
         self._forget(now)
         return tuple(
             RtpReceiver(
-                one.address,
-                one.block.fraction / 256,
-                one.block.lost,
-                one.block.jitter / CLOCK_RATE,
-                one.round_trip,
-                now - one.at,
+                receiver.address,
+                receiver.block.fraction / 256,
+                receiver.block.lost,
+                receiver.block.jitter / CLOCK_RATE,
+                receiver.round_trip,
+                now - receiver.at,
             )
-            for one in self._heard.values()
+            for receiver in self._heard.values()
         )
 
     def _forget(self, now: float) -> None:
         self._heard = {
-            ssrc: one for ssrc, one in self._heard.items() if now - one.at < RECEIVER_TIMEOUT
+            ssrc: receiver
+            for ssrc, receiver in self._heard.items()
+            if now - receiver.at < RECEIVER_TIMEOUT
         }
 
 
@@ -134,12 +136,12 @@ class PacketHistory:
 
     def again(self, sequence: int) -> bytes | None:
         """Return a packet to send again; None if it is too old or was sent too often."""
-        found = self._sent.get(sequence)
+        packet = self._sent.get(sequence)
         if (
-            found is None
-            or found.times >= MAX_RESENDS
-            or time.monotonic() - found.at > MAX_RESEND_AGE
+            packet is None
+            or packet.times >= MAX_RESENDS
+            or time.monotonic() - packet.at > MAX_RESEND_AGE
         ):
             return None
-        found.times += 1
-        return found.data
+        packet.times += 1
+        return packet.data

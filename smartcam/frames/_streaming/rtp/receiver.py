@@ -314,10 +314,16 @@ class StreamReceiver:
         return self._depacketizer.tail() is not None
 
     def _ask(self, missing: list[int], now: float) -> None:
-        asked = self._asked
-        due = [one for one in missing if now - asked.get(one, float("-inf")) >= RESEND_INTERVAL]
+        asked_at = self._asked
+        due = [
+            number
+            for number in missing
+            if now - asked_at.get(number, float("-inf")) >= RESEND_INTERVAL
+        ]
         if due and self._reception is not None:
-            self._asked = {one: asked.get(one, now) for one in missing} | dict.fromkeys(due, now)
+            self._asked = {number: asked_at.get(number, now) for number in missing} | dict.fromkeys(
+                due, now
+            )
             self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
     def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:

@@ -53,8 +53,8 @@ class Reception:
         self._highest += ahead
         transit = int(now * CLOCK_RATE) - packet.timestamp
         if self._transit is not None:
-            off = (transit - self._transit + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
-            self._jitter += (abs(off) - self._jitter) / 16
+            difference = (transit - self._transit + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+            self._jitter += (abs(difference) - self._jitter) / 16
         self._transit = transit
 
     def sender(self, report: SenderReport, now: float) -> None:

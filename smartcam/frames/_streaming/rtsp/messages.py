@@ -169,11 +169,11 @@ class RequestParser:
         return line
 
     def _add_header(self, line: bytes) -> None:
-        found = _HEADER.fullmatch(line)
-        if found is None:
+        match = _HEADER.fullmatch(line)
+        if match is None:
             _refuse(f"a header: expected NAME: VALUE, got {line[:60]!r}")
-        name = found[1].decode("ascii").lower()
-        value = found[2].decode("latin-1").strip()
+        name = match[1].decode("ascii").lower()
+        value = match[2].decode("latin-1").strip()
         if name in self._headers:
             if name in _ONCE:
                 _refuse(f"{name}: expected once, got it twice")
@@ -193,12 +193,12 @@ MAX_MESSAGE_BYTES: Final = 4 + 0xFFFF
 
 
 def _start_line(line: bytes) -> tuple[str, str]:
-    found = _REQUEST.fullmatch(line)
-    if found is None:
+    match = _REQUEST.fullmatch(line)
+    if match is None:
         _refuse(f"expected METHOD URL RTSP/1.0, got {line[:60]!r}")
-    if found[3] != b"1.0":
-        _refuse(f"expected RTSP/1.0, got RTSP/{found[3].decode()}", 505)
-    return found[1].decode(), found[2].decode()
+    if match[3] != b"1.0":
+        _refuse(f"expected RTSP/1.0, got RTSP/{match[3].decode()}", 505)
+    return match[1].decode(), match[2].decode()
 
 
 def _is_number(text: str) -> bool:

@@ -135,7 +135,7 @@ async def _delivery(
 def _channels(connection: RtspConnection, requested: RequestedTransport) -> tuple[int, int]:
     taken = set(connection.channels())
     if requested.rtp is None or requested.rtcp is None:
-        first = next(one for one in range(0, 256, 2) if not {one, one + 1} & taken)
+        first = next(channel for channel in range(0, 256, 2) if not {channel, channel + 1} & taken)
         return first, first + 1
     if {requested.rtp, requested.rtcp} & taken:
         raise RtspError(461, f"Transport: channels {requested.rtp}-{requested.rtcp} are in use")

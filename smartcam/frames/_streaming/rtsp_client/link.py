@@ -100,10 +100,10 @@ class RtspLink(asyncio.Protocol):
         self._end(why)
 
     def _of_socket(self, what: str) -> Any:
-        found = None if self._transport is None else self._transport.get_extra_info(what)
-        if not found:
+        value = None if self._transport is None else self._transport.get_extra_info(what)
+        if not value:
             raise self._error(self.ended or "the connection is lost")
-        return found
+        return value
 
     async def ask(
         self, method: str, url: str, headers: dict[str, str] | None = None, body: bytes = b""
@@ -186,8 +186,8 @@ class RtspLink(asyncio.Protocol):
             return
         self._parser.feed(data)
         try:
-            while not self.ended and (came := self._parser.next()) is not None:
-                self._take(came)
+            while not self.ended and (item := self._parser.next()) is not None:
+                self._take(item)
         except MessageError as error:
             self._end(str(error))
         self.on_read()
@@ -199,13 +199,13 @@ class RtspLink(asyncio.Protocol):
 
     # received messages
 
-    def _take(self, came: ServerAnswer | ServerRequest | ChannelPacket) -> None:
-        if isinstance(came, ChannelPacket):
-            self.on_packet(came.channel, came.data)
-        elif isinstance(came, ServerAnswer):
-            self._answered(came)
+    def _take(self, item: ServerAnswer | ServerRequest | ChannelPacket) -> None:
+        if isinstance(item, ChannelPacket):
+            self.on_packet(item.channel, item.data)
+        elif isinstance(item, ServerAnswer):
+            self._answered(item)
         else:
-            self._requested(came)
+            self._requested(item)
 
     def _answered(self, answer: ServerAnswer) -> None:
         """Pass an answer on; some servers send a wrong CSeq, or none."""

@@ -57,15 +57,15 @@ class RtspParameters(DeviceFeatures):
         answer = await self._answered(READ, name, f"{name}\r\n")
         body = answer.body.decode(errors="replace")
         for line in body.splitlines():
-            found, colon, value = line.partition(":")
-            if colon and found.strip().lower() == name.lower():
+            given_name, colon, value = line.partition(":")
+            if colon and given_name.strip().lower() == name.lower():
                 return value.strip()
-        got = (
+        actual = (
             f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
             if body.strip()
             else ("got none: the camera only takes the request for a sign of life")
         )
-        raise self._wrong(name, f"expected its value from {READ}, {got}")
+        raise self._wrong(name, f"expected its value from {READ}, {actual}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a parameter; return the camera's new value, or the given value if it reports none.

@@ -135,7 +135,9 @@ class DialectChecks(Parameters):
 
     def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
         """Check for a session, a sign of life, results, and the status: by itself or on request."""
-        missing = [one.__name__ for one in NEEDED if not dialect.has(one)]
+        missing = [
+            message_type.__name__ for message_type in NEEDED if not dialect.has(message_type)
+        ]
         assert not missing, f"has() is False for {', '.join(missing)}"
         assert dialect.answers(m.Connect), "Connect must be answered"
         assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
@@ -148,8 +150,8 @@ class DialectChecks(Parameters):
         """Check that each ability has its messages, and the other way round."""
         for name, needed in ABILITIES.items():
             can = getattr(dialect.capabilities, name)
-            has = [dialect.has(one) for one in needed]
-            names = " and ".join(one.__name__ for one in needed)
+            has = [dialect.has(message_type) for message_type in needed]
+            names = " and ".join(message_type.__name__ for message_type in needed)
             if can:
                 assert all(has), f"capabilities.{name} is True, but it has not {names}"
             else:
@@ -173,8 +175,8 @@ class DialectChecks(Parameters):
         for kind in MESSAGES:
             if dialect.has(kind):
                 continue
-            for asked in (kind, example(kind, dialect)):
-                text = _refusal(UnsupportedError, dialect.message_id, asked)
+            for message in (kind, example(kind, dialect)):
+                text = _refusal(UnsupportedError, dialect.message_id, message)
                 assert text is not None, f"has() is False for {kind.__name__}, but it has an id"
                 assert dialect.name in text, f"{text}: which dialect?"
 
