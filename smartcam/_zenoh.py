@@ -264,7 +264,7 @@ class ZenohSession:
     Args:
         link: endpoints and certificates that the session uses.
         more: further settings of the engine, by their paths.
-        what: name of the bus in texts.
+        bus_text: name of the bus in texts.
     """
 
     def __init__(

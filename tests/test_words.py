@@ -269,3 +269,45 @@ def plain_functions() -> Iterator[Text]:
 def test_functions_begin_with_a_verb() -> None:
     found = [one for one in plain_functions() if HAPPENING.match(one.text)]
     assert not found, "\n".join(map(str, found))
+
+
+ENTRY_NAMES = re.compile(r"^    ((?:\*{0,2}\w+)(?:, \*{0,2}\w+)*): ", re.MULTILINE)
+"""Names in front of the explanations of a section."""
+
+
+def explained_arguments(node: ast.AST) -> set[str]:
+    """Return the names that the section ``Args`` of a docstring explains."""
+    if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return set()
+    sections = re.split(r"^(?=\w+:$)", ast.get_docstring(node) or "", flags=re.MULTILINE)
+    text = "".join(section for section in sections if section.startswith("Args:"))
+    names = {name.strip(" *") for match in ENTRY_NAMES.findall(text) for name in match.split(",")}
+    return names - {"None"}
+
+
+def arguments_of(node: ast.AST) -> set[str] | None:
+    """Return the arguments of a function, or of a class' own initializer; None without one."""
+    if isinstance(node, ast.ClassDef):
+        return next(
+            (
+                arguments_of(part)
+                for part in node.body
+                if isinstance(part, ast.FunctionDef) and part.name in {"__init__", "__new__"}
+            ),
+            None,
+        )
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        return {part.arg for part in ast.walk(node.args) if isinstance(part, ast.arg)}
+    return None
+
+
+def test_explained_arguments_exist() -> None:
+    found = [
+        f"{module}:{node.lineno}: {', '.join(sorted(explained - names))}"  # type: ignore[attr-defined]
+        for module, tree in package().items()
+        for node in statements(tree)
+        if (explained := explained_arguments(node))
+        and (names := arguments_of(node)) is not None
+        and not explained <= names
+    ]
+    assert not found, "\n".join(found)

@@ -181,7 +181,7 @@ class ClientLink(ABC):
     def session_ended(self) -> None:  # noqa: B027  only TCP has an order of links
         """Note that the client has ended its session; the link may stay open."""
 
-    def heard(self) -> None:
+    def answer_received(self) -> None:
         """Write the camera's answers to the received messages."""
         self.flush()
 
@@ -391,7 +391,7 @@ class FaultyLink:
         with self._owner.step():
             self._incoming.run()
             self._stop_cutting()
-            self._link.heard()
+            self._link.answer_received()
 
     # ------------------------------------------------------------------ both
 

@@ -56,13 +56,13 @@ class LineClient:
 
     Attributes:
         peer: address and port of the client.
-        heard: True once the client has sent the line that begins a session; if the dialect has
+        has_begun: True once the client has sent the line that begins a session; if the dialect has
             none, any line of the dialect.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
         self.peer: str = link.peer
-        self.heard: bool = False
+        self.has_begun: bool = False
         self._camera = camera
         self._link = link
         self._server = server
@@ -129,7 +129,7 @@ class LineClient:
 
     def begin(self, message: HeardLine) -> None:
         """Begin a line."""
-        self.heard = self.heard or self._camera.begins_session(message)
+        self.has_begun = self.has_begun or self._camera.begins_session(message)
         self._row, self._server.busy = message.row, True
 
 
@@ -397,7 +397,7 @@ class LineCamera(WireCamera):
     def serves(self, link: ClientLink) -> bool:
         """Return True if the client of the link has begun a session."""
         client = self._clients.get(link)
-        return client is not None and client.heard
+        return client is not None and client.has_begun
 
     def lost(self, link: ClientLink) -> None:
         """Forget a lost link; a second call does nothing."""

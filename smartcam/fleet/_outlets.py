@@ -39,7 +39,7 @@ class FleetOutlets(Server):
 
     Args:
         server: server of the cameras; not started yet.
-        tell: function that is called with an outlet's name and its trouble, and with "" at the end
+        report: function that is called with an outlet's name and its trouble, and with "" at the end
             of the trouble.
 
     Attributes:

@@ -191,7 +191,7 @@ class RosFleet(Server):
             calibrated_at=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
-            heard=lambda: camera.met,
+            agent_alive=lambda: camera.met,
             frames=self._frames.get(name, {}),
             controls=self._controls.get(name),
             calibrations=None if self._desks is None else self._desks.of(name),

@@ -77,7 +77,7 @@ class Pump:
     Args:
         outlet: the outlet.
         spool: spool of the outlet.
-        tell: function that is called with the reason why the far end or the disk fails, and with
+        report: function that is called with the reason why the far end or the disk fails, and with
             "" when it works again.
 
     Attributes:

@@ -151,11 +151,13 @@ def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dic
         if field is None:
             expected = ", ".join((*fields, *only)) or "none"
             raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
-        checked[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
+        checked[field.attribute] = _checked_value(kind, field, value, f"{where}{name}", depth)
     return checked
 
 
-def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth: int) -> Any:
+def _checked_value(
+    kind: MessageType, field: MessageField, value: Any, where: str, depth: int
+) -> Any:
     if field.shape and field.type in _BYTES and isinstance(value, str):
         try:
             return base64.b64decode(value, validate=True)

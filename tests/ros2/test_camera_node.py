@@ -348,7 +348,7 @@ async def test_closing_waits_for_what_is_being_opened() -> None:
 async def test_a_camera_of_a_fleet_whose_agent_goes_and_comes() -> None:
     async with Plant() as plant, plant.camera() as camera:
         node = NotedNode()
-        options = CameraNodeOptions(heard=lambda: camera._caller.met is not None)
+        options = CameraNodeOptions(agent_alive=lambda: camera._caller.met is not None)
         async with CameraNode(camera, node, options=options) as made:
             await until(lambda: made.lifecycle.active)
             assert node.last("~/status").ready

@@ -116,11 +116,11 @@ async def test_nothing_is_made_where_nobody_hears() -> None:
     async with seen() as one:
         await asyncio.sleep(0)
         topic = one.node.topics[DIAGNOSTICS]
-        topic.heard = False
+        topic.has_subscribers = False
         count = len(topic.said)
         await asyncio.sleep(5.5)
         assert len(topic.said) == count
-        topic.heard = True
+        topic.has_subscribers = True
         await asyncio.sleep(1)
         assert len(topic.said) == count + 1
 

@@ -77,7 +77,7 @@ async def given(driver: ScriptedDriver, *frames: Any) -> None:
 async def heard(node: Node, topic: str, kind: str) -> None:
     """Wait until a node knows that somebody hears a topic of its own."""
     with contextlib.closing(node.publisher(topic, kind, qos=DRIVER)) as other:
-        await until(lambda: other.heard)
+        await until(lambda: other.has_subscribers)
 
 
 def readers(driver: ScriptedDriver) -> int:

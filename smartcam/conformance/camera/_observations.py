@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
 
 T = TypeVar("T")
 
@@ -45,20 +45,20 @@ class ObservedRun(NamedTuple):
     """One trigger and its outcome."""
 
     sent_at: float  # time of sending
-    came: list[Heard]  # frames until the camera waited for the next trigger
+    frames: list[ReceivedFrame]  # frames until the camera waited for the next trigger
     under_way: int | None  # status word, asked for right after the trigger; ``bid`` only
     word: int  # size of a number, bytes
     waiting: int  # mask of Waiting for Trigger
 
     @property
-    def results(self) -> list[Heard]:
+    def results(self) -> list[ReceivedFrame]:
         """The result containers."""
-        return of_kind(self.came, MessageId.RESULT_CONTAINER)
+        return of_kind(self.frames, MessageId.RESULT_CONTAINER)
 
     def places(self) -> tuple[int | None, int | None, int | None]:
         """Return the places where Waiting ended, the first result came, and Waiting began again."""
         fell = result = rose = None
-        for place, message in enumerate(self.came):
+        for place, message in enumerate(self.frames):
             if message.message_id == MessageId.RESULT_CONTAINER and result is None:
                 result = place
             elif message.message_id == MessageId.STATUS:
@@ -231,7 +231,7 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
 class Stopped(NamedTuple):
     """A trigger to a stopped camera and its outcome."""
 
-    came: list[Heard]
+    frames: list[ReceivedFrame]
     text: str  # observation in words
 
 
@@ -255,8 +255,8 @@ class Switch(NamedTuple):
     """A switch and its outcome."""
 
     application: int  # application that was asked for
-    came: list[Heard]  # the frames until the answer and the status that is not busy
-    answer: Heard
+    frames: list[ReceivedFrame]  # the frames until the answer and the status that is not busy
+    answer: ReceivedFrame
     active: int  # application that Query reported afterwards
     seconds: float  # seconds from the request to the answer
 

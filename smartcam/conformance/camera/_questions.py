@@ -95,7 +95,7 @@ def busy_while_processing(camera: CameraUnderTest) -> bool:
             words = [inspection.under_way]
         else:
             end = inspection.places()[2]
-            words = camera.wire.statuses(inspection.came[:end])
+            words = camera.wire.statuses(inspection.frames[:end])
         words = [word for word in words if not word & bits.waiting]
         if words and camera.wire.is_bid:
             seen.add(not words[0] & bits.ready)
@@ -142,7 +142,7 @@ def overtriggered_time(camera: CameraUnderTest) -> float:
 def overtriggered_when_stopped(camera: CameraUnderTest) -> bool:
     """Overtriggered rises for a trigger to a stopped camera, too."""
     seen, bit = stopped_trigger(camera), camera.wire.bits.overtriggered
-    return any(word & bit for word in camera.wire.statuses(seen.came))
+    return any(word & bit for word in camera.wire.statuses(seen.frames))
 
 
 @question(_OPEN, needs=Allow.RUN | Allow.TRIGGER, dialects=SMART)
@@ -165,7 +165,7 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
 @question("ID-b 210, published", needs=Allow.TRIGGER, dialects=("bid",))
 def push_status(camera: CameraUnderTest) -> bool:
     """A status comes by itself with every change."""
-    return bool(of_kind(unasked(camera).came, MessageId.STATUS))
+    return bool(of_kind(unasked(camera).frames, MessageId.STATUS))
 
 
 @question("ID-a 227 against ID-b 216, published", dialects=("bid",), documents=("C4",))
@@ -187,9 +187,9 @@ def ready_bit(camera: CameraUnderTest) -> str:
 def switch_answer(camera: CameraUnderTest) -> str:
     """The answer to a switch comes before or after the status without BUSY."""
     seen, busy = switch(camera), camera.wire.bits.busy
-    answered = seen.came.index(seen.answer)
+    answered = seen.frames.index(seen.answer)
     was_busy = False
-    for place, message in enumerate(seen.came):
+    for place, message in enumerate(seen.frames):
         if message.message_id != MessageId.STATUS:
             continue
         if camera.wire.numbers(message.body)[0] & busy:

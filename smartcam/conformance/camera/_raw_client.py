@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
-from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
+from smartcam.conformance.camera._wire import BadBytesError, RawDialect, ReceivedFrame
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
@@ -56,7 +56,7 @@ class RawClient:
     _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
-        self.received: list[Heard] = []  # every frame that came, in order
+        self.received: list[ReceivedFrame] = []  # every frame that came, in order
         self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
@@ -139,7 +139,7 @@ class RawClient:
 
     # ------------------------------------------------------------------ in
 
-    def next(self, within: float) -> Heard | None:
+    def next(self, within: float) -> ReceivedFrame | None:
         """Return the next frame, None if none comes within so many seconds.
 
         Raises:
@@ -155,7 +155,7 @@ class RawClient:
             if left <= 0 or not self._receive(left):
                 return None
 
-    def _cut(self) -> Heard | None:
+    def _cut(self) -> ReceivedFrame | None:
         if not self._buffer:
             return None
         try:
@@ -172,7 +172,7 @@ class RawClient:
             return None
         message_id, body, size = frame
         self._buffer = self._buffer[size:]
-        message = Heard(time.monotonic(), message_id, body)
+        message = ReceivedFrame(time.monotonic(), message_id, body)
         self._note("<", self.wire.spell(message))
         self._kept += len(body)
         if self._kept > MAX_HEARD_BYTES:
@@ -209,8 +209,13 @@ class RawClient:
     # ------------------------------------------------------------------ waits
 
     def until(
-        self, fits: Callable[[Heard], object] | int, within: float, expected: str, *, mark: int = -1
-    ) -> Heard:
+        self,
+        fits: Callable[[ReceivedFrame], object] | int,
+        within: float,
+        expected: str,
+        *,
+        mark: int = -1,
+    ) -> ReceivedFrame:
         """Return the first frame that fits, of those after ``mark`` and those that come now.
 
         Args:
@@ -235,7 +240,7 @@ class RawClient:
                 return heard_now
         raise Differs(f"{expected} within {within:g} s", self.words(first))
 
-    def answer(self, request: m.Message, *, within: float | None = None) -> Heard:
+    def answer(self, request: m.Message, *, within: float | None = None) -> ReceivedFrame:
         """Send a request and return its answer, which has its id; raises as :meth:`until`."""
         message_id = self.wire.dialect.message_id(request)
         mark = len(self.received)
@@ -243,14 +248,14 @@ class RawClient:
         within = self._timeout if within is None else within
         return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
 
-    def trigger(self, expected: str = "a result", *, within: float | None = None) -> Heard:
+    def trigger(self, expected: str = "a result", *, within: float | None = None) -> ReceivedFrame:
         """Send a trigger and return the next result; raises as :meth:`until`."""
         mark = len(self.received)
         self.send(m.Trigger())
         within = self._timeout if within is None else within
         return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
 
-    def fence(self) -> list[Heard]:
+    def fence(self) -> list[ReceivedFrame]:
         """Send a Query and return the frames before its answer: all that were on their way.
 
         Raises:
@@ -261,7 +266,7 @@ class RawClient:
         self.answer(m.Query())
         return self.received[mark:-1]
 
-    def listen(self, seconds: float) -> list[Heard]:
+    def listen(self, seconds: float) -> list[ReceivedFrame]:
         """Return the frames that come in so many seconds; the end of the link ends it."""
         mark, deadline = len(self.received), time.monotonic() + seconds
         with contextlib.suppress(EndedError):

@@ -73,9 +73,9 @@ def trigger_gives_one_result(camera: CameraUnderTest) -> str:
 def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
     for inspection in inspections(camera):
-        answers = of_kind(inspection.came, MessageId.TRIGGER)
+        answers = of_kind(inspection.frames, MessageId.TRIGGER)
         if [camera.wire.numbers(message.body) for message in answers] != [(0,)]:
-            shown = "; ".join(map(camera.wire.spell, inspection.came)) or "nothing"
+            shown = "; ".join(map(camera.wire.spell, inspection.frames)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", shown)
 
 
@@ -96,7 +96,7 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
             places = inspection.places()
             fell, rose = places[0] is not None, places[2] is not None
         if not (fell and rose):
-            shown = "; ".join(map(camera.wire.spell, inspection.came)) or "nothing"
+            shown = "; ".join(map(camera.wire.spell, inspection.frames)) or "nothing"
             raise Differs("Waiting for Trigger falls with a trigger and rises again", shown)
 
 
@@ -227,5 +227,5 @@ def _changes_nothing(camera: CameraUnderTest, message: Message) -> None:
 def stopped_camera_ignores_triggers(camera: CameraUnderTest) -> None:
     """A trigger to a stopped camera gives no result."""
     seen = stopped_trigger(camera)
-    if of_kind(seen.came, MessageId.RESULT_CONTAINER):
+    if of_kind(seen.frames, MessageId.RESULT_CONTAINER):
         raise Differs("no result of a stopped camera", seen.text)

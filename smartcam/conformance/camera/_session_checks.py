@@ -17,7 +17,7 @@ from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
 
 TRANSIT_TIME = 0.02
 """Seconds, at least, that messages which were sent before a Disconnect may take to arrive."""
@@ -132,7 +132,7 @@ def deaf_after_disconnect(camera: CameraUnderTest) -> None:
             raise Differs("no answer to a Query after Disconnect", client.words(mark))
 
 
-def _without_answer(camera: CameraUnderTest, messages: list[Heard]) -> list[Heard]:
+def _without_answer(camera: CameraUnderTest, messages: list[ReceivedFrame]) -> list[ReceivedFrame]:
     """Return the frames without the answer to Disconnect that ``bid`` may give (C3)."""
     if not camera.wire.is_bid:
         return messages

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.conformance.camera._options import ConformanceOptions
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
     from smartcam.protocols import FramedDialect
     from smartcam.settings import Address
 
@@ -223,7 +223,7 @@ class CameraUnderTest:
         self.gone = why
         raise NotObserved(f"there is no session: {why}")
 
-    def greet(self, client: RawClient) -> Heard:
+    def greet(self, client: RawClient) -> ReceivedFrame:
         """Connect on a link and return the answer; also wait for a status that comes unasked.
 
         Raises:
@@ -237,7 +237,7 @@ class CameraUnderTest:
             client.until(MessageId.STATUS, self.options.timeout, "a status after Connect", mark=0)
         return answer
 
-    def _learn_code(self, message: Heard) -> None:
+    def _learn_code(self, message: ReceivedFrame) -> None:
         """Learn whether ``b16`` answers have a code, from the length of the answer to Connect."""
         if self.dialect == "b16" and message.message_id == MessageId.CONNECT:
             self.learn_quirk("code", on=len(message.body) == 4)
@@ -313,7 +313,7 @@ class CameraUnderTest:
             lambda word: word & bits.running, self.options.timeout, "a status with Running"
         )
 
-    def load(self, client: RawClient, application: int) -> list[Heard]:
+    def load(self, client: RawClient, application: int) -> list[ReceivedFrame]:
         """Load an application; return the frames from the request to its end.
 
         Raises:

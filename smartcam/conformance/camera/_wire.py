@@ -33,7 +33,7 @@ class BadBytesError(Exception):
     """Received bytes are no frame of this dialect; the text says why."""
 
 
-class Heard(NamedTuple):
+class ReceivedFrame(NamedTuple):
     """One frame of the camera."""
 
     at: float  # time of arrival of the last byte, time.monotonic()
@@ -41,7 +41,7 @@ class Heard(NamedTuple):
     body: bytes  # the bytes after the header
 
 
-def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
+def of_kind(frames: Iterable[ReceivedFrame], message_id: int) -> list[ReceivedFrame]:
     """Return the frames that have an id."""
     return [frame for frame in frames if frame.message_id == message_id]
 
@@ -132,14 +132,14 @@ class RawDialect:
         count = len(body) // self.word
         return struct.unpack_from(f"<{count}{code}", body)
 
-    def statuses(self, frames: Iterable[Heard]) -> list[int]:
+    def statuses(self, frames: Iterable[ReceivedFrame]) -> list[int]:
         """Return the status words among frames."""
         bodies = (frame.body for frame in of_kind(frames, MessageId.STATUS))
         return [int.from_bytes(body[: self.word], "little") for body in bodies]
 
     # ------------------------------------------------------------------ in words
 
-    def spell(self, message: Heard) -> str:
+    def spell(self, message: ReceivedFrame) -> str:
         """Return a frame of the camera in readable form, with hex."""
         return self._spell(Sender.CAMERA, message.message_id, message.body)
 
@@ -161,7 +161,7 @@ class RawDialect:
             shown = f"id {message_id:#04x}"
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
 
-    def flaw(self, message: Heard) -> str | None:
+    def flaw(self, message: ReceivedFrame) -> str | None:
         """Return the undocumented property of a frame of the camera, None if there is none."""
         if self.is_bid and self.numbers(message.body) in _REFUSALS:
             return None  # a refusal may be only its code, for any request

@@ -137,7 +137,7 @@ class EmulatedInSight(LineCamera):
             quirks=validated(InSightQuirks, {} if quirks is None else quirks, "quirks"),
         )
         self._ordered: deque[_Ordered] = deque()
-        self._heard: Tally[str] = Tally()
+        self._commands_received: Tally[str] = Tally()
         self._offset = 0  # nanoseconds from the device's time, which stands still while stopped
         self._was_online = online
         super().__init__(**options)
@@ -302,10 +302,11 @@ class EmulatedInSight(LineCamera):
         count = check_integer(count, "count", 0, caller="wait_heard")
         timeout = check_seconds(timeout, "timeout", "wait_heard")
         try:
-            await self._heard.wait(mnemonic, count, timeout)
+            await self._commands_received.wait(mnemonic, count, timeout)
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"the emulator heard {self._heard[mnemonic]} of {count} {mnemonic} in {timeout} s",
+                f"the emulator received {self._commands_received[mnemonic]} of {count} {mnemonic} "
+                f"in {timeout} s",
                 waited=timeout,
             ) from exc
 
@@ -366,7 +367,7 @@ class EmulatedInSight(LineCamera):
             client.respond(str(code).encode("ascii") + words.LINE_END)
         else:
             self._commands.execute(line, client.respond)
-        self._heard.add(mnemonic if mnemonic in words.COMMANDS else "")
+        self._commands_received.add(mnemonic if mnemonic in words.COMMANDS else "")
 
     # ------------------------------------------------------------------ inside
 

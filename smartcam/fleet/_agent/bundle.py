@@ -94,7 +94,7 @@ class AgentBundle:
 
     def open(self) -> None:
         """Start to check for subscribers."""
-        self._out = self._bus.publisher(self._key, self._on_heard)
+        self._out = self._bus.publisher(self._key, self._on_subscribers)
 
     def close(self) -> None:
         """Send the results that are left, and stop sending. Idempotent."""
@@ -105,9 +105,9 @@ class AgentBundle:
             out.close()
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the bundles have a subscriber."""
-        return self._out is not None and self._out.heard
+        return self._out is not None and self._out.has_subscribers
 
     def add(self, camera: str, runs: bytes) -> None:
         """Add a camera's results, which are sent soon with those of others."""
@@ -142,7 +142,7 @@ class AgentBundle:
             head = _HEAD.pack(_MAGIC, self._epoch, number, self._number, count)
             self._out.put(b"".join((head, *parts)))
 
-    def _on_heard(self, has_subscribers: bool) -> None:
+    def _on_subscribers(self, has_subscribers: bool) -> None:
         if has_subscribers:
             self._remind(0)
 
@@ -160,6 +160,6 @@ class AgentBundle:
 
     def _say_number(self, step: int) -> None:
         self._reminder = None
-        if self.heard:
+        if self.has_subscribers:
             self._put(self._number, 0, [])
             self._remind(step)

@@ -142,7 +142,7 @@ class Host:
         self._opened = asyncio.Event()
         self._over = False  # whether no further session will come
         self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
-        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_subscribers)
 
     @property
     def camera(self) -> SharedCamera:
@@ -471,7 +471,7 @@ class Host:
         outcomes = self.outcomes.get(owner)
         if outcomes is not None:
             outcomes.append(data)
-        if self._results_out.heard or self._bundle.heard:
+        if self._results_out.has_subscribers or self._bundle.has_subscribers:
             self._fresh.append(data)
             self._fresh_bytes += len(data)
             if self._fresh_bytes >= FULL_MESSAGE_BYTES:
@@ -520,13 +520,13 @@ class Host:
             self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
             payload = encode_runs(self.epoch, self.results.following, fresh)
-            if self._bundle.heard:
+            if self._bundle.has_subscribers:
                 self._bundle.add(self.name, payload)
-            if self._results_out.heard:
+            if self._results_out.has_subscribers:
                 self._results_out.put(payload)
                 self._remind(0)
 
-    def _on_heard(self, has_subscribers: bool) -> None:
+    def _on_subscribers(self, has_subscribers: bool) -> None:
         if has_subscribers:
             self._remind(0)
 
@@ -541,6 +541,6 @@ class Host:
 
     def _say_number(self, step: int) -> None:
         self._reminder = None
-        if self._results_out.heard:
+        if self._results_out.has_subscribers:
             self._results_out.put(encode_runs(self.epoch, self.results.following, []))
             self._remind(step)

@@ -48,10 +48,10 @@ class Publisher(Handle):
     """An end that publishes under one key.
 
     Attributes:
-        heard: whether the publisher has a known subscriber.
+        has_subscribers: whether the publisher has a known subscriber.
     """
 
-    heard: bool = False
+    has_subscribers: bool = False
 
     @abc.abstractmethod
     def put(self, payload: bytes) -> None:
@@ -109,13 +109,17 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
         """Return a publisher of messages under ``key``.
 
         Args:
             key: key of the messages.
-            on_heard: callback for whether the key has subscribers, when that changes.
+            on_subscribers: callback for whether the key has subscribers, when that changes.
             urgent: whether messages wait in one line with those of :meth:`put`; else after them.
         """
 
@@ -287,8 +291,8 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard_parts: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.heard: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.part_subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.answered: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.watched: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.present_here: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
@@ -310,7 +314,13 @@ class MemoryEnd(Bus):
 
     async def close(self) -> None:
         self.detach()
-        places = (self.heard, self.heard_parts, self.answered, self.watched, self.present_here)
+        places = (
+            self.subscriptions,
+            self.part_subscriptions,
+            self.answered,
+            self.watched,
+            self.present_here,
+        )
         for place in places:
             place.clear()
 
@@ -319,39 +329,43 @@ class MemoryEnd(Bus):
         if not self.attached:
             self._bus.ends.append(self)
             self._tell_presence(True)
-            self._tell_heard("**")
+            self._check_subscribers("**")
 
     def detach(self) -> None:
         """Leave the bus like after a broken cable: both sides lose each other."""
         if self.attached:
             self._tell_presence(False)
             self._bus.ends.remove(self)
-            self._tell_heard("**")
+            self._check_subscribers("**")
 
     def put(self, key: str, payload: bytes) -> None:
         for end in self._others():
-            for subscription in end.heard.meeting(key):
+            for subscription in end.subscriptions.meeting(key):
                 self._loop.call_soon(_call, subscription, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         for end in self._others():
-            for subscription in end.heard_parts.meeting(key):
+            for subscription in end.part_subscriptions.meeting(key):
                 self._loop.call_soon(_call, subscription, key, head, data)
 
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        return _MemoryDeclared(self.heard_parts, pattern, hear)
+        return _MemoryDeclared(self.part_subscriptions, pattern, hear)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return _MemoryPublisher(self, self.publishers, key, on_heard)
+        return _MemoryPublisher(self, self.publishers, key, on_subscribers)
 
     def subscribe(
         self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        made = _MemoryDeclared(self.heard, pattern, hear)
-        self._tell_heard(pattern)
-        return made.then(lambda: self._tell_heard(pattern))
+        made = _MemoryDeclared(self.subscriptions, pattern, hear)
+        self._check_subscribers(pattern)
+        return made.then(lambda: self._check_subscribers(pattern))
 
     def answer(
         self,
@@ -414,15 +428,15 @@ class MemoryEnd(Bus):
             for watcher in end.watched.meeting(key):
                 self._loop.call_soon(_call, watcher, key, present)
 
-    def _tell_heard(self, pattern: str) -> None:
+    def _check_subscribers(self, pattern: str) -> None:
         """Make the publishers under a pattern check for subscribers."""
         for end in self._bus.ends:
             for publisher in end.publishers.meeting(pattern):
                 publisher.look()
 
-    def is_heard(self, key: str) -> bool:
+    def has_subscribers(self, key: str) -> bool:
         """Return True if this end's messages under ``key`` have a subscriber."""
-        return any(end.heard.meeting(key) for end in self._others())
+        return any(end.subscriptions.meeting(key) for end in self._others())
 
 
 class _MemoryPublisher(Publisher):
@@ -431,21 +445,21 @@ class _MemoryPublisher(Publisher):
         end: MemoryEnd,
         place: _ByPattern[_MemoryPublisher],
         key: str,
-        on_heard: Callable[[bool], None] | None,
+        on_subscribers: Callable[[bool], None] | None,
     ) -> None:
         self.pattern = key
         self._end, self._place = end, place
-        self._on_heard = on_heard
+        self._on_subscribers = on_subscribers
         place.add(self)
         self.look()
 
     def look(self) -> None:
         """Check for subscribers, and report a change."""
-        has_subscribers = self._end.is_heard(self.pattern)
-        if has_subscribers != self.heard:
-            self.heard = has_subscribers
-            if self._on_heard is not None:
-                self._on_heard(has_subscribers)
+        has_subscribers = self._end.has_subscribers(self.pattern)
+        if has_subscribers != self.has_subscribers:
+            self.has_subscribers = has_subscribers
+            if self._on_subscribers is not None:
+                self._on_subscribers(has_subscribers)
 
     def put(self, payload: bytes) -> None:
         self._end.put(self.pattern, payload)

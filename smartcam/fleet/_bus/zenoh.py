@@ -332,9 +332,13 @@ class ZenohEnd(ZenohSession, Bus):
         sender.submit(send)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return _ZenohPublisher(self, key, on_heard, urgent=urgent)
+        return _ZenohPublisher(self, key, on_subscribers, urgent=urgent)
 
     def subscribe(
         self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
@@ -509,11 +513,16 @@ class _FrequentKey(_OnBus):
 
 class _ZenohPublisher(Publisher):
     def __init__(
-        self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None, *, urgent: bool
+        self,
+        end: ZenohEnd,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None,
+        *,
+        urgent: bool,
     ) -> None:
         zenoh = end.engine
         self._end = end
-        self._on_change = on_heard
+        self._on_change = on_subscribers
         self._urgent_key = key if urgent else None
 
         def declare(session: Any) -> Any:
@@ -525,7 +534,7 @@ class _ZenohPublisher(Publisher):
             )
 
         def on_matching(status: Any) -> None:
-            end.later(self._declared.call, self._on_heard, status.matching)
+            end.later(self._declared.call, self._on_subscribers, status.matching)
 
         self._declared = _OnBus(end)
         self._publisher: Any = None
@@ -536,13 +545,13 @@ class _ZenohPublisher(Publisher):
         publisher.declare_matching_listener(direct(on_matching))
         has_subscribers = bool(publisher.matching_status.matching)
         if again:
-            self._end.later(self._declared.call, self._on_heard, has_subscribers)
+            self._end.later(self._declared.call, self._on_subscribers, has_subscribers)
         else:
-            self.heard = has_subscribers
+            self.has_subscribers = has_subscribers
         return publisher
 
-    def _on_heard(self, has_subscribers: bool) -> None:
-        self.heard = has_subscribers
+    def _on_subscribers(self, has_subscribers: bool) -> None:
+        self.has_subscribers = has_subscribers
         if self._on_change is not None:
             self._on_change(has_subscribers)
 

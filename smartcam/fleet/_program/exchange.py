@@ -261,9 +261,13 @@ class Exchange(Bus):
         return self._bus.subscribe_parts(pattern, hear)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return self._bus.publisher(key, on_heard, urgent=urgent)
+        return self._bus.publisher(key, on_subscribers, urgent=urgent)
 
     def answer(
         self,

@@ -40,7 +40,7 @@ class JudgedResults(Observer):
         session: function that returns the number of the device's session (0: no session) and the
             last report of a run.
         received: function that returns the number of containers that the client has received.
-        found: function that is called with each result and its picture, before other observers get
+        on_found: function that is called with each result and its picture, before other observers get
             the result.
         max_kept: number of last results whose pictures are kept for :meth:`judged_of`.
     """

@@ -41,7 +41,7 @@ class TransferFiles:
 
     Args:
         server: server of asyncua.
-        own: index of the namespace that contains the cameras' nodes.
+        own_index: index of the namespace that contains the cameras' nodes.
     """
 
     def __init__(self, server: Any, own_index: int) -> None:

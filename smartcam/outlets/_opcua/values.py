@@ -120,7 +120,7 @@ class VisionValues:
     Args:
         server: server of asyncua, with the nodeset.
         machine_vision: index of the nodeset's namespace.
-        own: index of the namespace of cameras.
+        own_index: index of the namespace of cameras.
     """
 
     def __init__(self, server: Any, machine_vision: int, own_index: int) -> None:

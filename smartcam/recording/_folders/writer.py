@@ -76,7 +76,7 @@ class FolderWriter:
         folder: folder that holds the files.
         limits: bounds on the files.
         compress: function that compresses a chunk.
-        tell: function that is called in the thread with the error when nothing can be written, and
+        report: function that is called in the thread with the error when nothing can be written, and
             with None when it can again.
         clock: function that returns the time in seconds, for the files' age and delays.
 

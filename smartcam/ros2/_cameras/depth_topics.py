@@ -153,7 +153,7 @@ class DepthTopics:
         publishers = {
             name: publisher
             for name, publisher in self._publishers.items()
-            if getattr(publisher, "heard", True)
+            if getattr(publisher, "has_subscribers", True)
         }
         if self._thread is None or not publishers:
             return

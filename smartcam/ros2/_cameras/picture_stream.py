@@ -87,7 +87,7 @@ class SubscribedPictures(Generic[Item]):
     @property
     def has_subscriber(self) -> bool:
         """True if one of the topics has a subscriber, as far as is known."""
-        return any(getattr(publisher, "heard", True) for publisher in self._publishers)
+        return any(getattr(publisher, "has_subscribers", True) for publisher in self._publishers)
 
     async def _run(self) -> None:
         while True:

@@ -178,7 +178,7 @@ class CameraPictures:
 
     async def _publish_raw(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        if _heard(self._image):
+        if _has_subscribers(self._image):
             ready = frame
             if frame.format.name not in ENCODINGS:
                 ready = await self._in_thread(lambda: prepared(frame))
@@ -205,7 +205,7 @@ class CameraPictures:
         if frame.utc in self._stamps:
             return
         self._stamps.append(frame.utc)
-        if _heard(self._info):
+        if _has_subscribers(self._info):
             await self._lens.load()
             self._info.publish(self._lens.fields(frame))
 
@@ -216,5 +216,5 @@ class CameraPictures:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
 
-def _heard(publisher: Any) -> bool:
-    return bool(getattr(publisher, "heard", True))
+def _has_subscribers(publisher: Any) -> bool:
+    return bool(getattr(publisher, "has_subscribers", True))

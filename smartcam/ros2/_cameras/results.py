@@ -89,10 +89,12 @@ class CameraResults:
         return waiting + (0 if self._outlet is None else self._outlet.dropped)
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if one of the topics has a subscriber."""
         outlet = () if self._outlet is None else (self._outlet,)
-        return any(_heard(publisher) for publisher in (*self._publishers.values(), *outlet))
+        return any(
+            _has_subscribers(publisher) for publisher in (*self._publishers.values(), *outlet)
+        )
 
     def start(self) -> None:
         """Declare the topics, and publish results from now on. Idempotent.
@@ -236,7 +238,7 @@ class CameraResults:
             self._put(publisher, make)
 
     def _put(self, publisher: Any, make: Any) -> None:
-        if not _heard(publisher):
+        if not _has_subscribers(publisher):
             return
         try:
             publisher.publish(make())
@@ -251,9 +253,9 @@ class CameraResults:
             logger.exception("%s ! a result was not published", self._node.full_name)
 
 
-def _heard(publisher: Any) -> bool:
+def _has_subscribers(publisher: Any) -> bool:
     """Return False if it is known that a topic has no subscriber, otherwise True."""
-    return bool(getattr(publisher, "heard", True))
+    return bool(getattr(publisher, "has_subscribers", True))
 
 
 def _name(publisher: Any) -> str:
@@ -284,13 +286,13 @@ class _SubscriberOutlet:
         self._timer: asyncio.TimerHandle | None = None
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a subscriber."""
-        return _heard(self._publisher)
+        return _has_subscribers(self._publisher)
 
     def offer(self, made: _Made, put: Any) -> None:
         """Publish a message when the delay is over."""
-        if not self.heard:
+        if not self.has_subscribers:
             return
         self._queue.append(made)
         self._bytes += made.size

@@ -81,7 +81,7 @@ class CameraStatus:
         self._since: datetime | None = None
         self._before: dict[str, int] = {}  # counters at the last diagnostics
         self._woken = asyncio.Event()
-        self._heard: list[Callable[[], None]] = []
+        self._listeners: list[Callable[[], None]] = []
         self._events: Any = None
         self._tasks: list[asyncio.Task[None]] = []
         self._ends: list[Any] = []
@@ -114,8 +114,8 @@ class CameraStatus:
 
     def listen(self, on_change: Callable[[], None]) -> Callable[[], None]:
         """Call ``on_change`` at each change of the status; return a function that ends that."""
-        self._heard.append(on_change)
-        return lambda: self._heard.remove(on_change) if on_change in self._heard else None
+        self._listeners.append(on_change)
+        return lambda: self._listeners.remove(on_change) if on_change in self._listeners else None
 
     def set_period(self, seconds: float) -> None:
         """Publish diagnostics in this period from now on."""
@@ -162,7 +162,7 @@ class CameraStatus:
         self._due = asyncio.get_running_loop().time() + self._least
         self._status.publish({"header": self._header(), **fields})
         self._published = fields
-        for on_change in tuple(self._heard):
+        for on_change in tuple(self._listeners):
             self._guarded(on_change)
 
     # ------------------------------------------------------------------ diagnostics
@@ -172,7 +172,7 @@ class CameraStatus:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            if getattr(self._diagnostics, "heard", True):
+            if getattr(self._diagnostics, "has_subscribers", True):
                 self._guarded(self._diagnose)
             if loop.time() >= self._due:
                 self._guarded(self._publish_if_new)  # the reason of a loss changes without an event
@@ -194,7 +194,7 @@ class CameraStatus:
         streams = [subscriber for subscriber in counted.subscribers if subscriber.name == "results"]
         counts["dropped"] = sum(stream.dropped for stream in streams)
         known = KnownState.of(self._camera)
-        how = health(known, session_alive=self._is_heard(counted))
+        how = health(known, session_alive=self._is_session_alive(counted))
         before, self._before = self._before, counts
         rose = [name for name in RISING if counts[name] > before.get(name, counts[name])]
         if how.level == OK and rose:
@@ -209,10 +209,10 @@ class CameraStatus:
         address = options.settings.address if options.settings is not None else None
         return options.hardware_id or hardware_id(address or place_of(self._camera))
 
-    def _is_heard(self, counted: Statistics) -> bool:
+    def _is_session_alive(self, counted: Statistics) -> bool:
         """Return True if the program that has the session is alive, or was."""
-        if self._options.heard is not None:
-            return self._options.heard()
+        if self._options.agent_alive is not None:
+            return self._options.agent_alive()
         return bool(counted.sessions or counted.last_error)
 
     def _values(

@@ -145,7 +145,7 @@ class TransformListener:
     def __init__(self, node: Any) -> None:
         self._node = node
         self._links: dict[str, _FrameLink] = {}
-        self._heard: list[Any] = []
+        self._subscriptions: list[Any] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._news = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
@@ -158,10 +158,10 @@ class TransformListener:
             RosError: the node is not open.
         """
         loop = asyncio.get_running_loop()
-        if not self._heard:
+        if not self._subscriptions:
             for topic, qos in TOPICS.items():
                 subscription = self._node.subscribe(topic, TYPE, qos=qos)
-                self._heard.append(subscription)
+                self._subscriptions.append(subscription)
                 task = loop.create_task(self._take(subscription, static=qos.latched))
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
@@ -173,7 +173,7 @@ class TransformListener:
         """Unsubscribe, and forget all transforms."""
         if self._timer is not None:
             self._timer.cancel()
-        subscriptions, self._heard, self._timer = self._heard, [], None
+        subscriptions, self._subscriptions, self._timer = self._subscriptions, [], None
         for subscription in subscriptions:
             subscription.close()
         for task in self._tasks:

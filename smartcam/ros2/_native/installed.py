@@ -91,7 +91,8 @@ def _compare(kind: MessageType, class_: Any) -> None:
         raise ConfigurationError(
             f"{kind.name}: the ROS that is installed has the fields "
             f"{', '.join(actual_kinds)}: "
-            f"expected {', '.join(ours)}; say its distribution, or build the package of this smartcam"
+            f"expected {', '.join(ours)}; name its distribution, or "
+            f"build the package of this smartcam"
         )
 
 

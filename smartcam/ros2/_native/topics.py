@@ -64,7 +64,7 @@ class NativePublisher:
             self._raw = node.made(lambda ros: ros.create_publisher(cls, name, profile_of(qos)))
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed or self._raw is None:
             return False

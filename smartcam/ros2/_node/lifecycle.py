@@ -127,7 +127,7 @@ class Lifecycle:
         self.name: str = name
         self.state: LifecycleState = UNCONFIGURED
         self._work, self._timeout = work, timeout
-        self._heard: list[Callable[[LifecycleTransition], None]] = []
+        self._listeners: list[Callable[[LifecycleTransition], None]] = []
         self._task: asyncio.Task[None] | None = None
         self.closed: bool = False
 
@@ -143,8 +143,10 @@ class Lifecycle:
 
     def listen(self, on_transition: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
         """Call ``on_transition`` after each step; return a function that ends this."""
-        self._heard.append(on_transition)
-        return lambda: self._heard.remove(on_transition) if on_transition in self._heard else None
+        self._listeners.append(on_transition)
+        return lambda: (
+            self._listeners.remove(on_transition) if on_transition in self._listeners else None
+        )
 
     async def settled(self) -> None:
         """Wait for the end of a running transition.
@@ -278,7 +280,7 @@ class Lifecycle:
         self.state = transition.goal
         if self.state.id < PRIVATE:
             logger.info("%s = %s", self.name, self.state.label)
-        for on_transition in tuple(self._heard):
+        for on_transition in tuple(self._listeners):
             try:
                 on_transition(transition)
             except ENDS_PROGRAM:

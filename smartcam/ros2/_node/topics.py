@@ -164,7 +164,7 @@ class RosPublisher(RosEnd):
         return self._publisher
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed:
             return False
@@ -173,7 +173,7 @@ class RosPublisher(RosEnd):
     def watch(self, call: Callable[[], None]) -> Callable[[], None]:
         """Call ``call`` when subscribers come and go; return a function that ends that.
 
-        ``heard`` may change a moment later.
+        ``has_subscribers`` may change a moment later.
         """
         return self._context.watch(self.name, SUBSCRIPTION, lambda _entity, _present: call())
 

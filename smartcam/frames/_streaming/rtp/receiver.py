@@ -123,7 +123,7 @@ class StreamReceiver:
         proofs: number of earlier frames of the sender with a right marker.
 
     Attributes:
-        heard: time of the stream's last packet, on the loop's clock.
+        last_packet_at: time of the stream's last packet, on the loop's clock.
     """
 
     def __init__(

@@ -105,7 +105,7 @@ class DatagramDelivery:
         sockets: bound sockets for RTP and RTCP.
         client: address of the client, from the RTSP connection.
         ports: ports of the client for RTP and RTCP.
-        heard: function that is called with RTCP from the client.
+        on_rtcp: function that is called with RTCP from the client.
     """
 
     def __init__(
