@@ -5,7 +5,7 @@ subclass may compare, hash and print as it likes. A value that cannot work is a
 :exc:`~smartcam.ConfigurationError` that names the argument, the expected value, and the given
 value. Nothing is searched, sent or waited for.
 
-``who`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
+``caller`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
 """
 
 from __future__ import annotations

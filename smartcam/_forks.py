@@ -21,21 +21,21 @@ class KnowsForks(Protocol):
         """Start anew in a fork: no other thread runs there; do not wait."""
 
 
-_notified: weakref.WeakSet[Any] = weakref.WeakSet()
+_objects_to_notify: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-def tell_of_forks(one: KnowsForks) -> None:
+def notify_of_forks(notified: KnowsForks) -> None:
     """Notify an object of each fork, in the fork, as long as the object lives."""
-    _notified.add(one)
+    _objects_to_notify.add(notified)
 
 
-def _tell_all() -> None:
-    for notified in tuple(_notified):
+def _notify_all() -> None:
+    for notified in tuple(_objects_to_notify):
         notified.forked()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_tell_all)
+    os.register_at_fork(after_in_child=_notify_all)
 
 
 if TYPE_CHECKING:

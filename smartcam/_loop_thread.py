@@ -12,7 +12,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, LocalProtocolError, ResponseTimeoutError
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ class LoopThread:
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
         self._forked = False
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def start(self) -> None:
         """Start the thread; do nothing if it runs."""

@@ -120,7 +120,7 @@ def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
     parts = _parts(word)
     of_known = {candidate: _parts(candidate)[:MAX_PARTS] for candidate in known}
     every = dict.fromkeys(itertools.chain.from_iterable(of_known.values()))
-    lengths_and_scores = [(len(part), _near(part, every)) for part in parts[:MAX_PARTS]]
+    lengths_and_scores = [(len(part), _parts_near(part, every)) for part in parts[:MAX_PARTS]]
     letters = sum(map(len, parts)) or 1
     scores = {}
     for candidate, own_parts in of_known.items():
@@ -139,7 +139,7 @@ def _parts(word: str) -> list[str]:
     return [part.lower() for part in re.split(r"[\W_]+", spaced) if part]
 
 
-def _near(part: str, every: Iterable[str]) -> dict[str, float]:
+def _parts_near(part: str, every: Iterable[str]) -> dict[str, float]:
     """Return the parts that equal a part, begin with it or are a few edits away, with scores."""
     scores = {
         match: _likeness(part, match) for match in difflib.get_close_matches(part, every, n=10)

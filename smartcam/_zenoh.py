@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from smartcam._extras import load
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
     ConfigurationError,
@@ -248,7 +248,7 @@ class _EngineUse:
     def __init__(self) -> None:
         self.begun: bool = False
         self.in_a_fork: bool = False
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def forked(self) -> None:
         """Note in a fork that the engine's threads do not run there."""
@@ -273,7 +273,7 @@ class ZenohSession:
         more: Mapping[str, Any] | None = None,
         bus_text: str = "the fleet's bus",
     ) -> None:
-        self._link, self._more, self._what = link, dict(more or {}), bus_text
+        self._link, self._more, self._bus_text = link, dict(more or {}), bus_text
         self._zenoh = engine()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
@@ -305,9 +305,9 @@ class ZenohSession:
         """
         if _use.in_a_fork:
             raise LocalProtocolError(
-                f"{self._what}: this process is a fork of one in which the engine's threads run, "
-                "and it has none of them: start it by another method, such as multiprocessing's "
-                "'spawn', or before the first session"
+                f"{self._bus_text}: this process is a fork of one in which the engine's threads "
+                "run, and it has none of them: start it by another method, such as "
+                "multiprocessing's 'spawn', or before the first session"
             )
         _use.begun = True
         self._loop = asyncio.get_running_loop()
@@ -344,7 +344,7 @@ class ZenohSession:
                 return
         logger.warning(
             "%s ! no router at %s yet: ends behind it can be reached once it runs",
-            self._what,
+            self._bus_text,
             self._link.place,
         )
 
@@ -358,7 +358,7 @@ class ZenohSession:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
                 raise ConfigurationError(
-                    f"{self._what}: the engine refuses {path}: {value!r}"
+                    f"{self._bus_text}: the engine refuses {path}: {value!r}"
                 ) from exc
         opening = self._loop.run_in_executor(None, zenoh.open, config)
         try:
@@ -390,7 +390,7 @@ class ZenohSession:
                 async with asyncio.timeout(CLOSE_TIMEOUT):
                     await asyncio.shield(closing)
         if not self._reopening:
-            raise ConfigurationError(f"{self._what} is not open")
+            raise ConfigurationError(f"{self._bus_text} is not open")
         await self._open(timeout)
         for number, declared in enumerate(tuple(self._declared)):
             if number % MAX_DECLARED_AT_ONCE == 0:
@@ -418,7 +418,7 @@ class ZenohSession:
 
     def _failed(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
-        text = f"{self._what}: cannot {doing} {self._link.place}: {why}"
+        text = f"{self._bus_text}: cannot {doing} {self._link.place}: {why}"
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
@@ -581,7 +581,7 @@ class ZenohSession:
             ConfigurationError: the session is not open.
         """
         if self._session is None:
-            raise ConfigurationError(f"{self._what} is not open")
+            raise ConfigurationError(f"{self._bus_text} is not open")
         return self._session
 
     @property
@@ -654,14 +654,14 @@ class ZenohDeclared:
         self._by_dropping = by_dropping
         self._end = end
         self._closed = False
-        self._it: Any = None
+        self._declaration: Any = None
         self._how: Callable[[Any], Any] = _nothing
         self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
         """Declare the object that ``how`` makes with the engine's session."""
         self._how = how
-        self._it = self._end.declare(self, how)
+        self._declaration = self._end.declare(self, how)
         return self
 
     def when_lost(self, call: Callable[[], None]) -> Self:
@@ -671,15 +671,15 @@ class ZenohDeclared:
 
     def lose(self) -> Any:
         """Prepare for the end of the session; return the object to keep until then."""
-        declared, self._it = self._it, None
+        declared, self._declaration = self._declaration, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
         return None if self._by_dropping else declared
 
     def again(self) -> None:
         """Declare the key again at the present session."""
-        if not self._closed and self._it is None:
-            self._it = self._how(self._end.session)
+        if not self._closed and self._declaration is None:
+            self._declaration = self._how(self._end.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call back, unless it was closed meanwhile."""
@@ -691,7 +691,7 @@ class ZenohDeclared:
         if not self._closed:
             self._closed = True
             self._end.forget(self)
-            declared, self._it = self._it, None
+            declared, self._declaration = self._declaration, None
             if not self._by_dropping and declared is not None:
                 quietly(declared.undeclare)
 

@@ -57,7 +57,7 @@ class Registry:
         self.revision: int = 0
         self._builtins = builtins
         self._aliases = aliases or {}
-        self._found: dict[str, list[EntryPoint]] | None = None
+        self._points_found: dict[str, list[EntryPoint]] | None = None
         self._loaded: dict[str, object] = {}
         self._registered: dict[str, object] = {}
 
@@ -103,23 +103,23 @@ class Registry:
 
     def refresh(self) -> None:
         """Forget found and loaded plug-ins, but not registered ones; later calls search again."""
-        self._found = None
+        self._points_found = None
         self._loaded.clear()
         self.revision += 1
 
     def _entry_points(self) -> dict[str, list[EntryPoint]]:
-        if self._found is None:
-            self._found = {}
+        if self._points_found is None:
+            self._points_found = {}
             for point in _points(self.group):
-                self._found.setdefault(point.name, []).append(point)
-            for name in self._builtins.keys() & self._found.keys():
+                self._points_found.setdefault(point.name, []).append(point)
+            for name in self._builtins.keys() & self._points_found.keys():
                 _log.warning(
                     "%s: the name %s is smartcam's own, that of %s is left out",
                     self.group,
                     shown(name),
-                    " and ".join(_distribution(point) for point in self._found.pop(name)),
+                    " and ".join(_distribution(point) for point in self._points_found.pop(name)),
                 )
-        return self._found
+        return self._points_found
 
     def _load(self, name: str) -> object:
         if name in self._builtins:  # without a slow look at the installed packages

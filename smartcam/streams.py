@@ -79,7 +79,7 @@ class Queue(Generic[T]):
         self._ready = asyncio.Event()
         self._ended = False
         self._end_error: SmartCamError | None = None
-        self._kept: object = None
+        self._last_item: object = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
@@ -110,7 +110,7 @@ class Queue(Generic[T]):
     def keep(self, source: object) -> None:
         """Keep a reference to the items' source, for a program that keeps the stream alone."""
         if not self._ended:
-            self._kept = source
+            self._last_item = source
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
@@ -218,7 +218,7 @@ class Queue(Generic[T]):
         if not self._ended:
             self._ended = True
             self._end_error = error
-            self._kept = None
+            self._last_item = None
         self._ready.set()
 
     # ------------------------------------------------------------------ inside

@@ -107,7 +107,7 @@ class _Taken:
         self._first = self._last = first
         self._intervals: list[float] = []
         self._ages: list[float] = []
-        self._came = 1
+        self._frames_received = 1
         self._delivered = self._skipped = self._lost = 0
         self._note(first)
 
@@ -119,7 +119,7 @@ class _Taken:
             account = reader.statistics()
             if account.skipped == self._skipped and not frame.lost:
                 self._intervals.append(frame.captured - self._last.captured)
-            self._came = account.delivered + account.skipped
+            self._frames_received = account.delivered + account.skipped
             self._delivered, self._skipped = account.delivered, account.skipped
             self._lost = account.lost - lost
             self._last = frame
@@ -137,7 +137,7 @@ class _Taken:
             "frames": self._delivered,
             "lost": self._lost,
             "skipped": self._skipped,
-            "rate": (self._came - 1) / span if span > 0 else None,
+            "rate": (self._frames_received - 1) / span if span > 0 else None,
             "interval_ms": _ms(_mean(self._intervals)),
             "jitter_ms": _ms(_deviation(self._intervals)),
             "longest_ms": _ms(max(self._intervals, default=None)),

@@ -112,7 +112,7 @@ class Interpretation:
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
         self._endian = 0
-        self._one: _ApplicationReader | None = None
+        self._reader_of_all: _ApplicationReader | None = None
         self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
             for application, interpreter in spec.items():
@@ -121,21 +121,25 @@ class Interpretation:
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{shown(application)} is no id"
                     )
-                self._by_application[application] = _way(resolve(interpreter, lenient=lenient), own)
+                self._by_application[application] = _reader_for(
+                    resolve(interpreter, lenient=lenient), own
+                )
         else:
-            self._one = _raw(own) if spec is None else _way(resolve(spec, lenient=lenient), own)
+            self._reader_of_all = (
+                _raw(own) if spec is None else _reader_for(resolve(spec, lenient=lenient), own)
+            )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
-            if self._one is not None:
-                self._calibrations.check(None, self._one.interpreter)
+            if self._reader_of_all is not None:
+                self._calibrations.check(None, self._reader_of_all.interpreter)
             for application, reader in self._by_application.items():
                 self._calibrations.check(application, reader.interpreter)
-        self.by_application: bool = self._one is None
+        self.by_application: bool = self._reader_of_all is None
 
     @property
     def layout(self) -> Layout | None:
         """Layout of every container; None if there is none, or one for each application."""
-        return None if self._one is None else self._one.interpreter.layout
+        return None if self._reader_of_all is None else self._reader_of_all.interpreter.layout
 
     @property
     def applications(self) -> tuple[int, ...]:
@@ -144,24 +148,24 @@ class Interpretation:
 
     def interpreter(self, application: int | None) -> Interpreter | None:
         """Return the interpreter of an application; None for one that is not known."""
-        reader = self._way(application)
+        reader = self._reader_for(application)
         return None if reader is None else reader.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return the place of the number in this application's containers, None without one."""
-        reader = self._one or self._way(application)
+        reader = self._reader_of_all or self._reader_for(application)
         return reader.numbering if reader is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
         """Return the layouts with a number in them, in the form of ``interpret_as``."""
-        if self._one is not None:
-            return _numbered(self._one)
+        if self._reader_of_all is not None:
+            return _numbered(self._reader_of_all)
         texts = {key: _numbered(reader) for key, reader in self._by_application.items()}
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number, None if it has none or does not fit."""
-        reader = self._way(container.application)
+        reader = self._reader_for(container.application)
         if reader is None or reader.interpreter.layout is None:
             return None
         try:
@@ -169,13 +173,13 @@ class Interpretation:
         except InterpretationError:
             return None
 
-    def _way(self, application: int | None) -> _ApplicationReader | None:
-        if self._one is not None or application is None:
-            return self._one
+    def _reader_for(self, application: int | None) -> _ApplicationReader | None:
+        if self._reader_of_all is not None or application is None:
+            return self._reader_of_all
         return self._by_application.get(application)
 
-    def _known(self, application: int) -> _ApplicationReader:
-        reader = self._way(application)
+    def _known_reader(self, application: int) -> _ApplicationReader:
+        reader = self._reader_for(application)
         if reader is None:
             known = sorted(self._by_application)
             raise WrongApplicationError(
@@ -195,7 +199,7 @@ class Interpretation:
                 value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        reader_of_application = self._one or self._known(container.application)
+        reader_of_application = self._reader_of_all or self._known_reader(container.application)
         interpreter, simple = reader_of_application.interpreter, reader_of_application.simple
         data = container.data
         if container.cells is not None or container.fault is not None:
@@ -244,7 +248,7 @@ class Interpretation:
         None if they are to be interpreted one by one: the interpreter uses a Reader, a sequence
         number must be read, or one container does not fit.
         """
-        reader = self._way(application)
+        reader = self._reader_for(application)
         if (
             reader is None
             or reader.simple is None
@@ -279,10 +283,10 @@ class _Calibrations:
     """
 
     def __init__(self, given: Any, y_down: bool) -> None:
-        self._one: Calibration | None = None
+        self._reader_of_all: Calibration | None = None
         self._by_application: dict[int, Calibration | None] | None = None
         if hasattr(given, "to_robot") or not hasattr(given, "items"):
-            self._one = _calibration(given, y_down)
+            self._reader_of_all = _calibration(given, y_down)
             return
         self._by_application = {}
         for application, calibration in given.items():
@@ -301,7 +305,7 @@ class _Calibrations:
         Raises:
             ConfigurationError: no value would pass; the text names the possible values.
         """
-        given, known = [self._one], self._by_application
+        given, known = [self._reader_of_all], self._by_application
         of = "" if application is None else f" of application {application}"
         if known is not None:
             if application is not None and application not in known:
@@ -362,7 +366,7 @@ class _Calibrations:
     def _of(self, application: int) -> Calibration | None:
         known = self._by_application
         if known is None:
-            return self._one
+            return self._reader_of_all
         if application not in known:
             raise WrongApplicationError(
                 f"a result of application {application} came; calibration knows {sorted(known)}",
@@ -458,7 +462,7 @@ class _ApplicationReader:
 @functools.cache
 def _raw(own: bool) -> _ApplicationReader:
     """Return the reader without a specification: plain bytes, the same reader for each client."""
-    return _way(resolve(None), own)
+    return _reader_for(resolve(None), own)
 
 
 def _numbered(reader: _ApplicationReader) -> str | None:
@@ -466,7 +470,7 @@ def _numbered(reader: _ApplicationReader) -> str | None:
     return None if reader.numbering is None or layout is None else layout.text
 
 
-def _way(interpreter: Interpreter, own: bool) -> _ApplicationReader:
+def _reader_for(interpreter: Interpreter, own: bool) -> _ApplicationReader:
     layout = interpreter.layout
     sequenced = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None

@@ -272,8 +272,8 @@ def _widened(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
     return values
 
 
-def _check_average(who: str, alpha: float, delta: float) -> None:
+def _check_average(caller: str, alpha: float, delta: float) -> None:
     if not 0 < alpha <= 1:
-        raise ConfigurationError(f"{who}: alpha: expected above 0, up to 1, got {shown(alpha)}")
+        raise ConfigurationError(f"{caller}: alpha: expected above 0, up to 1, got {shown(alpha)}")
     if not (delta > 0 and math.isfinite(delta)):
-        raise ConfigurationError(f"{who}: delta: expected a step above 0, got {shown(delta)}")
+        raise ConfigurationError(f"{caller}: delta: expected a step above 0, got {shown(delta)}")

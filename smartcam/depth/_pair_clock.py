@@ -35,20 +35,20 @@ class PairClock:
     """Estimate skew and drift of two cameras from their paired frames."""
 
     def __init__(self) -> None:
-        self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
+        self._pairs: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
 
     def saw(self, left: Frame, right: Frame) -> None:
         """Record a pair; restart if a camera's frame numbers restarted."""
         now = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
-        if self._seen and not all(
-            a < b for a, b in zip(self._seen[-1].sequence, now.sequence, strict=True)
+        if self._pairs and not all(
+            a < b for a, b in zip(self._pairs[-1].sequence, now.sequence, strict=True)
         ):
-            self._seen.clear()
-        self._seen.append(now)
+            self._pairs.clear()
+        self._pairs.append(now)
 
     def skew(self) -> float | None:
         """Return the median time, seconds, by which the right frames of recent pairs are later."""
-        recent = list(self._seen)[-SKEW_PAIRS:]
+        recent = list(self._pairs)[-SKEW_PAIRS:]
         if not recent:
             return None
         return statistics.median(pair.captured[1] - pair.captured[0] for pair in recent)
@@ -70,7 +70,7 @@ class PairClock:
 
     def _rates(self) -> tuple[float, float] | None:
         """Return both cameras' frame rates by the local clock."""
-        seen = list(self._seen)
+        seen = list(self._pairs)
         if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None
         rates = []

@@ -179,7 +179,7 @@ class CameraSearch:
         self._timeout = timeout
         self._max_addresses = max_addresses
         _check_size(self._networks, max_addresses)
-        self._found: dict[tuple[HostAddress, int], FoundPort] = {}
+        self._ports_found: dict[tuple[HostAddress, int], FoundPort] = {}
         self._busy = 0
         self.opened = 0
         self.total = 0
@@ -193,13 +193,13 @@ class CameraSearch:
         """Names of protocols whose cameras serve one client, and were found but not asked."""
         if self._ask:
             return []
-        names = {name for port in self._found.values() for name in port.protocols}
+        names = {name for port in self._ports_found.values() for name in port.protocols}
         known = tcp_protocols()
         return sorted(name for name in names if serves_one(known[name]))
 
     def results(self) -> list[FoundPort]:
         """Return the ports found so far, sorted by address."""
-        return [self._found[key] for key in sorted(self._found)]
+        return [self._ports_found[key] for key in sorted(self._ports_found)]
 
     async def run(self) -> None:
         """Search.
@@ -262,7 +262,7 @@ class CameraSearch:
         self.counts[opened.outcome] += 1
         self.why = self.why or opened.why
         if opened.outcome == "open":
-            self._found[address, port] = found_port(str(address), port, opened, protocols)
+            self._ports_found[address, port] = found_port(str(address), port, opened, protocols)
 
     async def _socket(self, address: HostAddress) -> socket.socket:
         """Return a socket, as soon as the system has one."""
@@ -287,10 +287,10 @@ class CameraSearch:
 
         async def ask(key: tuple[HostAddress, int]) -> None:
             async with places:
-                self._found[key] = await asked(self._found[key])
+                self._ports_found[key] = await asked(self._ports_found[key])
 
         async with asyncio.TaskGroup() as group:
-            for key, port in sorted(self._found.items()):
+            for key, port in sorted(self._ports_found.items()):
                 if port.protocols:
                     group.create_task(ask(key), name=f"smartcam.find[{port.host}:{port.port}].ask")
 

@@ -39,8 +39,8 @@ class FleetOutlets(Server):
 
     Args:
         server: server of the cameras; not started yet.
-        report: function that is called with an outlet's name and its trouble, and with "" at the end
-            of the trouble.
+        report: function that is called with an outlet's name and its trouble, and with "" at the
+            end of the trouble.
 
     Attributes:
         outlets: the outlets.

@@ -113,13 +113,13 @@ class FrameGroup:
         self._sources = dict(sources)
         self._readers: dict[str, _GroupReader] = {}
         self._open = False
-        self._kept: dict[str, collections.deque[Frame]] = {
+        self._queues: dict[str, collections.deque[Frame]] = {
             name: collections.deque() for name in sources
         }
         self._alone = dict.fromkeys(sources, 0)
         self._next: FrameSet | None = None
         self._over: tuple[FrameSourceError | None] | None = None
-        self._came = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._offered = self._delivered = self._skipped = 0
         self._skew = 0.0
 
@@ -207,8 +207,8 @@ class FrameGroup:
         try:
             async with asyncio.timeout(self._timeout):
                 while self._next is None and self._over is None:
-                    self._came.clear()
-                    await self._came.wait()
+                    self._arrived.clear()
+                    await self._arrived.wait()
         except TimeoutError:
             raise FrameTimeoutError(self._silence(), source=", ".join(self._sources)) from None
         if self._next is not None:
@@ -240,13 +240,13 @@ class FrameGroup:
 
     def _take(self, name: str, frame: Frame) -> None:
         """Add a camera's frame, and deliver a set if it is complete."""
-        queue = self._kept[name]
+        queue = self._queues[name]
         queue.append(frame)
         if len(queue) > MAX_WAITING_FRAMES:
             queue.popleft()
             self._alone[name] += 1
         frames = {name: frame}
-        for other, waiting in self._kept.items():
+        for other, waiting in self._queues.items():
             if other != name:
                 if not waiting:
                     return
@@ -264,18 +264,18 @@ class FrameGroup:
         if self._next is not None:
             self._skipped += 1
         self._next = FrameSet({key: frames[key] for key in self._sources}, skew)
-        self._came.set()
+        self._arrived.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
         """Drop a frame that is in a set, and earlier frames, which cannot be in a set any more."""
-        queue = self._kept[name]
+        queue = self._queues[name]
         while queue.popleft() is not frame:
             self._alone[name] += 1
 
     def _end(self, error: FrameSourceError | None) -> None:
         if self._over is None:
             self._over = (error,)
-        self._came.set()
+        self._arrived.set()
 
 
 class _GroupReader(FrameReader):

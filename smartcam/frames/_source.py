@@ -244,7 +244,9 @@ class FrameSource(FrameSink):
             return
         self._task = None
         if task.cancelled() or task.exception() is not None:
-            self._tell(FrameSourceError(f"{self.name}: its task was cancelled", source=self.name))
+            self._end_readers(
+                FrameSourceError(f"{self.name}: its task was cancelled", source=self.name)
+            )
         elif self._readers:
             self._begin(self._loop)
 
@@ -386,9 +388,9 @@ class FrameSource(FrameSink):
             check_callable(fire, "fire", "trigger")
         if self._loop is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`, then trigger")
-        return self._seen(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
+        return self._with_lens(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
 
-    def _seen(self, frame: Frame) -> Frame:
+    def _with_lens(self, frame: Frame) -> Frame:
         """Return a frame with the source's lens added."""
         if self._camera_info is None or frame.camera_info is not None:
             return frame
@@ -419,7 +421,7 @@ class FrameSource(FrameSink):
         if frame.lost:
             self.lost(frame.lost)
         self._last_came = asyncio.get_running_loop().time()
-        frame = self._seen(self._timed(frame, time.monotonic()))
+        frame = self._with_lens(self._timed(frame, time.monotonic()))
         self._frames += 1
         self._newest = frame
         if frame.trigger is not None:
@@ -494,14 +496,14 @@ class FrameSource(FrameSink):
             try:
                 await self._stream()
             except FrameSourceError as error:
-                self._tell(error)
+                self._end_readers(error)
             except asyncio.CancelledError:
                 raise
             except ENDS_PROGRAM:
                 raise
             except BaseException as error:  # noqa: BLE001 - a driver may be a plug-in
                 _log.exception("%s: its driver failed", self.name)
-                self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
+                self._end_readers(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
     async def _stream(self) -> None:
         """Stream until there are no readers, or the device ends."""
@@ -524,7 +526,7 @@ class FrameSource(FrameSink):
             await self._driver.stop()
         over, self._over = self._over, None
         if over is not None:
-            self._tell(over[0])
+            self._end_readers(over[0])
 
     async def _while_read(self) -> None:
         """Wait until the driver ends or is stuck, or the linger after the last reader is over."""
@@ -565,7 +567,7 @@ class FrameSource(FrameSink):
             self._changed.clear()
             await self._changed.wait()
 
-    def _tell(self, error: FrameSourceError | None) -> None:
+    def _end_readers(self, error: FrameSourceError | None) -> None:
         """End all readers; a later reader starts the device again."""
         if error is not None:
             self._triggers.failed(error)

@@ -86,7 +86,7 @@ class TriggerQueue:
                     self._number += 1
                     pending.number = self._number
                     doing.append("triggering")
-                    return await self._one(pending, fire)
+                    return await self._trigger_once(pending, fire)
         except FrameSourceError:
             raise
         except TimeoutError as exc:
@@ -98,7 +98,7 @@ class TriggerQueue:
                 waited=seconds,
             ) from exc
 
-    async def _one(
+    async def _trigger_once(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
     ) -> Frame:
         driver = self._source.driver
@@ -107,13 +107,13 @@ class TriggerQueue:
             try:
                 await driver.trigger(pending, fire)
             except FrameSourceError:
-                if not _came(pending):  # only the answer to the trigger was lost
+                if not _has_arrived(pending):  # only the answer to the trigger was lost
                     raise
             return await pending.outcome
         finally:
             self._pending = None
             driver.disarm()
-            self.settled = self.settled and (pending.fired is None or _came(pending))
+            self.settled = self.settled and (pending.fired is None or _has_arrived(pending))
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
                 pending.outcome.exception()  # mark the error as retrieved
 
@@ -134,6 +134,6 @@ class TriggerQueue:
             self._pending.outcome.set_exception(error)
 
 
-def _came(pending: AwaitedTrigger) -> bool:
+def _has_arrived(pending: AwaitedTrigger) -> bool:
     outcome = pending.outcome
     return outcome.done() and not outcome.cancelled() and outcome.exception() is None

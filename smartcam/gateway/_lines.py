@@ -112,7 +112,7 @@ class RequestReader:
 
     def __init__(self, form: str) -> None:
         self._xml = form == "xml"
-        self._rest = b""
+        self._unread = b""
 
     def feed(self, data: bytes) -> list[RobotRequest]:
         """Add received bytes; return the requests that are complete now.
@@ -120,15 +120,15 @@ class RequestReader:
         Raises:
             NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
-        data, lines = self._rest + data, []
+        data, lines = self._unread + data, []
         at = _behind_blanks(data, 0)
         while (end := self._end(data, at)) > 0 and end - at <= MAX_LINE_BYTES:
             line = data[at:end].strip(_BLANKS)
             if line:
                 lines.append(self._read(line))
             at = _behind_blanks(data, end)
-        self._rest = data[at:].lstrip(_BLANKS)
-        if len(self._rest) > MAX_LINE_BYTES:
+        self._unread = data[at:].lstrip(_BLANKS)
+        if len(self._unread) > MAX_LINE_BYTES:
             raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
         return lines
 

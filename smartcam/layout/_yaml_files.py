@@ -76,7 +76,7 @@ def read_model(
         findings = (
             (
                 item["loc"],
-                item["msg"].removeprefix("Value error, ") + _got(item) + _meant(kind, item),
+                item["msg"].removeprefix("Value error, ") + _actual_text(item) + _meant(kind, item),
             )
             for item in exc.errors(include_url=False)
         )
@@ -96,7 +96,7 @@ def _beside(path: Path) -> list[str]:
         return []
 
 
-def _got(item: ErrorDetails) -> str:
+def _actual_text(item: ErrorDetails) -> str:
     """Return an addition to pydantic's error with the given value, if its text lacks it."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""

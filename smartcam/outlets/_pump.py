@@ -91,13 +91,13 @@ class Pump:
         spool: Spool,
         report: Callable[[str, str], None] = lambda _name, _why: None,
     ) -> None:
-        self.outlet, self.spool, self._tell = outlet, spool, report
+        self.outlet, self.spool, self._report = outlet, spool, report
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
         self._lost: dict[str, tuple[Arrival, int]] = {}  # dropped entries without a gap yet
         self._numbers: dict[str, int] = {}
-        self._came, self._spooled = asyncio.Event(), asyncio.Event()
+        self._arrived, self._spooled = asyncio.Event(), asyncio.Event()
         self._account = OutletAccount()
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
@@ -187,7 +187,7 @@ class Pump:
 
     def _gathered(self) -> None:
         self._gathering = None
-        self._came.set()
+        self._arrived.set()
 
     @property
     def account(self) -> OutletAccount:
@@ -205,8 +205,8 @@ class Pump:
 
     async def _write(self) -> None:
         while True:
-            await self._came.wait()
-            self._came.clear()
+            await self._arrived.wait()
+            self._arrived.clear()
             while self._waiting or self._lost:
                 try:
                     await self._keep_some()
@@ -223,9 +223,11 @@ class Pump:
             arrival for arrival, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)
         ]
         lost = {} if batch else dict(self._lost)
-        await self._kept(batch, lost)
+        await self._store_arrivals(batch, lost)
 
-    async def _kept(self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]) -> None:
+    async def _store_arrivals(
+        self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]
+    ) -> None:
         epoch = self.spool.epoch
 
         def work() -> OutletAccount:
@@ -291,7 +293,7 @@ class Pump:
             self.disk_trouble = why
             log = logger.error if why else logger.info
             log("outlet %s: %s", self.outlet.name, why or "the spool is written again")
-            self._tell(self.outlet.name, why)
+            self._report(self.outlet.name, why)
 
     # ------------------------------------------------------------------ to the far end
 
@@ -403,7 +405,7 @@ class Pump:
             self.trouble = why
             log = logger.warning if why else logger.info
             log("outlet %s: %s", self.outlet.name, why or "delivers again")
-            self._tell(self.outlet.name, why)
+            self._report(self.outlet.name, why)
 
 
 _MEMORY = "the spool's disk was full, away or too slow"

@@ -236,7 +236,7 @@ class Spool:
                 name.with_name(name.name + suffix).unlink(missing_ok=True)
 
     @property
-    def _there(self) -> sqlite3.Connection:
+    def _open_database(self) -> sqlite3.Connection:
         if self._database is None:
             raise sqlite3.OperationalError("the spool is closed")
         return self._database
@@ -255,7 +255,7 @@ class Spool:
         Raises:
             sqlite3.Error: the disk is full or unavailable; no entry was written or counted.
         """
-        database = self._there
+        database = self._open_database
         new = dict(self._counts)
         with _transaction(database):
             for last, count, why in lost:
@@ -326,7 +326,7 @@ class Spool:
         """Return the oldest entries, ``most`` at most, which stay in flight until :meth:`done`."""
         while True:
             places, entries, bad = list[int](), list[OutletEntry](), list[int]()
-            for place, checksum, *fields in self._there.execute(
+            for place, checksum, *fields in self._open_database.execute(
                 f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
                 (most,),
             ):
@@ -343,7 +343,7 @@ class Spool:
 
     def _discard(self, places: Sequence[int]) -> None:
         """Drop damaged entries, and add a gap for them."""
-        database, counts = self._there, dict(self._counts)
+        database, counts = self._open_database, dict(self._counts)
         with _transaction(database):
             database.executemany(
                 "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
@@ -362,7 +362,7 @@ class Spool:
             count: number of accepted entries.
             refused: reason why the far end refused the next one; "" if it did not.
         """
-        database = self._there
+        database = self._open_database
         if waiting.epoch != self.epoch:
             return  # the spool was renewed meanwhile: they come again, with the same ids
         taken = len(waiting.places) if count is None else count

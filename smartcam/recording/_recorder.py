@@ -22,7 +22,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 import smartcam
 from smartcam._arguments import check_flag, check_kind, check_path, check_text
 from smartcam._extras import from_part, load
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer, RawFrame, TraceEntry
@@ -173,7 +173,7 @@ class Recorder(Observer):
         self._file: _Written | None = None
         self._thread: threading.Thread | None = None
         self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     # ------------------------------------------------------------------ life
 

@@ -88,7 +88,7 @@ class RosbridgeNode(NamedNode):
         self._new: list[RosbridgeService] = []  # services to be advertised
         self._leaving: list[RosbridgeService] = []  # services to be withdrawn
         self._changing: asyncio.Task[None] | None = None
-        self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
+        self._pending_answers: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "publish": self._published,
@@ -363,7 +363,7 @@ class RosbridgeNode(NamedNode):
         """
         request = question(service, arguments)
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
-        self._asked[request["id"]] = answer
+        self._pending_answers[request["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
                 self.send(encoded(request))
@@ -372,10 +372,10 @@ class RosbridgeNode(NamedNode):
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
             return None
         finally:
-            del self._asked[request["id"]]
+            del self._pending_answers[request["id"]]
 
     def _answered(self, operation: dict[str, Any]) -> None:
-        answer = self._asked.get(str(operation.get("id")))
+        answer = self._pending_answers.get(str(operation.get("id")))
         if answer is not None and not answer.done():
             answer.set_result(operation)
 

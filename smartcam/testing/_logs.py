@@ -126,7 +126,7 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
         timeout = check_seconds(timeout, "timeout", "expect")
-        wanted = [_known(message) for message in expected]
+        wanted = [_checked_expectation(message) for message in expected]
         self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
 
     def expect_nothing_while_busy(
@@ -221,7 +221,7 @@ def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
     ]
 
 
-def _known(expected: Expected) -> Expected:
+def _checked_expectation(expected: Expected) -> Expected:
     if isinstance(expected, type) and issubclass(expected, m.Message):
         return expected
     if isinstance(expected, m.Message):

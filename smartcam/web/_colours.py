@@ -105,14 +105,14 @@ class ColourSite(ThreadedSite):
         self.colours: ColourRange = ColourRange() if colours is None else colours
         self._quality = quality
         self._looks = 0
-        self._kept: OrderedDict[str, deque[Frame]] = OrderedDict()
+        self._pictures: OrderedDict[str, deque[Frame]] = OrderedDict()
 
     async def stop(self) -> None:
         """Close the port, and drop all pictures."""
         try:
             await super().stop()
         finally:
-            self._kept.clear()
+            self._pictures.clear()
 
     async def next_frame(self, viewer: str) -> Frame:
         """Return the next frame of the source, and keep it for a viewer.
@@ -131,11 +131,11 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a source that gives frames") from exc
         except StopAsyncIteration:
             raise RefusedError(410, f"{name} has ended", "one that goes on") from None
-        queue = self._kept.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
+        queue = self._pictures.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
         queue.append(frame)
-        self._kept.move_to_end(viewer)
-        while len(self._kept) > MAX_KEPT:
-            self._kept.popitem(last=False)
+        self._pictures.move_to_end(viewer)
+        while len(self._pictures) > MAX_KEPT:
+            self._pictures.popitem(last=False)
         return frame
 
     def kept_frame(self, viewer: str, sequence: int | None = None) -> Frame:
@@ -144,7 +144,7 @@ class ColourSite(ThreadedSite):
         Raises:
             RefusedError: the frame is no longer kept.
         """
-        for frame in reversed(self._kept.get(viewer, ())):
+        for frame in reversed(self._pictures.get(viewer, ())):
             if sequence in {None, frame.sequence}:
                 return frame
         which = "a picture" if sequence is None else f"picture {sequence}"

@@ -72,7 +72,9 @@ class Visitor(asyncio.Protocol):
         self._inner: asyncio.Protocol | None = None  # protocol for the bytes; None: none
         self._head: bytearray | None = None  # received part of an unfinished head
         self._idle = False  # between requests, when the next may take long
-        self._rest: StreamReader | None = None  # body of a request that was refused before its end
+        self._stream: StreamReader | None = (
+            None  # body of a request that was refused before its end
+        )
         self._peer = "?"
 
     # ------------------------------------------------------------------ from the transport
@@ -121,8 +123,8 @@ class Visitor(asyncio.Protocol):
         self._acceptor.leave(self)
         if self._inner is not None:
             self._inner.connection_lost(exc)
-        if self._rest is not None:  # aiohttp would still wait for its end
-            self._rest.feed_eof()
+        if self._stream is not None:  # aiohttp would still wait for its end
+            self._stream.feed_eof()
 
     # ------------------------------------------------------------------ from the site
 
@@ -138,7 +140,7 @@ class Visitor(asyncio.Protocol):
                 self._head, self._idle = bytearray(), True
                 self._acceptor.expect(self, KEEP_ALIVE, "no request")
             else:  # the connection ends with the request
-                self._rest = request.content
+                self._stream = request.content
                 self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager

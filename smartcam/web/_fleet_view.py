@@ -110,7 +110,7 @@ class FleetView:
         self._names: list[str] = []  # sorted; empty until it is made again
         self._rang: dict[FleetRow, None] = {}
         self._aging: set[FleetRow] = set()  # rows whose rate or error mark changes by itself
-        self._gone: dict[str, None] = {}  # the longest gone first
+        self._removed: dict[str, None] = {}  # the longest gone first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
@@ -277,11 +277,11 @@ class FleetView:
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
             self._aging.add(row)  # its reason may change without an event
         if row.agents:
-            self._gone.pop(row.name, None)
-        elif row.name not in self._gone:
-            self._gone[row.name] = None
-            if len(self._gone) > MAX_GONE:
-                self._forget(next(iter(self._gone)))
+            self._removed.pop(row.name, None)
+        elif row.name not in self._removed:
+            self._removed[row.name] = None
+            if len(self._removed) > MAX_GONE:
+                self._forget(next(iter(self._removed)))
 
     def _forget(self, name: str) -> None:
         row = self.rows.pop(name)
@@ -289,7 +289,7 @@ class FleetView:
         self.failing.pop(row, None)
         self._flags.subtract(row.flags)
         self._aging.discard(row)
-        self._gone.pop(name, None)
+        self._removed.pop(name, None)
         self._names = []
         self.version += 1
 

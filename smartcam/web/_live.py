@@ -102,7 +102,7 @@ class LiveReader:
         self._view = site.view
         oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
         self._serial = oldest if since is None else since
-        self._known: dict[str, Any] = {}
+        self._last_values: dict[str, Any] = {}
         self._looks = 0
         self._history = -1  # version of the history that was sent
 
@@ -136,8 +136,8 @@ class LiveReader:
             yield News("results", {"results": entries, "missed": missed}, self._serial)
 
     def _changed(self, kind: str, value: Any) -> Iterator[News]:
-        if self._known.get(kind) != value:
-            self._known[kind] = value
+        if self._last_values.get(kind) != value:
+            self._last_values[kind] = value
             yield News(kind, value)
 
 

@@ -115,7 +115,7 @@ class LiveView:
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
-        self._asked = 0  # number of the failure whose picture was asked for
+        self._questions = 0  # number of the failure whose picture was asked for
         self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -266,9 +266,9 @@ class LiveView:
         while True:
             wanted = self._picture_wanted and self._is_watched()
             failure = self.history.last_failure
-            missing = self._writes and self.history.wants_picture and failure != self._asked
+            missing = self._writes and self.history.wants_picture and failure != self._questions
             if (wanted or missing) and self.camera.connected:
-                self._asked = failure
+                self._questions = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()

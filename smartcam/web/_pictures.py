@@ -191,7 +191,7 @@ class Press:
             loop = asyncio.get_running_loop()
             self._frame = frame
             self._made = loop.run_in_executor(self._threads, _pressed, frame, self._quality)
-            self._made.add_done_callback(_seen)
+            self._made.add_done_callback(_retrieved)
         return await asyncio.shield(self._made)
 
     def forget(self) -> None:
@@ -211,7 +211,7 @@ def _pressed(frame: Frame, quality: int) -> bytes:
     return data
 
 
-def _seen(made: asyncio.Future[bytes]) -> None:
+def _retrieved(made: asyncio.Future[bytes]) -> None:
     if not made.cancelled():
         made.exception()  # marks the error as handled if all callers are gone
 

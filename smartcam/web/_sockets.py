@@ -60,7 +60,7 @@ class PageSocket(ABC):
         longest: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
-        self._what = what
+        self._subject = what
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
             max_msg_size=longest,
@@ -87,7 +87,9 @@ class PageSocket(ABC):
                 await self._socket.close(code=WSCloseCode.GOING_AWAY)
         except TimeoutError:
             _log.info(
-                "= %s: a page that takes no %s was disconnected", self._request.remote, self._what
+                "= %s: a page that takes no %s was disconnected",
+                self._request.remote,
+                self._subject,
             )
             if self._request.transport is not None:
                 self._request.transport.abort()

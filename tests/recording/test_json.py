@@ -317,4 +317,4 @@ def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
         raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
         entry = raw.entry()
         assert texts.text(raw) == (frame_text(entry), body_of(entry))
-        assert 0 < len(texts._known) <= MAX_CACHED_FRAME_TEXTS
+        assert 0 < len(texts._texts) <= MAX_CACHED_FRAME_TEXTS

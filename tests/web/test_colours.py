@@ -166,10 +166,10 @@ async def test_pictures_of_few_are_kept_and_two_of_each() -> None:
         for number in range(MAX_KEPT + 1):
             await all_of.get(coloured(number), viewer=f"viewer {number}")
         kept = [f"viewer {number}" for number in range(1, MAX_KEPT + 1)]
-        assert list(all_of.site._kept) == kept
+        assert list(all_of.site._pictures) == kept
         for number in range(4):
             await all_of.get(coloured(number), viewer=kept[0])
-        assert [one.sequence for one in all_of.site._kept[kept[0]]] == [2, 3]
+        assert [one.sequence for one in all_of.site._pictures[kept[0]]] == [2, 3]
         assert PICTURES_PER_VIEWER == 2
         gone = await all_of.refused("/api/look", viewer="viewer 0", range=BLACK, again=True)
         assert gone.status == 409

@@ -71,7 +71,7 @@ class Pieces(NamedTuple):
             chosen_places = chosen_places[np.argsort(areas[chosen_places])[-most:]]
         number = np.full(len(areas), -1, dtype=np.int32)
         number[chosen_places] = np.arange(len(chosen_places))
-        pieces = self._some(chosen_places)
+        pieces = self._selected(chosen_places)
         good = _filled(self, number, pieces)
         return Spots(pieces.points[good], pieces.areas[good])
 
@@ -81,9 +81,9 @@ class Pieces(NamedTuple):
         chosen = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
         chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
         chosen[0] = False
-        return self._some(np.flatnonzero(chosen))
+        return self._selected(np.flatnonzero(chosen))
 
-    def _some(self, places: NDArray[np.intp]) -> Spots:
+    def _selected(self, places: NDArray[np.intp]) -> Spots:
         middles, areas = self.middles[places], self.boxes[places, 4]
         return Spots(middles.astype(np.float64), areas.astype(np.float64))
 

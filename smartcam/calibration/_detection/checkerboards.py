@@ -344,11 +344,13 @@ def _shades(
     image: GreyImage, target: Checkerboard, corners: Corners, arrangement: Arrangement
 ) -> _Shades:
     grid = corners.points[arrangement.order]
-    squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
+    squares = sorted(
+        mean_level(image, _mapped_near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES
+    )
     area = (
         target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC
     )
-    seen = _near(grid, area)
+    seen = _mapped_near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
     level = mean_level(image, seen) if inside else None
     return _Shades(sum(squares[:2]) / 2, sum(squares[2:]) / 2, level)
@@ -363,7 +365,7 @@ def _blackness(target: Checkerboard, corners: Corners, arrangement: Arrangement)
     return against * float(parity(rows_of(target.columns, target.rows)) @ signs)
 
 
-def _near(grid: Array, at: Array) -> Array:
+def _mapped_near(grid: Array, at: Array) -> Array:
     """Map places (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
 
     A place is given from this corner, in sides of a square.

@@ -94,10 +94,10 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
         good &= swing >= np.partition(swing[good], -MAX_SADDLES_KEPT)[-MAX_SADDLES_KEPT]
     at = at[good]
     bends = np.stack([part[at[:, 1], at[:, 0]] for part in (xx, xy, xy, yy)], axis=1)
-    return Saddles(at + _way(smooth, at, bends), turns[good] / swing[good, None])
+    return Saddles(at + _steps_to_saddles(smooth, at, bends), turns[good] / swing[good, None])
 
 
-def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
+def _steps_to_saddles(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
     """Return the steps (N, 2), at most a pixel, from pixels to the saddles, where the slope is 0.
 
     ``bends`` (N, 4): second derivatives at the pixels.

@@ -226,7 +226,7 @@ def calibrate_hand_eye(
         robot=robot,
         seen=seen,
         poses=poses,
-        given=_given(ordered),
+        given=_checked_views(ordered),
         sigmas=_positive(robot_sigmas),
         lens=None if lens_calibration is None else lens_calibration.covariance,
     )
@@ -386,7 +386,7 @@ def _numbered_alike(
     ]
 
 
-def _given(views: Sequence[TargetView]) -> Any:
+def _checked_views(views: Sequence[TargetView]) -> Any:
     counts = np.array([len(view.ids) for view in views])
     return np.arange(counts.max())[None] < counts[:, None]
 
@@ -398,7 +398,7 @@ def _observations(
     residuals = np.concatenate([view.residuals for view in located])
     noise = np.concatenate([view.covariance for view in views])
     more = excess(residuals, noise, residuals.size - 6 * len(views))
-    given = _given(views)
+    given = _checked_views(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))
     for index, view in enumerate(views):
@@ -431,7 +431,7 @@ def _without_bad(
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
     """Return the calibration from the poses that are not bad, with the errors of all poses."""
-    used, remarks = _near(problem, request, named)
+    used, remarks = _start_poses(problem, request, named)
     result = _solved(problem.taken(used), request, robot_poses[0])
     while len(bad := _bad(result)) and request.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
@@ -497,7 +497,7 @@ def _moved_remark(
             return
 
 
-def _near(
+def _start_poses(
     problem: Problem, request: _Asked, named: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
     """Return the poses to begin with, and remarks, by number, on those that belong to other views.

@@ -263,7 +263,7 @@ def candidates(
         plain = _reprojection(besides, _freed(problem, numbers), begin)
         return plain, [plain] if plain else []
     judges = _robots(problem, free, begin)
-    judge = _asked(judges)
+    judge = _best_candidate(judges)
     if judge is None or method == ROBOT:
         return judge, judges
     plain = _reprojection_beside(judge)
@@ -330,7 +330,7 @@ def _robots(
     return found
 
 
-def _asked(judges: Sequence[Candidate]) -> Candidate | None:
+def _best_candidate(judges: Sequence[Candidate]) -> Candidate | None:
     """Return the candidate with the right choice of adjusted values."""
     if not judges:
         return None

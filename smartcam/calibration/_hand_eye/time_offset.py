@@ -118,14 +118,14 @@ class _Moving:
     ) -> None:
         self._history, self._most = history, most
         self._in_hand = is_in_hand(setup, "time offset")
-        self._seen = Rigid.stacked(view.rigid for view in views)
+        self._views = Rigid.stacked(view.rigid for view in views)
         for number, view in enumerate(views):
             if view.at is None:
                 raise Code.BAD_TIME.refusal(
                     f"time offset: expected view {number} with a time, got none", got=None
                 )
         self._times = [view.at for view in views if view.at is not None]
-        self._arm = float(np.median(np.linalg.norm(self._seen.translation, axis=1)))
+        self._arm = float(np.median(np.linalg.norm(self._views.translation, axis=1)))
         check_motion(self._robot(0.0, np.arange(len(views))))
 
     def _robot(self, offset: float, index: NDArray[np.intp]) -> RobotPoses:
@@ -135,7 +135,7 @@ class _Moving:
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
-        robot, seen = self._robot(offset, index), self._seen.taken(index)
+        robot, seen = self._robot(offset, index), self._views.taken(index)
         solution = solve_linear("shah", robot, seen)
         if solution is None:
             return math.inf

@@ -65,7 +65,10 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
     free = adjust_shape(adjusted.bundle, sights, adjusted.more)
-    left_out, distances = leave_out(free, sights), _off(free.bundle, sights[0].view.target.points)
+    left_out, distances = (
+        leave_out(free, sights),
+        _adjustment(free.bundle, sights[0].view.target.points),
+    )
     # the simpler one, unless the other is better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
     gains = _squares(exact.left_out) - _squares(left_out)
@@ -79,7 +82,7 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     return exact._replace(remarks=[_remark(distances, done)] if better else [])
 
 
-def _off(bundle: Bundle, nominal: Array) -> Array:
+def _adjustment(bundle: Bundle, nominal: Array) -> Array:
     return np.zeros(nominal.shape) if bundle.points is None else bundle.points - nominal
 
 

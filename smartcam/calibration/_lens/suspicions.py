@@ -139,14 +139,14 @@ def squares_off(equations: Equations, scale: float) -> Array:
         )
         step = solve_scaled(rows.T @ rows, rows.T @ right)
         squares = ((equations.residuals - equations.by_pose @ step) ** 2).sum(axis=1)
-        outlying = _far(equations, squares, scale)
+        outlying = _outlying(equations, squares, scale)
         if not (inliers & outlying).any():
             return np.where(~inliers & outlying, squares, 0.0)
         inliers[int(np.argmax(np.where(inliers & outlying, squares, 0.0)))] = False
     return np.zeros(len(equations.residuals))
 
 
-def _far(equations: Equations, squares: Array, scale: float) -> Mask:
+def _outlying(equations: Equations, squares: Array, scale: float) -> Mask:
     pixels = equations.deviations * np.sqrt(squares)
     times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
     outlying: Mask = np.any(

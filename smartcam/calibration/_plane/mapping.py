@@ -217,8 +217,8 @@ class _Homogeneous:
 
     def __init__(self, points: Array) -> None:
         self._points = np.ascontiguousarray(points)
-        self._whole = points.shape[1] == 3
-        if not self._whole:
+        self._is_spatial = points.shape[1] == 3
+        if not self._is_spatial:
             self._pairs = self._points.view(np.complex128)[:, 0]
             self._buffer = np.ones((min(POINTS_PER_BLOCK, len(points)), 3))
             self._places: NDArray[np.complex128] = np.ndarray(
@@ -227,7 +227,7 @@ class _Homogeneous:
 
     def block(self, begin: int) -> Array:
         """Return the next points (n, 3), contiguous, valid until the next call."""
-        if self._whole:
+        if self._is_spatial:
             return self._points[begin : begin + POINTS_PER_BLOCK]
         pairs = self._pairs[begin : begin + POINTS_PER_BLOCK]
         self._places[: len(pairs)] = pairs

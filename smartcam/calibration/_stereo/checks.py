@@ -141,7 +141,7 @@ def examined(
     """
     check_apart(calibration.transform, calibration.covariance)
     sides = [[pair.left for pair in calibration.pairs], [pair.right for pair in calibration.pairs]]
-    seen = list(_seen(calibration))
+    seen = list(_views_of(calibration))
     fitted, used = [sight.fitted for sight in seen], [sight.used for sight in seen]
     names = [f"{label(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in seen]
     of_fit = list(view_remarks([fit.view for fit in fitted], names))
@@ -186,7 +186,7 @@ class _SeenFrom(NamedTuple):
     fitted: Fitted
 
 
-def _seen(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
+def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
     for number, pair in enumerate(calibration.pairs):
         if pair.transform is None:
             continue

@@ -119,7 +119,7 @@ def rectify(
             across,
         )
     rectified_maps = tuple(
-        _kept(camera, turn, projection, output)
+        _kept_part(camera, turn, projection, output)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
     return Rectification(
@@ -215,7 +215,9 @@ def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
         return np.asarray((u >= 0) & (v >= 0) & (u <= size[0] - 1) & (v <= size[1] - 1))
 
 
-def _kept(camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]) -> float:
+def _kept_part(
+    camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]
+) -> float:
     """Return the part of the source pixels that are in the output."""
     width, height = camera.size
     step = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))

@@ -174,7 +174,9 @@ def _rig(
         # which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares Regression
         # (1984).
         guess = two @ turn @ left.inverse()
-        tried = np.array([_off(guess @ pose, view, right, turns) for _, pose, _, view in pairs])
+        tried = np.array(
+            [_mean_distances(guess @ pose, view, right, turns) for _, pose, _, view in pairs]
+        )
         middle = float(np.median(tried.min(axis=1)))
         if middle < least:
             best, least, distances = guess, middle, tried
@@ -198,7 +200,9 @@ def _rig(
     return best, apart, turned
 
 
-def _off(pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]) -> list[float]:
+def _mean_distances(
+    pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]
+) -> list[float]:
     """Return the mean distance, pixels, of a view's points from a pose's, for each turn."""
     seen = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
     distances = [np.linalg.norm(points - view.points, axis=1) for points in seen]

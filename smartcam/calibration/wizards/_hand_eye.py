@@ -303,7 +303,7 @@ class _Views:
         image = await self._take_picture()
         flange = typed or await self._flange()
         name = f"view {len(self._samples) + 1}"
-        view, preview, following = await asyncio.to_thread(self._found, image, name)
+        view, preview, following = await asyncio.to_thread(self._view_in, image, name)
         frames = [flange.target, flange.source]
         return {
             "frames": frames,
@@ -319,7 +319,7 @@ class _Views:
         pose = await self._robot()
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
-    def _found(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
+    def _view_in(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
         """Return the view found in a picture, an SVG of it, and the next suggestion.
 
         A large SVG is left out.
@@ -442,8 +442,8 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "mean_mm": 1e3 * calibration.mean_error,
-        "translation_error_mm": _known(1e3, calibration.translation_error),
-        "rotation_error_deg": _known(math.degrees(1.0), calibration.rotation_error),
+        "translation_error_mm": _measured(1e3, calibration.translation_error),
+        "rotation_error_deg": _measured(math.degrees(1.0), calibration.rotation_error),
         "remarks": remarks,
     }
     notes = [f"{figures['views']} views, {figures['method']}"]
@@ -462,5 +462,5 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     return Calibrated(calibration, figures, (*notes, *remarks), judgement)
 
 
-def _known(factor: float, value: float) -> float | None:
+def _measured(factor: float, value: float) -> float | None:
     return factor * value if math.isfinite(value) else None

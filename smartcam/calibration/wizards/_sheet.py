@@ -153,7 +153,7 @@ class _SheetSource(PointSource):
 
         async def look(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
-            sighting = await asyncio.to_thread(_found, image, self._target, lens)
+            sighting = await asyncio.to_thread(_sheet_in, image, self._target, lens)
             known = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
             return {**sighting, "lens_covariance": known}
 
@@ -320,7 +320,7 @@ class _SheetSource(PointSource):
         return u, v
 
 
-def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
+def _sheet_in(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
     """Return a picture's view, the lens, and an SVG if it is small, as JSON takes them."""
     view = find_target(image, target)
     preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)

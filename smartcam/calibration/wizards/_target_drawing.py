@@ -107,7 +107,7 @@ def draw(
         *canvas.covered(counts),
     ]
     summary = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
-    texts = [summary, _seen(counts, earlier, view)]
+    texts = [summary, _covered(counts, earlier, view)]
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:
@@ -161,7 +161,9 @@ def _with(svg: str, parts: Sequence[str]) -> str:
     return "\n".join([head.rstrip("\n"), *parts, END]) + tail
 
 
-def _seen(counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None) -> str:
+def _covered(
+    counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None
+) -> str:
     views = len(earlier) + (view is not None)
     plural = "" if views == 1 else "s"
     return f"{np.count_nonzero(counts)} of {counts.size} cells seen by {views} view{plural}"

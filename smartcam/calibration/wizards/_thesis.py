@@ -439,18 +439,18 @@ class ThesisCalibration:
         )
 
     async def _localize(self) -> list[Localization]:
-        return await _there(self._camera).localize()
+        return await _checked(self._camera).localize()
 
     async def _picture(self, sequence: _Sequence, source: str) -> Any:
         sequence.pictured = None
         if source == SMARTCAMERA:
-            return await _there(self._camera).take_picture()
-        image, sequence.pictured = await _there(self.graph).picture(source)
+            return await _checked(self._camera).take_picture()
+        image, sequence.pictured = await _checked(self.graph).picture(source)
         return image
 
     async def _tool(self, sequence: _Sequence, utc: float | None) -> Transform:
         request = sequence.asked
-        return await _there(self.graph).pose(
+        return await _checked(self.graph).pose(
             request.tf_frame_robot_tcp, request.tf_frame_robot_base, utc
         )
 
@@ -584,7 +584,7 @@ class CalibrationDesks:
             desk.close()
 
 
-def _there(value: T | None) -> T:
+def _checked(value: T | None) -> T:
     """Return a value that earlier checks found not to be None."""
     if value is None:
         raise Code.NOT_POSSIBLE.refusal(

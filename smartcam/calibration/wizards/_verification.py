@@ -194,13 +194,13 @@ class _DriftCheck(Touches):
             await self._touch_marks()
             if not self.touches:
                 continue
-            drift = self.calibration.check(self._seen(), self.places)
+            drift = self.calibration.check(self._touched_marks(), self.places)
             figures = self._figures(drift)
             choice = await ask(self._verdict(drift, figures), partial(self._end, drift, figures))
             if choice["next"] == "finish":
                 return {"name": self.name, **figures, **choice.outcome}
 
-    def _seen(self) -> Array:
+    def _touched_marks(self) -> Array:
         return np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
@@ -262,7 +262,7 @@ class _DriftCheck(Touches):
             preview=compared(
                 self.calibration,
                 self.touches,
-                self._seen(),
+                self._touched_marks(),
                 drift.offsets,
                 worst=offsets.index(max(offsets)),
             ),
@@ -270,7 +270,7 @@ class _DriftCheck(Touches):
 
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
-        needed = [touches_needed(self.calibration, point) for point in self._seen()]
+        needed = [touches_needed(self.calibration, point) for point in self._touched_marks()]
         enough = [name for name in needed if name is not None]
         return {
             "stale": drift.stale,

@@ -157,7 +157,7 @@ class Device:
         self._entered: list[DeviceState] = []
         self._bits = 0  # bits of the status word, as last seen
         first = next(iter(self._applications)) if active is None else active
-        self._take_up(self._applications[self._known(first)])
+        self._take_up(self._applications[self._known_application(first)])
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
@@ -386,7 +386,7 @@ class Device:
         """
         application = check_application(application, caller="device")
         running = check_flag(running, "running", "device")
-        target = self._applications[self._known(application)]
+        target = self._applications[self._known_application(application)]
         with self.around():
             if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
                 return False
@@ -904,7 +904,7 @@ class Device:
         self._reported = now = (self._status_word(), self._endian)
         self._send(_status_report(*now))
 
-    def _known(self, application: int) -> int:
+    def _known_application(self, application: int) -> int:
         if application not in self._applications:
             known = ", ".join(str(key) for key in self._applications)
             raise ConfigurationError(f"no application has the id {application}; there are {known}")

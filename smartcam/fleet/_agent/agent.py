@@ -108,22 +108,22 @@ class CallNumbers:
 
     def __init__(self, floor: int = 0) -> None:
         self.floor = floor
-        self._known: set[int] = set()
+        self._known_calls: set[int] = set()
 
     @property
     def last(self) -> int:
         """The highest received number."""
-        return max(self._known, default=self.floor)
+        return max(self._known_calls, default=self.floor)
 
     def is_new(self, call: int) -> bool:
         """Return True if a call is received for the first time, and remember it."""
-        if call <= self.floor or call in self._known:
+        if call <= self.floor or call in self._known_calls:
             return False
-        self._known.add(call)
-        if len(self._known) > KNOWN_CALLS:
-            newest = sorted(self._known)[KNOWN_CALLS // 2 :]
+        self._known_calls.add(call)
+        if len(self._known_calls) > KNOWN_CALLS:
+            newest = sorted(self._known_calls)[KNOWN_CALLS // 2 :]
             self.floor = newest[0] - 1
-            self._known = set(newest)
+            self._known_calls = set(newest)
         return True
 
 
@@ -134,7 +134,7 @@ class Guest:
     Questions and commands have separate bounds, so that neither blocks the other.
 
     Attributes:
-        who: name and secret of the program.
+        program: name and secret of the program.
         number: number of the program in the results of its triggers.
         present: whether the program's presence was seen.
         questions, commands: numbers of its calls of each kind.
@@ -144,7 +144,7 @@ class Guest:
         last_state: number of the last state in the program's replies, by camera.
     """
 
-    who: ProgramName
+    program: ProgramName
     number: int
     present: bool
     questions: CallNumbers = field(default_factory=CallNumbers)
@@ -227,7 +227,7 @@ class Agent:
         # by role: present programs, by their tokens; and programs that left, oldest first, with
         # their last call
         self._present = collections.defaultdict[str, set[str]](set)
-        self._gone = collections.defaultdict[str, dict[str, int]](dict)
+        self._counts_of_removed = collections.defaultdict[str, dict[str, int]](dict)
         self._of_role: collections.Counter[str] = collections.Counter()  # number of programs
         # running questions, by program
         self._questions: collections.Counter[str] = collections.Counter()
@@ -289,7 +289,7 @@ class Agent:
         for program in [*self._programs]:
             self._forget(program, going_back=False)
         for task in self._workers.close():
-            self._own(task)
+            self._add_task(task)
         for task in tuple(self._tasks):
             task.cancel()
         try:
@@ -449,16 +449,16 @@ class Agent:
     def begin(self, work: Any, name: str) -> asyncio.Task[None]:
         """Run a coroutine in a task, which ends with the agent."""
         task = asyncio.get_running_loop().create_task(work, name=name)
-        self._own(task)
+        self._add_task(task)
         return task
 
-    def _own(self, task: asyncio.Task[None]) -> None:
+    def _add_task(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     def _end(self, call: asyncio.Task[None]) -> None:
         """Cancel a call's task, and keep the task until it has ended."""
-        self._own(call)
+        self._add_task(call)
         call.cancel()
 
     @property
@@ -482,7 +482,7 @@ class Agent:
             names_present.discard(token)
         elif len(names_present) < MAX_PROGRAMS_PER_ROLE:
             names_present.add(token)
-        if guest is None or guest.who != name:
+        if guest is None or guest.program != name:
             return
         guest.present = present
         if not present:
@@ -493,9 +493,9 @@ class Agent:
         guest = self._programs.pop(program, None)
         if guest is None:
             return
-        role = guest.who.role
+        role = guest.program.role
         self._of_role[role] -= 1
-        gone = self._gone[role]
+        gone = self._counts_of_removed[role]
         gone[program] = guest.last
         if len(gone) > MAX_PROGRAMS_PER_ROLE:
             del gone[next(iter(gone))]
@@ -509,15 +509,15 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _known(self, name: ProgramName) -> Guest | None:
+    def _known_calls(self, name: ProgramName) -> Guest | None:
         """Return a known program; None also if another one uses its name."""
         guest = self._programs.get(name.name)
-        return guest if guest is not None and guest.who == name else None
+        return guest if guest is not None and guest.program == name else None
 
     def _guest(self, name: ProgramName, call: int) -> Guest | None:
         """Return the program that sent a hello; None if the program has left since then."""
-        known, role = self._known(name), name.role
-        left = self._gone[role].get(name.name, 0)
+        known, role = self._known_calls(name), name.role
+        left = self._counts_of_removed[role].get(name.name, 0)
         if known is None and call > left:
             if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
                 raise LocalProtocolError(
@@ -534,9 +534,9 @@ class Agent:
 
     def _expect_present(self, guest: Guest) -> None:
         """Forget a program whose presence was not seen in time."""
-        if not guest.present and self._programs.get(guest.who.name) is guest:
-            logger.warning("%s ! %s is not present: forgotten", self.name, guest.who.name)
-            self._forget(guest.who.name)
+        if not guest.present and self._programs.get(guest.program.name) is guest:
+            logger.warning("%s ! %s is not present: forgotten", self.name, guest.program.name)
+            self._forget(guest.program.name)
 
     def next_program(self) -> int:
         """Return the number for a new program, which marks the results of its triggers."""
@@ -571,7 +571,7 @@ class Agent:
 
         return hear
 
-    def _who(self, token: str, role: str | None) -> ProgramName:
+    def _caller(self, token: str, role: str | None) -> ProgramName:
         """Return the name of the calling program.
 
         Raises:
@@ -584,7 +584,7 @@ class Agent:
 
     def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
-        program, number = self._who(str(fields["program"]), role), int(fields["call"])
+        program, number = self._caller(str(fields["program"]), role), int(fields["call"])
         if "come" in fields:
             self._sender.come(program.name, number, fields["come"])
             return
@@ -595,7 +595,7 @@ class Agent:
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(program, number) if action == "hello" else self._known(program)
+        guest = self._guest(program, number) if action == "hello" else self._known_calls(program)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
@@ -623,8 +623,8 @@ class Agent:
         number, action = order.call, "trigger"
         program, _, secret = token.partition(".")
         guest = self._programs.get(program)
-        if guest is None or guest.who.secret != secret:
-            guest, program = None, self._who(token, None).name
+        if guest is None or guest.program.secret != secret:
+            guest, program = None, self._caller(token, None).name
         epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
         reservation = order.reservation
         left = self._admit(
@@ -688,9 +688,9 @@ class Agent:
         if left < 0:
             return late(action, f"{host.name}: {action} came after its deadline; it was not done")
         cameras = len(self.hosts)
-        if not command and self._questions[guest.who.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
+        if not command and self._questions[guest.program.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
             return LocalProtocolError(
-                f"{host.name}: too many questions of role {guest.who.role} are under way"
+                f"{host.name}: too many questions of role {guest.program.role} are under way"
             )
         if guest.under_way[command] >= MAX_CALLS_PER_PROGRAM * cameras:
             kind = "commands" if command else "questions"
@@ -705,8 +705,8 @@ class Agent:
         )
         guest.begin(command, call.owner.call, task)
         if not command:
-            self._questions[guest.who.role] += 1
-            task.add_done_callback(partial(self._answered, guest.who.role))
+            self._questions[guest.program.role] += 1
+            task.add_done_callback(partial(self._answered, guest.program.role))
 
     def _answered(self, role: str, _: object) -> None:
         self._questions[role] -= 1

@@ -87,17 +87,17 @@ class ProgramCall(NamedTuple):
         return value
 
 
-def _check_layouts(value: object, what: str, who: str) -> Any:
+def _check_layouts(value: object, name: str, caller: str) -> Any:
     """Return the layouts that have a number: one, or one for each application."""
     if not isinstance(value, dict):
-        return check_text(value, what, who)
+        return check_text(value, name, caller)
     try:
         return {
-            int(key): check_text(text, what, who)
+            int(key): check_text(text, name, caller)
             for key, text in cast("dict[str, object]", value).items()
         }
     except ValueError as exc:
-        raise wrong_argument(what, "layouts by application id", value, who) from exc
+        raise wrong_argument(name, "layouts by application id", value, caller) from exc
 
 
 _PLAIN = Carrier()

@@ -59,14 +59,14 @@ class FleetChanges:
 
     def __str__(self) -> str:
         parts = [
-            f"{len(names)} {change} ({_some(names)})"
+            f"{len(names)} {change} ({_shortened(names)})"
             for change in ("added", "removed", "changed")
             if (names := getattr(self, change))
         ]
         return ", ".join([*parts, f"{self.kept} kept"])
 
 
-def _some(names: tuple[str, ...], most: int = 5) -> str:
+def _shortened(names: tuple[str, ...], most: int = 5) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -173,7 +173,7 @@ class Reloader:
         self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
         self.on_reload: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
         self._folder, self._make = folder, make
-        self._one = asyncio.Lock()
+        self._reload_lock = asyncio.Lock()
         self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
         self._applying: asyncio.Task[None] | None = None
         self._closed = False
@@ -186,7 +186,7 @@ class Reloader:
 
     async def reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
         """Apply ``file`` to a running agent, like :meth:`FleetServer.reload`."""
-        async with self._one:
+        async with self._reload_lock:
             self.on_reload(None)
             try:
                 changes = await self._typed(agent, file)
@@ -320,7 +320,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
                 f"{', '.join(sorted(LIVE))} can be changed while it runs"
             )
     for name, planned in new.plan.items():
-        if old.file.ros2 is not None and _seen(old.plan.get(name)) != _seen(planned):
+        if old.file.ros2 is not None and _ros_entry(old.plan.get(name)) != _ros_entry(planned):
             raise ConfigurationError(
                 f"cameras.{name}.ros2: it was changed, which wants a restart of the agent {agent}"
             )
@@ -349,7 +349,7 @@ def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
             )
 
 
-def _seen(planned: Planned | None) -> RosCamera:
+def _ros_entry(planned: Planned | None) -> RosCamera:
     """Return a camera's entry for ROS; for a camera that is new, the entry's defaults."""
     return RosCamera.model_validate({}) if planned is None else planned.entry.ros2
 

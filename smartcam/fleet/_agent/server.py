@@ -97,7 +97,7 @@ class FleetServer(Server):
         self._given_frames = _frames or {}
         if not isinstance(file, (Path, FleetFile)):
             file = check_text(file, "fleet file", least=1)
-        self._given = file
+        self._given_file = file
         self.observers: list[Observer] = []
         self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
         self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = _nothing
@@ -352,7 +352,7 @@ class FleetServer(Server):
         """
         if self._agent is None:
             raise ConnectionClosedError("the agent is not started: there is nothing to reload")
-        return await self.reloads.reload(self._agent, self._given if file is None else file)
+        return await self.reloads.reload(self._agent, self._given_file if file is None else file)
 
     async def _source(self, planned: Planned, folder: Path) -> CameraSource:
         """Return the source of a camera's session; start an emulated camera for it.

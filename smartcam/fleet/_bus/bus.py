@@ -392,8 +392,8 @@ class MemoryEnd(Bus):
 
     def be_present(self, key: str) -> Handle:
         made = _MemoryDeclared(self.present_here, key, _nothing)
-        self._tell(key, True)
-        return made.then(lambda: self._tell(key, False))
+        self._report_presence(key, True)
+        return made.then(lambda: self._report_presence(key, False))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
         return [
@@ -421,9 +421,9 @@ class MemoryEnd(Bus):
                     for watch in self.watched.meeting(watcher.pattern):
                         self._loop.call_soon(_call, watch, watcher.pattern, present)
         for token in self.present_here:
-            self._tell(token.pattern, present)
+            self._report_presence(token.pattern, present)
 
-    def _tell(self, key: str, present: bool) -> None:
+    def _report_presence(self, key: str, present: bool) -> None:
         for end in self._others():
             for watcher in end.watched.meeting(key):
                 self._loop.call_soon(_call, watcher, key, present)

@@ -223,8 +223,8 @@ class ZenohEnd(ZenohSession, Bus):
         # a single message is sent at once, a burst together: there is not room for many
         express = self._burst_messages <= MAX_EXPRESS_MESSAGES
         waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
-        if waits or (self._behind and self._way(key) in self._behind):
-            self._hand_over(self._way(key), session, key, payload, express)
+        if waits or (self._behind and self._queue_of(key) in self._behind):
+            self._hand_over(self._queue_of(key), session, key, payload, express)
             return
         try:
             publisher = self._publisher_of(key, begun) if express else None
@@ -235,9 +235,9 @@ class ZenohEnd(ZenohSession, Bus):
         except self._zenoh.ZError as exc:  # it ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
         if self._loop.time() - begun >= ROOM_TIMEOUT:
-            self._hand_over(self._way(key), session, key, payload, express, doubtful=True)
+            self._hand_over(self._queue_of(key), session, key, payload, express, doubtful=True)
 
-    def _way(self, key: str) -> str:
+    def _queue_of(self, key: str) -> str:
         """Return the name of the queue in which a message is sent in order."""
         # a router, and a peer, has one to each who listens
         return "" if self._link.mode == "client" else key
@@ -475,7 +475,7 @@ class ZenohEnd(ZenohSession, Bus):
         quietly(publisher.put, payload)
         if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
             self._hand_over(
-                self._way(urgent_key), session, urgent_key, payload, False, doubtful=True
+                self._queue_of(urgent_key), session, urgent_key, payload, False, doubtful=True
             )
 
 
@@ -508,7 +508,7 @@ class _FrequentKey(_OnBus):
         if not self._declares:
             self._declares = True
             self.of(lambda session: session.declare_publisher(self._key, **self._options))
-        return self._it
+        return self._declaration
 
 
 class _ZenohPublisher(Publisher):

@@ -28,7 +28,7 @@ class FramePace:
         self._last: tuple[float, int] | None = None
         self._period = 0.0  # period of the source; 0: unknown
         self._due = -math.inf
-        self._rest = 0.0
+        self._least_interval = 0.0
 
     def window(self, now: float, arrived_at: float, remaining: float = 0.0) -> tuple[float, float]:
         """Return the time after which the next frame must have come, and the end of the wait.
@@ -41,7 +41,7 @@ class FramePace:
         if self._given_at is not None:
             self._transit_times = (self._transit_times[1], now - self._given_at)
             self._given_at = None
-        self._rest = remaining
+        self._least_interval = remaining
         least = min(self._transit_times)
         since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * least), now
         if 0 < self._period <= least:  # otherwise the link is free before the next frame comes
@@ -61,7 +61,7 @@ class FramePace:
         if self._last is not None and offered > self._last[1]:
             self._period = (arrived_at - self._last[0]) / (offered - self._last[1])
         self._last = arrived_at, offered
-        self._due = max(self._due, arrived_at - self._rest) + self._rest
+        self._due = max(self._due, arrived_at - self._least_interval) + self._least_interval
 
     def note_sent(self, now: float) -> None:
         """Note that the frame is sent now."""

@@ -61,7 +61,7 @@ class SharedVideo:
     def __init__(self, source: FrameSource, encoder: H264Encoder, name: str) -> None:
         self._encoder = encoder
         self._reader = source.reader(timeout=None)
-        self._kept: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
+        self._units: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
         self._stirred = asyncio.Event()
         self._over: tuple[Exception | None] | None = None
         self._name = name
@@ -78,7 +78,7 @@ class SharedVideo:
         if self._over is None:
             self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
         self._reader.close()
-        self._kept.clear()
+        self._units.clear()
         self._stirred.set()
 
     @property
@@ -121,7 +121,7 @@ class SharedVideo:
             await self._stirred.wait()
 
     def _following(self, have: int) -> list[VideoUnit]:
-        pictures_kept = self._kept
+        pictures_kept = self._units
         if not pictures_kept or pictures_kept[-1].number == have:
             return []
         fresh = asyncio.get_running_loop().time() - LATE_SECONDS
@@ -158,7 +158,7 @@ class SharedVideo:
         key, _ = entry_point(bytes(made.data))
         if key:
             self._last_key, self._key_wanted = loop.time(), False
-        number = self._kept[-1].number + 1 if self._kept else secrets.randbits(31) + 1
+        number = self._units[-1].number + 1 if self._units else secrets.randbits(31) + 1
         unit = VideoUnit(number, made, took, key, loop.time(), offered, lost)
-        self._kept.append(unit)
+        self._units.append(unit)
         self._stirred.set()

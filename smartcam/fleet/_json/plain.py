@@ -191,7 +191,7 @@ class Plain:
         self._numbers = 0
         # running calls by camera, and whether only operators may make them
         self._under_way: collections.Counter[tuple[str, bool]] = collections.Counter()
-        self._known = {operates: _KnownAnswers() for operates in (True, False)}
+        self._known_answers = {operates: _KnownAnswers() for operates in (True, False)}
         self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
 
     def open(self) -> None:
@@ -372,7 +372,7 @@ class Plain:
             if not self._is_full(question, order):
                 call = _PlainCall(order.what(request), [question])
                 if request.id is not None:
-                    self._known[order.operates].begin(request, call)
+                    self._known_answers[order.operates].begin(request, call)
                 self._start(self._do(order, request, call), order)
         elif call.answer is None:
             call.waiting.append(question)
@@ -381,7 +381,7 @@ class Plain:
             question.close()
 
     def _known_call(self, order: _Order, request: PlainRequest) -> _PlainCall | None:
-        known = self._known[order.operates].of(request)
+        known = self._known_answers[order.operates].of(request)
         if known is not None and known.what != order.what(request):
             raise LocalProtocolError(
                 f"{order.camera}: id {request.id!r} was another call's; {order.name} was not done"
@@ -411,7 +411,7 @@ class Plain:
                 question.reply(question.key, call.answer)
                 question.close()
             if request.id is not None:
-                self._known[order.operates].end(call.answer)
+                self._known_answers[order.operates].end(call.answer)
 
     async def _bounded(self, order: _Order, request: PlainRequest) -> dict[str, Any]:
         """Carry out a call within its timeout.

@@ -51,7 +51,7 @@ class Topics:
     """
 
     def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:
-        self.who: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
+        self.identity: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
         self.keys: Keys = keys
         self.bus: Bus = bus
         self._any: dict[Kind, Publisher] = {}
@@ -224,7 +224,7 @@ class CameraTopics:
     def result(self, run: ResultRun) -> dict[str, Any]:
         """Return a result; ``run`` has one container."""
         fields = result_fields(run, self.interpretation, self._host.name)
-        return {**self._topics.who, **fields}
+        return {**self._topics.identity, **fields}
 
     def state(self) -> dict[str, Any]:
         """Return the fields of the camera's current state."""
@@ -233,7 +233,7 @@ class CameraTopics:
         word: int | None = state["status"]
         return {
             "camera": host.name,
-            **self._topics.who,
+            **self._topics.identity,
             "connected": state["connected"],
             "failure": str(host.failure or self.trouble),
             "status": word,
@@ -324,4 +324,4 @@ class CameraTopics:
     def _put_event(self, kind: str, fields: dict[str, Any], number: int) -> None:
         out = self._topics.subscribed("events", self._host.name)
         if out is not None:
-            out.put(as_json({**self._topics.who, "number": number, "event": kind, **fields}))
+            out.put(as_json({**self._topics.identity, "number": number, "event": kind, **fields}))

@@ -381,7 +381,7 @@ class Fleet:
         Raises:
             ConfigurationError: the pattern is not valid.
         """
-        return [self._known(name) for name in self.names(pattern)]
+        return [self._known_camera(name) for name in self.names(pattern)]
 
     def names(self, pattern: str = "**") -> list[str]:
         """Return the names of the cameras that agents share now.
@@ -402,7 +402,7 @@ class Fleet:
         url: str = self._address_of(check_name(name)).url
         return url
 
-    def _known(self, name: str) -> FleetCamera[Any]:
+    def _known_camera(self, name: str) -> FleetCamera[Any]:
         """Return a camera; in a large fleet it is met now, if it was not before."""
         camera = self._cameras.get(name)
         if camera is None:
@@ -435,7 +435,7 @@ class Fleet:
                 f"the fleet has no camera {name!r}; there are {names}"
                 f"{did_you_mean(name, self._agents)}"
             )
-        return self._known(name)
+        return self._known_camera(name)
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self._agents
@@ -779,7 +779,7 @@ class Fleet:
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):
             self._exchange.cover("results")
         for name in names:
-            results.add(self._known(name))
+            results.add(self._known_camera(name))
         if self._state == "closed":
             results.end()
         return results

@@ -143,7 +143,7 @@ class _Authority:
                 "this command made, or an empty one"
             )
         if not has_authority:
-            cls._found(place)
+            cls._authority_in(place)
         try:
             made = x509.load_pem_x509_certificate((place / CA_FILE).read_bytes())
         except (OSError, ValueError) as exc:
@@ -153,7 +153,7 @@ class _Authority:
         return cls(folder, made, _key_in(place))
 
     @staticmethod
-    def _found(place: Path) -> None:
+    def _authority_in(place: Path) -> None:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
 

@@ -89,7 +89,7 @@ def _divided(left: Number, right: Number) -> Number:
     return left / right
 
 
-def _rest(left: Number, right: Number) -> Number:
+def _remainder(left: Number, right: Number) -> Number:
     if isinstance(left, int) and isinstance(right, int):
         remainder = abs(left) % abs(right)
         return -remainder if left < 0 else remainder
@@ -129,7 +129,7 @@ _BINARY: Final[Mapping[str, Callable[[Number, Number], Number]]] = {
     "-": operator.sub,
     "*": operator.mul,
     "/": _divided,
-    "%": _rest,
+    "%": _remainder,
     "**": _power,
 }
 

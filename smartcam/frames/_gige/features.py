@@ -277,7 +277,7 @@ class GenicamFeatures:
 
     async def _entries_now(self, node: Element) -> dict[str, int]:
         return {
-            entry.name: _whole(entry.text_of("Value"))
+            entry.name: _integer(entry.text_of("Value"))
             for entry in node.all("EnumEntry")
             if await self._is_available(entry, 0)
         }
@@ -642,7 +642,7 @@ class GenicamFeatures:
         address = 0
         for child in node.children:
             if child.kind == "Address":
-                address += _whole(child.text)
+                address += _integer(child.text)
             elif child.kind == "pAddress":
                 address += int(await self._numbered(child.text, depth + 1))
             elif child.kind == "IntSwissKnife":
@@ -656,7 +656,7 @@ class GenicamFeatures:
     async def _index(self, index: Element, length: int, depth: int) -> int:
         offset: int | float = length
         if "Offset" in index.attributes:
-            offset = _whole(index.attributes["Offset"])
+            offset = _integer(index.attributes["Offset"])
         elif "pOffset" in index.attributes:
             offset = await self._numbered(index.attributes["pOffset"], depth + 1)
         return int(offset * await self._numbered(index.text, depth + 1))
@@ -709,7 +709,7 @@ class GenicamFeatures:
 
 def _number(text: str) -> int | float:
     try:
-        return _whole(text)
+        return _integer(text)
     except MessageError:
         pass
     try:
@@ -721,7 +721,7 @@ def _number(text: str) -> int | float:
     return number
 
 
-def _whole(text: str) -> int:
+def _integer(text: str) -> int:
     digits = text.strip()
     try:
         if len(digits) > 24:
@@ -733,7 +733,7 @@ def _whole(text: str) -> int:
 
 
 def _entries(node: Element) -> dict[str, int]:
-    return {entry.name: _whole(entry.text_of("Value")) for entry in node.all("EnumEntry")}
+    return {entry.name: _integer(entry.text_of("Value")) for entry in node.all("EnumEntry")}
 
 
 def _access(node: Element) -> tuple[str, str]:
@@ -742,11 +742,11 @@ def _access(node: Element) -> tuple[str, str]:
 
 
 def _on(node: Element) -> int:
-    return _whole(node.text_of("OnValue", "1"))
+    return _integer(node.text_of("OnValue", "1"))
 
 
 def _off(node: Element) -> int:
-    return _whole(node.text_of("OffValue", "0"))
+    return _integer(node.text_of("OffValue", "0"))
 
 
 def _signed(node: Element) -> bool:
@@ -762,7 +762,7 @@ def _span(node: Element, length: int) -> tuple[int, int]:
     if node.kind == "IntReg":
         return 0, 8 * length
     bit = node.text_of("Bit")
-    ends = [_whole(bit or node.text_of(kind)) for kind in ("LSB", "MSB")]
+    ends = [_integer(bit or node.text_of(kind)) for kind in ("LSB", "MSB")]
     low, high = min(ends), max(ends)
     if not 0 <= low <= high < 8 * length:
         raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")

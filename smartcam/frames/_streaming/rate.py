@@ -143,7 +143,7 @@ class RateControl:
         self._comes = 0.0
         self._flow = _Flow()
         self._weight = _Mean()  # size of a frame with quantization steps of 1, bytes
-        self._way = _Mean()  # seconds per byte on the way
+        self._transit = _Mean()  # seconds per byte on the way
         self._age, self._took = _Mean(), _Mean()
 
     @property
@@ -196,7 +196,7 @@ class RateControl:
         # a frame that is long on its way is counted only once
         of_late = max(seconds, took)
         self._weight.add(size * _steps(had) ** SIZE_EXPONENT, of_late)
-        self._way.add(took / size, of_late)
+        self._transit.add(took / size, of_late)
         self._age.add(age, of_late)
         self._took.add(took, of_late)
         self._follow(seconds)
@@ -231,7 +231,7 @@ class RateControl:
             elif self._quality >= best:
                 why = "the best quality"
         self._why = why
-        self._tell()
+        self._notify()
 
     def _wanted(self) -> tuple[float, float, str]:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
@@ -242,7 +242,7 @@ class RateControl:
             comes = min(most, max(fewest, self._comes or most))
             limits.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
         if self._latency is not None:
-            size = max(1.0, (self._latency - self._age.value) / self._way.value)
+            size = max(1.0, (self._latency - self._age.value) / self._transit.value)
             limits.append(
                 (size, max(most * size / smallest, FREE_SHARE / self._took.value), "latency")
             )
@@ -257,7 +257,7 @@ class RateControl:
     def _bytes(self, quality: float) -> float:
         return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         back = self._fps == self._rates[1] != self._told_fps
         if back or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._told_fps < LOGGED_CHANGE_FACTOR:
             self._told_fps = self._fps

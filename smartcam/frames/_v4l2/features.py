@@ -78,8 +78,8 @@ class ControlFeature:
     def __init__(self, control: DeviceControl) -> None:
         self.control = control
         known = SFNC.get(control.number)
-        self._known = known or SfncFeature(control.name)
-        entries = dict(self._known.entries)
+        self._sfnc_feature = known or SfncFeature(control.name)
+        entries = dict(self._sfnc_feature.entries)
         if self.name == "ExposureAuto" and 0 not in control.menu:
             entries[APERTURE_PRIORITY] = entries.pop(0)
         values = control.menu or entries
@@ -88,7 +88,7 @@ class ControlFeature:
     @property
     def name(self) -> str:
         """Name of the feature."""
-        return self._known.name
+        return self._sfnc_feature.name
 
     @property
     def spellings(self) -> set[str]:
@@ -103,7 +103,9 @@ class ControlFeature:
             return self._entries.get(number, str(number))
         if self.control.kind == "boolean":
             return bool(number)
-        return number if self._known.factor == 1 else float(number * self._known.factor)
+        return (
+            number if self._sfnc_feature.factor == 1 else float(number * self._sfnc_feature.factor)
+        )
 
     def number(self, value: FeatureValue) -> int | None:
         """Return the control's number for a value; None: the device has no such value."""
@@ -111,12 +113,12 @@ class ControlFeature:
             wanted = spelled(str(value))
             names = self._entries.items()
             return next((number for number, name in names if spelled(name) == wanted), None)
-        if isinstance(value, float) and self._known.factor == 1:
+        if isinstance(value, float) and self._sfnc_feature.factor == 1:
             return self.control.number_of(int(value)) if value.is_integer() else None
-        if not isinstance(value, float) and self._known.factor == 1:
+        if not isinstance(value, float) and self._sfnc_feature.factor == 1:
             return self.control.number_of(value)
         try:
-            number = round(float(value) / self._known.factor)
+            number = round(float(value) / self._sfnc_feature.factor)
         except (ValueError, OverflowError):
             return None
         inside = self.control.least <= number <= self.control.most
@@ -132,7 +134,7 @@ class ControlFeature:
         elif control.flags & abi.CTRL_WRITE_ONLY or control.kind == "button":
             access = "wo"
         kind: FeatureKind = "enumeration" if self._entries else _KINDS[control.kind]
-        factor = self._known.factor
+        factor = self._sfnc_feature.factor
         if factor != 1:
             kind = "float"
         ranged = kind in ("integer", "float") and control.kind != "bitmask"
@@ -144,7 +146,7 @@ class ControlFeature:
             minimum=control.least * factor if ranged else None,
             maximum=control.most * factor if ranged else None,
             step=max(1, control.step) * factor if ranged else None,
-            unit=self._known.unit,
+            unit=self._sfnc_feature.unit,
             entries=tuple(self._entries.values()),
             description=f"V4L2 control {control.name}",
         )
@@ -173,11 +175,11 @@ class V4L2Features(DeviceFeatures):
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
-        return (await self._found(name)).described()
+        return (await self._feature_named(name)).described()
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""
-        feature = await self._found(name)
+        feature = await self._feature_named(name)
         value = feature.value(feature.control.value)
         if value is None:
             raise self._wrong(feature, "it has no value that can be read")
@@ -185,7 +187,7 @@ class V4L2Features(DeviceFeatures):
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a feature; return the device's new value."""
-        feature = await self._found(name)
+        feature = await self._feature_named(name)
         if feature.control.kind == "button":
             raise self._wrong(feature, "it is a command: it is executed")
         number = feature.number(value)
@@ -197,12 +199,12 @@ class V4L2Features(DeviceFeatures):
 
     async def execute(self, name: str) -> None:
         """Execute a command."""
-        feature = await self._found(name)
+        feature = await self._feature_named(name)
         if feature.control.kind != "button":
             raise self._wrong(feature, "it is no command: it is set")
         await self._driver.set_control(feature.control.name, 1)
 
-    async def _found(self, name: str) -> ControlFeature:
+    async def _feature_named(self, name: str) -> ControlFeature:
         features = await self._all()
         wanted = spelled(name)
         for feature in features:

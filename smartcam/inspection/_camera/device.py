@@ -195,7 +195,7 @@ class SoftwareDevice(Server):
         try:
             await self.emulator.start()
         except BaseException:
-            await self._rest()
+            await self._stop_parts()
             raise
 
     async def stop(self) -> None:
@@ -206,9 +206,9 @@ class SoftwareDevice(Server):
         try:
             await self.emulator.stop()
         finally:
-            await self._rest()
+            await self._stop_parts()
 
-    async def _rest(self) -> None:
+    async def _stop_parts(self) -> None:
         """Stop the inspector and the keeper of pictures."""
         try:
             await self.inspector.stop()

@@ -40,8 +40,8 @@ class JudgedResults(Observer):
         session: function that returns the number of the device's session (0: no session) and the
             last report of a run.
         received: function that returns the number of containers that the client has received.
-        on_found: function that is called with each result and its picture, before other observers get
-            the result.
+        on_found: function that is called with each result and its picture, before other observers
+            get the result.
         max_kept: number of last results whose pictures are kept for :meth:`judged_of`.
     """
 
@@ -53,14 +53,14 @@ class JudgedResults(Observer):
         *,
         max_kept: int = MAX_KEPT,
     ) -> None:
-        self._session, self._received, self._found = session, received, on_found
+        self._session, self._received, self._on_found = session, received, on_found
         self._max_kept = max_kept
         self._number = 0  # number of the session
         self._sent = 0  # number of containers sent in the session
         self._report: LastReport | None = None
         self._before = 0  # number of containers that the client received before the session
         self._pending: dict[int, _SentContainer] = {}  # containers by their count in the session
-        self._kept: collections.OrderedDict[tuple[int, datetime], Judged] = (
+        self._judged: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
         )
 
@@ -91,11 +91,11 @@ class JudgedResults(Observer):
             del self._pending[older]  # their results were not awaited
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return
-        self._kept[result.number, result.received_at] = sent.judged
-        if len(self._kept) > self._max_kept:
-            self._kept.popitem(last=False)
-        self._found(result, sent.judged)
+        self._judged[result.number, result.received_at] = sent.judged
+        if len(self._judged) > self._max_kept:
+            self._judged.popitem(last=False)
+        self._on_found(result, sent.judged)
 
     def judged_of(self, result: Result) -> Judged | None:
         """Return the picture of a recent result; None if it is no longer kept."""
-        return self._kept.get((result.number, result.received_at))
+        return self._judged.get((result.number, result.received_at))

@@ -186,7 +186,7 @@ class Locate(Tool[LocateSettings]):
             wanted = f"{least} or more" if self.settings.count is None else wanted
             text = f"{count} found, expected {wanted}"
             if count < least:
-                text += _near(nearest, len(self.models) > 1)
+                text += _nearest_text(nearest, len(self.models) > 1)
             return text
         for part, pose in zip(located.parts, poses, strict=True):
             if part.doubt:
@@ -251,7 +251,7 @@ def _values(located: Located) -> dict[str, Any]:
     return {"count": len(located.parts), "best_score": 0.0 if best is None else best}
 
 
-def _near(nearest: LocatedPart | None, named: bool) -> str:
+def _nearest_text(nearest: LocatedPart | None, named: bool) -> str:
     if nearest is None:
         return "; nothing in the picture resembles it"
     name = f"{nearest.name} " if named else ""

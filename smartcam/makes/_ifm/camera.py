@@ -261,7 +261,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return "\t".join(f"{count:010}" for count in counts) if self.active else "!"
 
     @request(r"G\?")
-    def _who(self, call: IfmClient) -> str:
+    def _identity(self, call: IfmClient) -> str:
         """Return maker, article, name, place, description, address, ports and time settings."""
         return "\t".join(
             ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK)

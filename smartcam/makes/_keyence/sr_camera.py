@@ -98,9 +98,9 @@ class EmulatedSr(LineCamera):
             return
         self._reading, self._code, self._run = call, None, self._run + 1
         run = self._run
-        self.after(self.reading_time, lambda: self._found(run))
+        self.after(self.reading_time, lambda: self._read_code(run))
 
-    def _found(self, run: int) -> None:
+    def _read_code(self, run: int) -> None:
         """Read the present code, in the current reading."""
         if run != self._run or self._reading is None:
             return

@@ -45,7 +45,7 @@ class TransferFiles:
     """
 
     def __init__(self, server: Any, own_index: int) -> None:
-        self._server, self._own = server, own_index
+        self._server, self._own_index = server, own_index
         self._files: dict[int, _OpenFile] = {}
         self._numbers = itertools.count(1)
         self._closing: set[asyncio.Task[None]] = set()
@@ -97,7 +97,7 @@ class TransferFiles:
             self._server.get_node(nodes.id(_TRANSFER)),
             self._server.get_node(ua.NodeId(ua.ObjectIds.FileType)),
             nodeid=root,
-            bname=ua.QualifiedName(f"File{number}", self._own),
+            bname=ua.QualifiedName(f"File{number}", self._own_index),
             instantiate_optional=False,
         )
         for name, value, of in (
@@ -106,10 +106,10 @@ class TransferFiles:
             ("Writable", False, ua.VariantType.Boolean),
             ("UserWritable", False, ua.VariantType.Boolean),
         ):
-            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
             await node.write_value(value, of)
         for name, call in self._calls(number).items():
-            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
             self._server.link_method(node, call)
         return self._server.get_node(root)
 

@@ -190,16 +190,16 @@ class Methods:
             meas: Any, part: Any, recipe: Any, product: Any, _more: Any
         ) -> list[ua.Variant]:
             ids = (
-                self._given("MeasIdDataType", meas),
-                self._given("PartIdDataType", part),
-                self._given("ProductIdDataType", product),
+                self._client_id("MeasIdDataType", meas),
+                self._client_id("PartIdDataType", part),
+                self._client_id("ProductIdDataType", product),
             )
             job = self._system.start_job(ids, _text(recipe), single=single)
             return [self._id("JobIdDataType", job.id)]
 
         return start
 
-    def _given(self, kind: str, value: Any) -> Any:
+    def _client_id(self, kind: str, value: Any) -> Any:
         """Return the client's id, which the result will carry; None without one."""
         text, description = _text(value), getattr(value, "Description", None)
         if not text and description is None:
@@ -269,7 +269,7 @@ class Methods:
 
     # ------------------------------------------------------------------ results
 
-    def _kept(self, result: Any) -> KeptResult:
+    def _kept_result(self, result: Any) -> KeptResult:
         text = _text(result)
         kept_result = self._book.get(text, self._nodes.name)
         if kept_result is None:
@@ -277,12 +277,12 @@ class Methods:
         return kept_result
 
     async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
-        kept_result = self._kept(result)
+        kept_result = self._kept_result(result)
         value = ua.Variant(kept_result.value, ua.VariantType.ExtensionObject)
         return [_number(self._book.handle(timeout)), value]
 
     async def _components(self, result: Any, timeout: int) -> list[ua.Variant]:
-        value = self._kept(result).value
+        value = self._kept_result(result).value
         handle = _number(self._book.handle(timeout))
         outputs = [_boolean(bool(value.HasTransferableDataOnFile)), handle]
         for name, of in _COMPONENTS:

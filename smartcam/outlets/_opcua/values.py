@@ -124,7 +124,7 @@ class VisionValues:
     """
 
     def __init__(self, server: Any, machine_vision: int, own_index: int) -> None:
-        self._server, self._vision, self._own = server, machine_vision, own_index
+        self._server, self._vision, self._own_index = server, machine_vision, own_index
         self._structures: dict[tuple[str, int, tuple[Column, ...]], Structure] = {}
         base: Any = getattr(ua, "BinaryIdBaseDataType")  # noqa: B009 - made from the nodeset
         self._classes: dict[str, Any] = {
@@ -217,11 +217,11 @@ class VisionValues:
         key = f"types.{camera}.App{application}.{digest}"
         node = await create_data_type(
             self._server.nodes.base_structure_type,
-            ua.NodeId(key, self._own),
-            ua.QualifiedName(name, self._own),
+            ua.NodeId(key, self._own_index),
+            ua.QualifiedName(name, self._own_index),
         )
         encoding = await create_encoding(
-            node, ua.NodeId(f"{key}.Binary", self._own), ua.QualifiedName("Default Binary", 0)
+            node, ua.NodeId(f"{key}.Binary", self._own_index), ua.QualifiedName("Default Binary", 0)
         )
         definition = ua.StructureDefinition()
         definition.BaseDataType = self._server.nodes.base_structure_type.nodeid

@@ -144,7 +144,7 @@ class Codec:
 
     __slots__ = (
         *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
-        *("_known", "_meaning", "_omitted", "_status"),
+        *("_messages", "_meaning", "_omitted", "_status"),
         *("has_data", "message_id", "names", "size", "type"),
     )
 
@@ -169,7 +169,7 @@ class Codec:
         coded = answers and dialect.coded and "code" in self._fields
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
-        self._known: dict[bytes, Message] = {}  # received bodies; messages are immutable
+        self._messages: dict[bytes, Message] = {}  # received bodies; messages are immutable
         # fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [_filler(row.type, name) for name in self.names]
         self._omitted = [
@@ -229,14 +229,14 @@ class Codec:
             data = bytes(buffer[behind:end])
             return self._make((*self._body.unpack_from(buffer, begin), data))
         body = bytes(buffer[begin:behind])
-        message = self._known.get(body)
+        message = self._messages.get(body)
         if message is None:
             values = self._body.unpack(body)
             if self._status is not None:
                 values = (self._status.read(values[0]), *values[1:])
             message = self._make(values)
-            if len(self._known) < MAX_KNOWN:
-                self._known[body] = message
+            if len(self._messages) < MAX_KNOWN:
+                self._messages[body] = message
         return message
 
     def spell(self, body: bytes) -> dict[str, Any]:

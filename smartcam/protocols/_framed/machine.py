@@ -141,8 +141,8 @@ TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transition
 _NEXT_STATES: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
     (state, sender): {
         kind: following
-        for (before, who, kind), following in TRANSITIONS.items()
-        if (before, who) == (state, sender)
+        for (before, by, kind), following in TRANSITIONS.items()
+        if (before, by) == (state, sender)
     }
     for state in State
     for sender in m.Sender

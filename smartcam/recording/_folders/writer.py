@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
 from smartcam.recording._folders.files import FolderFiles, Limits
@@ -76,8 +76,8 @@ class FolderWriter:
         folder: folder that holds the files.
         limits: bounds on the files.
         compress: function that compresses a chunk.
-        report: function that is called in the thread with the error when nothing can be written, and
-            with None when it can again.
+        report: function that is called in the thread with the error when nothing can be written,
+            and with None when it can again.
         clock: function that returns the time in seconds, for the files' age and delays.
 
     Attributes:
@@ -92,7 +92,7 @@ class FolderWriter:
         report: Callable[[RecordingError | None], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._tell, self._clock = folder, report, clock
+        self._folder, self._report, self._clock = folder, report, clock
         self._files = FolderFiles(folder, limits, compress, clock)
         self._more = threading.Condition()
         self._waiting = _DiskQueue()
@@ -100,7 +100,7 @@ class FolderWriter:
         self._tracks: dict[str, CameraTrack] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def forked(self) -> None:
         """Write nothing in a fork of the process that has the folder; leave out all records."""
@@ -287,11 +287,11 @@ class FolderWriter:
         self._trouble = _Trouble(failure, reason, full, again, tries)
         if before is None:
             logger.warning("%s; nothing is recorded until it is better", failure)
-            self._tell(failure)
+            self._report(failure)
 
     def _heal(self) -> None:
         """Note that the disk works again."""
         if self._trouble is not None:
             self._trouble = None
             logger.warning("recordings %s: recorded again", self._folder.path)
-            self._tell(None)
+            self._report(None)

@@ -52,7 +52,7 @@ class FrameTexts:
     def __init__(self) -> None:
         # text before and after the data, by the kind of frame. The dialect is kept as well, since
         # its id in memory could otherwise be reused
-        self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
+        self._texts: dict[tuple[object, ...], tuple[str, str, object]] = {}
 
     def text(self, raw: RawFrame) -> tuple[str, str]:
         """Return a frame's text, as from :func:`frame_text`, and its data as hex.
@@ -67,17 +67,17 @@ class FrameTexts:
             entry = raw.entry()
             return frame_text(entry), body_of(entry)
         kind = raw.camera, id(dialect), frame.message_id, payload[:begins], len(payload)
-        data, known = payload[begins:].hex(), self._known.get(kind)
+        data, known = payload[begins:].hex(), self._texts.get(kind)
         if known is None:
             entry = raw.entry()
             text = frame_text(entry)
             before = f'{{"at":{text_of(raw.at)}'
             behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
             if text.startswith(before) and text.endswith(data + behind):
-                if len(self._known) >= MAX_CACHED_FRAME_TEXTS:
-                    self._known.clear()
+                if len(self._texts) >= MAX_CACHED_FRAME_TEXTS:
+                    self._texts.clear()
                 front = text[len(before) : len(text) - len(data) - len(behind)]
-                self._known[kind] = front, behind, dialect
+                self._texts[kind] = front, behind, dialect
             return text, body_of(entry)
         return f'{{"at":{text_of(raw.at)}{known[0]}{data}{known[1]}', data
 

@@ -61,7 +61,7 @@ class ReplayedPictures:
         self.shown: Frame | None = None
         self.sinks: set[FrameSink] = set()
         self._speed, self._began = speed, 0.0
-        self._given: collections.Counter[tuple[int, bytes]] = collections.Counter()
+        self._times_given: collections.Counter[tuple[int, bytes]] = collections.Counter()
         self._pictures = _by_application(recording, camera, applications)
         self.first: Frame | None = next(
             (
@@ -87,8 +87,8 @@ class ReplayedPictures:
         pictures = self._pictures.get(key)
         chosen = None
         if pictures:
-            chosen = pictures[self._given[key] % len(pictures)]
-            self._given[key] += 1
+            chosen = pictures[self._times_given[key] % len(pictures)]
+            self._times_given[key] += 1
         if chosen is None:
             self.shown = None
             return

@@ -240,22 +240,22 @@ class _GapSteps:
     """
 
     def __init__(self) -> None:
-        self._whole = False  # whether all earlier items are known
+        self._is_complete = False  # whether all earlier items are known
 
     def steps(self, item: Item | RecordedState, at: float) -> list[_ReplayStep]:
         """Return the steps of an item, at a time that does not decrease."""
         if isinstance(item, RecordedError) and item.error == GAP:
-            self._whole = False
+            self._is_complete = False
             return [_ReplayStep(at, _StepKind.LOST)]
         if not isinstance(item, RecordedState):
-            self._whole = True
+            self._is_complete = True
             return []
         if not item.connected:
-            self._whole = False
+            self._is_complete = False
             return [_ReplayStep(at, _StepKind.LOST)]
-        if self._whole:
+        if self._is_complete:
             return []
-        self._whole = True
+        self._is_complete = True
         steps = [_ReplayStep(at, _StepKind.CONNECTED)]
         if item.application is not None:
             steps.append(_ReplayStep(at, _StepKind.NAMED, item.application))

@@ -77,7 +77,7 @@ class CameraPictures:
         self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
         self.frame_id: str = frame_id or f"{node.name}_optical"
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
-        self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
+        self._requests = PictureRequests(node, self.frame_id, self._lens, self._publish_one)
         self._ends: list[Any] = []
         self._streams: list[SubscribedPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
@@ -162,7 +162,7 @@ class CameraPictures:
         quality = None if encoding == "raw" else self._quality
         return self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
 
-    async def _one(self, timeout: float) -> Frame:
+    async def _publish_one(self, timeout: float) -> Frame:
         frame = await one_frame(self._frames, self._camera, timeout)
         self._size = (frame.width, frame.height)
         return frame
@@ -171,7 +171,7 @@ class CameraPictures:
         if self._frames is not None:
             return self._frames.format.width, self._frames.format.height
         if self._size is None:
-            await self._one(SIZE_TIMEOUT)
+            await self._publish_one(SIZE_TIMEOUT)
         return self._size or (0, 0)
 
     # ------------------------------------------------------------------ messages

@@ -167,9 +167,9 @@ class TransformListener:
                 task.add_done_callback(self._tasks.discard)
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = loop.call_later(LINGER, self._rest)
+        self._timer = loop.call_later(LINGER, self._unsubscribe)
 
-    def _rest(self) -> None:
+    def _unsubscribe(self) -> None:
         """Unsubscribe, and forget all transforms."""
         if self._timer is not None:
             self._timer.cancel()
@@ -182,7 +182,7 @@ class TransformListener:
 
     async def close(self) -> None:
         """Unsubscribe. Idempotent."""
-        self._rest()
+        self._unsubscribe()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _take(self, subscription: Any, *, static: bool) -> None:

@@ -47,7 +47,7 @@ class NativeParameters(RosParameters):
         self.undeclare(SIM_TIME)
         self._native = node
         self._ros: Any = None
-        self._own = threading.local()  # set while this object sets a value in rclpy
+        self._own_change = threading.local()  # set while this object sets a value in rclpy
 
     def open(self) -> None:
         """Declare the parameters in ROS."""
@@ -63,7 +63,7 @@ class NativeParameters(RosParameters):
 
     # ------------------------------------------------------------------ from here to ROS
 
-    def _tell(self, **lists: Any) -> None:
+    def _change_parameters(self, **lists: Any) -> None:
         """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
@@ -77,20 +77,20 @@ class NativeParameters(RosParameters):
                 self._put(lambda name=name: self._ros.undeclare_parameter(name))
 
     def _put(self, do: Any) -> Any:
-        self._own.now = True
+        self._own_change.now = True
         try:
             return do()
         except Exception as exc:  # noqa: BLE001 - rclpy may raise any error
             logger.warning("%s ! a parameter: %s", self._native.full_name, exc)
         finally:
-            self._own.now = False
+            self._own_change.now = False
 
     def _declare_in_ros(self, name: str) -> None:
         description = self.describe(name)
         kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
         descriptor = to_ros(kind, description.encode(), class_of(kind.name))
         given = self._parameter(name)
-        self._own.now = True
+        self._own_change.now = True
         try:
             made = self._ros.declare_parameter(
                 name, given.value, descriptor, ignore_override=description.read_only
@@ -99,7 +99,7 @@ class NativeParameters(RosParameters):
             del self._declared[name]
             raise ConfigurationError(f"parameter {name!r}: {exc!s:.300}") from exc
         finally:
-            self._own.now = False
+            self._own_change.now = False
         if made.value != given.value:
             self._begin_with(name, decode_value(made.get_parameter_value()))
 
@@ -113,7 +113,7 @@ class NativeParameters(RosParameters):
             except SmartCamError as exc:
                 logger.warning("%s ! parameter %s: %s", self._native.full_name, name, exc)
                 _asked_by_ros.set(False)
-                self._tell(changed=[name])
+                self._change_parameters(changed=[name])
 
         task = asyncio.get_running_loop().create_task(begin())
         self._tasks.add(task)
@@ -133,7 +133,7 @@ class NativeParameters(RosParameters):
     def _on_set(self, parameters: Sequence[Any]) -> Any:
         """Accept or refuse values; called in the thread that sets them, which waits for hooks."""
         result = class_of("rcl_interfaces/msg/SetParametersResult")
-        if getattr(self._own, "now", False):
+        if getattr(self._own_change, "now", False):
             return result(successful=True)
         try:
             self._carry_out({parameter.name: parameter for parameter in parameters})

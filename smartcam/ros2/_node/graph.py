@@ -88,7 +88,7 @@ class RosGraph:
             del ends[token]
             if not ends:
                 del self._by_name[known.name, known.kind]
-            self._tell(known, False)
+            self._notify_watchers(known, False)
             return
         try:
             entity = Entity.parse(token)
@@ -103,9 +103,9 @@ class RosGraph:
         self._entities[token] = entity
         self._by_gid[entity.gid] = entity
         self._by_name.setdefault((entity.name, entity.kind), {})[token] = entity
-        self._tell(entity, True)
+        self._notify_watchers(entity, True)
 
-    def _tell(self, entity: Entity, present: bool) -> None:
+    def _notify_watchers(self, entity: Entity, present: bool) -> None:
         for listener in tuple(self._listeners):
             try:
                 listener(entity, present)

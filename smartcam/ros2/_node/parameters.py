@@ -176,7 +176,7 @@ class RosParameters:
         made = _Declared(described, first, on_set)
         made.fitting(first, by_node=True)
         self._declared[name] = made
-        self._tell(new=[name])
+        self._notify(new=[name])
 
     def undeclare(self, name: str) -> None:
         """Remove a parameter.
@@ -186,7 +186,7 @@ class RosParameters:
         """
         gone = self._of(name)
         del self._declared[name]
-        self._tell(deleted={name: gone.value})
+        self._notify(deleted={name: gone.value})
 
     def names(self) -> list[str]:
         """Return the names, in the order of their declaration."""
@@ -234,7 +234,7 @@ class RosParameters:
         fitted = declared.fitting(value, by_node=True)
         if fitted != declared.value:
             declared.value = fitted
-            self._tell(changed=[name])
+            self._notify(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
         """Set a parameter like another node.
@@ -301,7 +301,7 @@ class RosParameters:
             raise
         for change in changes:
             change.declared.value = change.new
-        self._tell(changed=[value for value in values if value in self._declared])
+        self._notify(changed=[value for value in values if value in self._declared])
 
     async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
         """Undo changes; a change that cannot be undone stays, and is published and logged."""
@@ -314,7 +314,7 @@ class RosParameters:
                 text = f"parameter {name!r} stays {change.new}: it was not taken back: {exc}"
                 logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - it is said
                 why.add_note(text)
-                self._tell(changed=[name])
+                self._notify(changed=[name])
 
     async def _call(self, declared: _Declared, value: Typed) -> None:
         """Call the hook with a value.
@@ -343,7 +343,7 @@ class RosParameters:
             logger.exception("%s ! on_set of parameter %r failed", self._node.full_name, name)
             raise RosError(f"parameter {name!r}: {type(exc).__name__}: {exc!s:.200}") from exc
 
-    def _tell(self, **lists: Any) -> None:
+    def _notify(self, **lists: Any) -> None:
         if self._services is not None:
             self._services.tell(**lists)
 

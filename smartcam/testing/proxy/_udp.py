@@ -58,7 +58,7 @@ class _Peer(Proxied):
             self._sock.close()
             raise
         self._loop.add_reader(self._sock, self._receive)
-        self._seen: Counter[Direction] = Counter()
+        self._datagrams: Counter[Direction] = Counter()
         self._lines = {direction: self._line(direction) for direction in DIRECTIONS}
         self._rules: dict[Direction, list[tuple[DatagramRule, Random]]] = {
             direction: [] for direction in DIRECTIONS
@@ -72,12 +72,12 @@ class _Peer(Proxied):
                 if isinstance(rule, DatagramRule) and rule.concerns(self.number, direction):
                     seed = f"{rule.seed}:{self.number}:{direction}"
                     chance = Random(seed)  # noqa: S311 - no secret
-                    self._rules[direction].append((rule.ahead(self._seen[direction]), chance))
+                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), chance))
 
     def take(self, direction: Direction, data: bytes) -> None:
         """Apply the rules to a datagram."""
-        self._seen[direction] += 1
-        number = self._seen[direction]
+        self._datagrams[direction] += 1
+        number = self._datagrams[direction]
         if direction in self._relay.stalled:
             self.note("stall", direction, number)
             return

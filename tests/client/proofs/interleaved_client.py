@@ -379,7 +379,15 @@ class Client:
             )
             for one in known
         )
-        memory = (last, evidence, at.doubted, at.satisfied, at._last_number, at._turn, at._given)
+        memory = (
+            last,
+            evidence,
+            at.doubted,
+            at.satisfied,
+            at._last_number,
+            at._turn,
+            at._newest_given,
+        )
         given_up = tuple(at._given_up.items())
         numbered = self.results._numbering is not None
         return self.state._last_status, numbered, call, waiting, owed, memory, given_up

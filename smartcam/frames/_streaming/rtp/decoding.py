@@ -89,7 +89,7 @@ class UnitDecoding:
         self._size = plan.size or (plan.coding.size_in(plan.sets) if plan.sets else None)
         self._loop = asyncio.get_running_loop()
         self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
-        self._came = asyncio.Event()
+        self._arrived = asyncio.Event()
         self.overflows = 0
         self._source: UnitSource | None = None
         self._skipped = 0  # number of units dropped since the last decoded one
@@ -163,7 +163,7 @@ class UnitDecoding:
             except Exception as exc:  # noqa: BLE001 - passed on to readers
                 self._fail(exc)
         if self._units:
-            self._came.set()
+            self._arrived.set()
 
     def _fail(self, exc: Exception) -> None:
         """Report an error of any kind to the sink."""
@@ -178,9 +178,9 @@ class UnitDecoding:
         try:
             while not self._ended:
                 if not self._units:
-                    self._came.clear()
+                    self._arrived.clear()
                     self._idle = True
-                    await self._came.wait()
+                    await self._arrived.wait()
                 self._idle = False
                 if self._units:
                     await self._decode_next()

@@ -189,7 +189,7 @@ class _RtpStream:
             plan.payload,
             plan.repair,
             self._decoding.take,
-            self._gone,
+            self._on_goodbye,
             (plan.only,) * bool(plan.only),
         )
 
@@ -216,7 +216,7 @@ class _RtpStream:
         """Return the counts of packets received."""
         return self._receiver.statistics(self._decoding.overflows)
 
-    def _gone(self, reason: str) -> None:
+    def _on_goodbye(self, reason: str) -> None:
         why = f" ({reason})" if reason else ""
         self._decoding.over(FrameSourceError(f"{self._plan.name}: the sender said goodbye{why}"))
 

@@ -140,7 +140,7 @@ class StreamReceiver:
         proofs: int = 0,
     ) -> None:
         self._pair, self._payload_type, self._repair = pair, payload_type, repair
-        self._done, self._gone, self._only = done, gone, only
+        self._done, self._on_goodbye, self._only = done, gone, only
         self._agreed = agreed
         self._loop = asyncio.get_running_loop()
         self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, kind, wary=True)
@@ -151,7 +151,7 @@ class StreamReceiver:
         self._reports_to: tuple[Any, ...] = ()
         self._ssrc = secrets.randbits(32)
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
-        self._asked: dict[int, float] = {}
+        self._requested_at: dict[int, float] = {}
         self._vain = 0
         self._repaired = self._strange = self._packets = 0
         self._made: list[AccessUnit] = []
@@ -221,7 +221,7 @@ class StreamReceiver:
         self.last_packet_at = now = self._loop.time()
         self._packets += 1
         ours.packet(packet, now)
-        if self._asked.pop(packet.sequence, None) is not None:
+        if self._requested_at.pop(packet.sequence, None) is not None:
             self._repaired += 1
             self._vain = 0
         self._made += self._depacketizer.take(packet, now)
@@ -244,7 +244,7 @@ class StreamReceiver:
         self._sender = sender
         if self._reports_to[:1] != sender[:1]:
             self._reports_to = (sender[0], sender[1] + 1, *sender[2:])
-        self._asked.clear()
+        self._requested_at.clear()
         self._vain = 0
         self._report()
         self.want_picture()
@@ -288,7 +288,7 @@ class StreamReceiver:
         self._made += self._depacketizer.end_marked(now - MARKER_GRACE)
         if self._depacketizer.lost > lost:
             self._vain += 1
-            self._asked.clear()
+            self._requested_at.clear()
             self.want_picture()
         elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
             tail = self._depacketizer.tail()
@@ -314,16 +314,16 @@ class StreamReceiver:
         return self._depacketizer.tail() is not None
 
     def _ask(self, missing: list[int], now: float) -> None:
-        asked_at = self._asked
+        asked_at = self._requested_at
         due = [
             number
             for number in missing
             if now - asked_at.get(number, float("-inf")) >= RESEND_INTERVAL
         ]
         if due and self._reception is not None:
-            self._asked = {number: asked_at.get(number, now) for number in missing} | dict.fromkeys(
-                due, now
-            )
+            self._requested_at = {
+                number: asked_at.get(number, now) for number in missing
+            } | dict.fromkeys(due, now)
             self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
     def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
@@ -346,7 +346,7 @@ class StreamReceiver:
             if report.ntp >> 32:  # a sender without a clock sends 0
                 ours.sender(report, self._loop.time())
         elif isinstance(report, wire.Goodbye) and ours.ssrc in report.ssrcs:
-            self._gone(report.reason)
+            self._on_goodbye(report.reason)
 
     def _report(self) -> None:
         self._send_report()

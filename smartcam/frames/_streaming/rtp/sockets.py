@@ -59,7 +59,7 @@ class Endpoint(NamedTuple):
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-async def resolved(host: str, port: int, who: str) -> Endpoint:
+async def resolved(host: str, port: int, label: str) -> Endpoint:
     """Return a host's address.
 
     Raises:
@@ -70,7 +70,7 @@ async def resolved(host: str, port: int, who: str) -> Endpoint:
         addresses = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as exc:
         raise FrameSourceError(
-            f"{who}: no address of {host!r} is known: {exc}", source=who
+            f"{label}: no address of {host!r} is known: {exc}", source=label
         ) from exc
     family, *_, where = addresses[0]
     return Endpoint(family, str(where[0]), port)

@@ -96,7 +96,7 @@ class RequestParser:
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # number of searched bytes without an end of line
+        self._searched = 0  # number of searched bytes without an end of line
         self._start: tuple[str, str] | None = None  # method and URL
         self._headers: dict[str, str] = {}
 
@@ -155,17 +155,17 @@ class RequestParser:
 
     def _line(self, body: int = 0) -> bytes | None:
         """Return the next line, the last of a header only with its complete body; else None."""
-        end = self._data.find(b"\n", self._seen)
+        end = self._data.find(b"\n", self._searched)
         if end < 0 or end > MAX_LINE_BYTES:
-            self._seen = len(self._data)
-            if end > 0 or self._seen > MAX_LINE_BYTES:
+            self._searched = len(self._data)
+            if end > 0 or self._searched > MAX_LINE_BYTES:
                 _refuse(f"a line: expected {MAX_LINE_BYTES} bytes at most, got more")
             return None
         line = bytes(self._data[:end]).removesuffix(b"\r")
         if not line and len(self._data) - end - 1 < body:
             return None
         del self._data[: end + 1]
-        self._seen = 0
+        self._searched = 0
         return line
 
     def _add_header(self, line: bytes) -> None:

@@ -82,7 +82,7 @@ class AnswerParser:
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # number of searched bytes without the end of a header
+        self._searched = 0  # number of searched bytes without the end of a header
         self._strays = 0
         self._channels = set(USUAL_CHANNELS)
         self._head: ServerAnswer | ServerRequest | None = None
@@ -128,7 +128,7 @@ class AnswerParser:
         if gone:
             self._strays += len(self._data[:gone].strip(b"\r\n\0 "))
             del self._data[:gone]
-            self._seen = 0
+            self._searched = 0
         if match is None or not self._strays or self._data[:1] != b"$":
             return match is not None
         if len(self._data) <= 4:  # after skipped bytes, a dollar may be data
@@ -156,16 +156,16 @@ class AnswerParser:
 
         Lines may end by either character, or by both.
         """
-        match = _HEAD_ENDS.search(self._data, max(0, self._seen - 10))
+        match = _HEAD_ENDS.search(self._data, max(0, self._searched - 10))
         size = match.end() if match else len(self._data)
         if size > MAX_HEAD_BYTES:
             raise MessageError(f"RTSP: an answer: expected lines of {MAX_HEAD_BYTES} bytes at most")
         if match is None:
-            self._seen = size
+            self._searched = size
             return False
         lines = bytes(self._data[:size]).replace(b"\r", b"").split(b"\n")
         del self._data[:size]
-        self._seen = 0
+        self._searched = 0
         self._head = _message(lines[0], _headers(lines[1:]))
         if self._head is not None:
             self._strays = 0

@@ -115,7 +115,7 @@ class RtspLink(asyncio.Protocol):
         """
         async with self._turn:
             for refusals in range(1, MAX_REFUSALS + 1):
-                answer = await self._asked(method, url, headers or {}, body)
+                answer = await self._request_bytes(method, url, headers or {}, body)
                 if answer.status != 401:
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
@@ -133,7 +133,7 @@ class RtspLink(asyncio.Protocol):
             cure = "wrong user or password"
         return self._error(f"{method}: 401 Unauthorized: {cure}")
 
-    async def _asked(
+    async def _request_bytes(
         self, method: str, url: str, headers: dict[str, str], body: bytes
     ) -> ServerAnswer:
         self._cseq += 1

@@ -72,7 +72,7 @@ class MachineChecks(Parameters):
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
         """Check any cut of a stream: each piece may come alone, or with the next."""
         for room in (True, False):
-            for cuts in (_bytewise, _whole):
+            for cuts in (_bytewise, _unsplit):
                 player = Player(self.protocol, stream)
                 for step in stream.steps:
                     player.step(step, cuts(step), room=room)
@@ -426,7 +426,7 @@ def _bytewise(step: Step) -> list[bytes] | None:
     return [bytes([byte]) for byte in step.data] if isinstance(step, Came) else None
 
 
-def _whole(_: Step) -> None:
+def _unsplit(_: Step) -> None:
     return None
 
 

@@ -38,10 +38,10 @@ class Parameters(SaysWhatWasExpected):
         """
         for name in ("dialect", "conversation", "stream", "camera_kind"):
             if name in metafunc.fixturenames:
-                cases = self._found(name)
+                cases = self._parameters_named(name)
                 metafunc.parametrize(name, cases, ids=_label)
 
-    def _found(self, name: str) -> list[Any]:
+    def _parameters_named(self, name: str) -> list[Any]:
         suite = type(self)
         if name == "camera_kind":
             return list(self.camera_kinds) or _nothing(f"{suite.__name__}.camera_kinds is empty")
