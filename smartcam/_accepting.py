@@ -95,7 +95,7 @@ class _TakenPlace:
     peer: str  # address of the peer, without a port
     since: float  # time at which the connection came, or last had a session
     within: float  # seconds that the connection may stay from then on
-    what: str  # name of the missing thing, for the log
+    missing: str  # name of the missing thing, for the log
     deadline: float
 
 
@@ -128,7 +128,7 @@ class Places(Generic[G]):
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._within, self._what, self._own = within, what, own
+        self._within, self._missing, self._session_text = within, what, own
         self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
@@ -162,10 +162,10 @@ class Places(Generic[G]):
             self.crowded_out += 1
             evicted = next((occupant for occupant in crowd if not occupant.settled), None)
             if evicted is None:
-                return f"{taken}, and each has {self._own}"
-            self._send_away(evicted, f"{taken}, it was without {self._own} for longest")
+                return f"{taken}, and each has {self._session_text}"
+            self._send_away(evicted, f"{taken}, it was without {self._session_text} for longest")
         self._places[occupant] = _TakenPlace(
-            peer, now, self._within, self._what, now + self._within
+            peer, now, self._within, self._missing, now + self._within
         )
         return ""
 
@@ -191,7 +191,7 @@ class Places(Generic[G]):
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.within, place.what = math.inf if within is None else within, what
+            place.within, place.missing = math.inf if within is None else within, what
             place.deadline = now + place.within
 
     def waits_longest(self) -> tuple[float, G] | None:
@@ -221,7 +221,7 @@ class Places(Generic[G]):
             if occupant.settled:
                 place.deadline = now + place.within
             else:
-                self._send_away(occupant, f"{place.what} within {place.within:g} s")
+                self._send_away(occupant, f"{place.missing} within {place.within:g} s")
 
     def next_deadline(self) -> float:
         """Return when :meth:`end_overdue` is to be called next; infinity: never."""

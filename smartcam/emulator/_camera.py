@@ -455,9 +455,8 @@ class EmulatedCamera(WireCamera):
         if self.queue.device_on_camera:
             self._send_all(output, provoke=True)
         elif self._active is not None:
-            log = self._active.say
             for message in output:
-                log(message)
+                self._active.send(message)
 
     def _send_all(self, output: list[m.Message], *, provoke: bool) -> None:
         """Send messages to the client that has the session; they may trigger faults."""
@@ -465,7 +464,7 @@ class EmulatedCamera(WireCamera):
         for message in output:
             faults = self._provoke(self.queue.device_on_camera, message) if provoke else ()
             if session is not None and session is self._active and self.device.connected:
-                session.say(message)
+                session.send(message)
             self._act(faults, "after")
 
     def _settle(self) -> None:

@@ -2,7 +2,7 @@
 
 The owner of a link makes the link's protocol machine, which has the camera's role. A link is faulty
 only while wire faults wait or hold messages back. The camera's messages then go
-``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
+``FaultyLink.send -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
 ``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
@@ -138,7 +138,7 @@ class ClientLink(ABC):
         self.machine: CameraMachine = owner.make_machine(transport, self._trace)
         self._faulty: FaultyLink | None = None  # set while faults act
 
-    def say(self, message: m.Message) -> None:
+    def send(self, message: m.Message) -> None:
         """Add a message to those that :meth:`flush` will write."""
         if self._owner.queue.on_camera and self._faulty is None:
             self._enter_faulty()
@@ -148,7 +148,7 @@ class ClientLink(ABC):
             _log.warning("! %s: not sent: %s", self.peer, exc)
             return
         if self._faulty is not None:
-            self._faulty.say(message, b"".join(self.machine.data_to_send()))
+            self._faulty.send(message, b"".join(self.machine.data_to_send()))
 
     def flush(self) -> None:
         """Write all added messages."""
@@ -303,7 +303,7 @@ class FaultyLink:
 
     # ------------------------------------------------------------------ out
 
-    def say(self, message: m.Message, data: bytes) -> None:
+    def send(self, message: m.Message, data: bytes) -> None:
         """Add a message of the camera, and its bytes; call :meth:`run` next."""
         dialect, queue = self._owner.codec, self._owner.queue
         frame = dialect.to_frame(message)
@@ -443,7 +443,7 @@ class SecondClientSession:
     _traced: Callable[[Frame], None]  # called with all messages to it; none is on a wire
     peer: ClassVar[str] = "second client"
 
-    def say(self, message: m.Message) -> None:
+    def send(self, message: m.Message) -> None:
         """Accept a message."""
         try:
             frame = self._dialect.to_frame(message)

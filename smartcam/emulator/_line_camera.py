@@ -409,7 +409,7 @@ class LineCamera(WireCamera):
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
             faults = self._provoke(self.queue.device_on_camera, message)
-            link.say(message)
+            link.send(message)
             self._spoken_to[link] = None
             self._act(faults, "after")
 

@@ -425,7 +425,7 @@ class FrameSource(FrameSink):
         self._frames += 1
         self._newest = frame
         if frame.trigger is not None:
-            self._triggers.came(frame)
+            self._triggers.on_frame(frame)
         for reader in self._alive():
             reader._offer(frame)  # noqa: SLF001 - its own reader
 

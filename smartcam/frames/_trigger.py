@@ -117,7 +117,7 @@ class TriggerQueue:
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
                 pending.outcome.exception()  # mark the error as retrieved
 
-    def came(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         """Pass the frame of the pending trigger to its caller."""
         pending = self._pending
         if (

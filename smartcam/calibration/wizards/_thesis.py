@@ -184,7 +184,7 @@ class _Sequence:
         pictured: time of the last picture, UTC; None if it is not known.
     """
 
-    asked: CalibrationStart
+    start_request: CalibrationStart
     first: Step
     service: CalibrationService | None = None
     shown: bool = False
@@ -334,7 +334,7 @@ class ThesisCalibration:
         """Carry out a request; return its errors by the inputs' names."""
         first, sequence.shown = not sequence.shown, True
         try:
-            if self.graph is not None and sequence.asked.tf_frame_robot_tcp:
+            if self.graph is not None and sequence.start_request.tf_frame_robot_tcp:
                 self.graph.listen()  # so that the robot's pose at the picture is known
             if request.repeat_last_step:
                 return await self._back(sequence)
@@ -385,7 +385,7 @@ class ThesisCalibration:
         Raises:
             CalibrationError: as :meth:`CalibrationService.start`.
         """
-        request, name = sequence.asked, answers["name"]
+        request, name = sequence.start_request, answers["name"]
         self._files.folder.calibration(name)  # refused before anything is measured
         fixed = request.fixed_camera or answers["fixed_camera"]
         source = request._replace(fixed_camera=fixed).source or answers["pictures"]
@@ -408,7 +408,7 @@ class ThesisCalibration:
     ) -> Wizard:
         """Return the wizard for a camera in this place with this source of pictures."""
         save_to = self._files.folder.calibration
-        read = bool(sequence.asked.tf_frame_robot_tcp)
+        read = bool(sequence.start_request.tf_frame_robot_tcp)
 
         async def take() -> Any:
             return await self._picture(sequence, source)
@@ -449,7 +449,7 @@ class ThesisCalibration:
         return image
 
     async def _tool(self, sequence: _Sequence, utc: float | None) -> Transform:
-        request = sequence.asked
+        request = sequence.start_request
         return await _checked(self.graph).pose(
             request.tf_frame_robot_tcp, request.tf_frame_robot_base, utc
         )

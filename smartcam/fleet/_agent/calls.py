@@ -279,7 +279,7 @@ def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
 
 
 async def _frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.one(
+    return await call.host.frames.frame(
         _frame_order(call),
         max_age=call.argument("max_age", check_age),
         after=call.argument("after", check_moment),

@@ -85,7 +85,7 @@ class FrameCaller:
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
-    async def one(
+    async def frame(
         self,
         encoding: FrameForm,
         timeout: float,
@@ -194,7 +194,7 @@ class FrameCaller:
             fields = answer.get("frame")
             if fields is None:
                 return answer, []
-            data = await incoming.whole(int(fields["size"]))
+            data = await incoming.complete_data(int(fields["size"]))
             if data is None:
                 return answer, []
             caller.bound(float(answer["came"]), sent_at)

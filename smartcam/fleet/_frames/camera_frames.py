@@ -197,7 +197,7 @@ class SharedFrames:
             "rates": list(made.rates),
         }
 
-    async def one(
+    async def frame(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
         """Send one frame, as :meth:`get` has it."""
@@ -306,7 +306,7 @@ class SharedFrames:
                 raise
             finally:
                 if self._viewers.get(key) is viewer:
-                    viewer.rest(lambda: self._leave(key, viewer))
+                    viewer.mark_idle(lambda: self._leave(key, viewer))
         self._send([picture.frame for picture in taken], order)
         return {
             "came": asked_at,

@@ -661,7 +661,7 @@ class FleetCamera(Camera[ValueT]):
             await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
-        own = receiver.own[number] = Own(request.interpretation, expected)
+        own = receiver.own_calls[number] = Own(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(
                 request, application, expected, number, deadline, timeout
@@ -671,7 +671,7 @@ class FleetCamera(Camera[ValueT]):
                 await self._reach(reply.states, reply.batch.following, deadline)
             return receiver.outcomes(own, reply.batch)
         finally:
-            del receiver.own[number]
+            del receiver.own_calls[number]
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         self._require_session()
@@ -854,15 +854,15 @@ class FleetCamera(Camera[ValueT]):
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         age = None if math.isinf(max_age) else max_age
-        return await self.frame_caller.one(wanted, timeout, max_age=age)
+        return await self.frame_caller.frame(wanted, timeout, max_age=age)
 
     async def _frame_after(
         self, moment: float | None, form: FrameRequest, timeout: float
     ) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         if moment is None:
-            return await self.frame_caller.one(wanted, timeout, fresh=True)
-        return await self.frame_caller.one(wanted, timeout, moment=moment)
+            return await self.frame_caller.frame(wanted, timeout, fresh=True)
+        return await self.frame_caller.frame(wanted, timeout, moment=moment)
 
     async def _get_clock(self, timeout: float) -> datetime:
         reply = await self._do("get_clock", timeout)

@@ -41,15 +41,15 @@ class _BusPlace(Handle):
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
         self.key, self.call = key, call
         self._exchange = exchange
-        self.own: Handle | None = None
+        self.cover: Handle | None = None
         self.closed = False
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
             self._exchange.drop(self)
-            if self.own is not None:
-                self.own.close()
+            if self.cover is not None:
+                self.cover.close()
 
 
 class Exchange(Bus):
@@ -99,7 +99,7 @@ class Exchange(Bus):
         for places in [*self._places.get(kind, {}).values()]:
             # a message that comes twice meanwhile is taken once, by its number
             for place in places:
-                own, place.own = place.own, None
+                own, place.cover = place.cover, None
                 if own is not None:
                     own.close()
 
@@ -120,7 +120,7 @@ class Exchange(Bus):
         place = _BusPlace(self, key, call)
         self._places.setdefault(kind, {}).setdefault(self._name(key), []).append(place)
         if kind not in self._covers:
-            place.own = declare()
+            place.cover = declare()
         return place
 
     def _name(self, key: str) -> str:
@@ -215,7 +215,7 @@ class Exchange(Bus):
         if self._kind(pattern) != "presence/camera" or "*" in self._name(pattern):
             return self._bus.watch(pattern, see)
         place = self._enter(pattern, see, lambda: self._bus.watch(pattern, see))
-        if place.own is None:
+        if place.cover is None:
             for key in sorted(self._present.get(self._name(pattern), ())):
                 see(key, True)
         return place

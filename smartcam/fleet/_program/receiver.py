@@ -147,7 +147,7 @@ class Receiver:
         on_state: Callable[[dict[str, Any]], None],
         expected: Callable[[], int | None],
     ) -> None:
-        self.own: dict[int, Own] = {}
+        self.own_calls: dict[int, Own] = {}
         self._name, self._camera, self._caller = name, camera, caller
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
@@ -426,7 +426,9 @@ class Receiver:
         listeners.results.horizon = run.clock
         try:
             now = asyncio.get_running_loop().time()
-            own_call = self.own.get(run.call) if run.owner and run.owner == self._program else None
+            own_call = (
+                self.own_calls.get(run.call) if run.owner and run.owner == self._program else None
+            )
             if own_call is not None:
                 self._offer(run, self._outcome(own_call, run), now, owned=True)
                 return

@@ -204,7 +204,9 @@ class Assembler:
 
     def _deadline(self, block: Block) -> float:
         if block.missing_since < math.inf:
-            return max(block.missing_since + REORDER_GRACE, block.asked + RESEND_INTERVAL)
+            return max(
+                block.missing_since + REORDER_GRACE, block.resend_requested_at + RESEND_INTERVAL
+            )
         if block.highest or block.trailer is not None:
             return block.progress + SILENCE_TIMEOUT
         return block.progress + LEADER_TIMEOUT
@@ -235,7 +237,7 @@ class Assembler:
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
         # while other packets come, the next request is delayed
         block.tries += past
-        block.asked = now
+        block.resend_requested_at = now
         wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
 
     # packets
@@ -349,7 +351,7 @@ class Assembler:
                 block.dead = True
                 self._settle()
             return
-        if packet < len(block.seen) and block.seen[packet]:
+        if packet < len(block.packets_received) and block.packets_received[packet]:
             self.counts.doubled += 1
             return
         if not self._fits(block, header, payload):

@@ -102,13 +102,13 @@ async def find(
     Cancellation: safe.
     """
     loop = asyncio.get_running_loop()
-    searches: list[_Asking] = []
+    searches: list[_Search] = []
     transports: list[asyncio.DatagramTransport] = []
     try:
         for place in places:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, asking = await loop.create_datagram_endpoint(
-                    functools.partial(_Asking, place),
+                    functools.partial(_Search, place),
                     local_addr=(place.address, 0),
                     allow_broadcast=True,
                 )
@@ -124,17 +124,17 @@ async def find(
         for opened in transports:
             opened.close()
     answers = sorted(
-        (answer for search in searches for answer in search.found),
+        (answer for search in searches for answer in search.cameras),
         key=lambda answer: answer.reachable,
     )
     cameras = {(answer.info.mac, answer.info.serial, answer.address): answer for answer in answers}
     return sorted(cameras.values(), key=lambda camera: (camera.info.label, camera.address))
 
 
-class _Asking(asyncio.DatagramProtocol):
+class _Search(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
-        self.found: list[AnsweringCamera] = []
+        self.cameras: list[AnsweringCamera] = []
         self._answers = Counter[str]()  # number of answers by address
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
@@ -152,8 +152,8 @@ class _Asking(asyncio.DatagramProtocol):
         network = self._place.network
         reachable = network is None or ipaddress.IPv4Address(info.address) in network
         self._answers[addr[0]] += 1
-        if len(self.found) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:
-            self.found.append(AnsweringCamera(info, addr[0], reachable))
+        if len(self.cameras) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:
+            self.cameras.append(AnsweringCamera(info, addr[0], reachable))
 
     def error_received(self, exc: Exception) -> None:
         """Ignore that no process listens at one of the targets."""

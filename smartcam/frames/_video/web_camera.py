@@ -56,7 +56,7 @@ class WebDriver(VideoDriver):
                 return await super().open()
             if self._fps:
                 raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
-            frame = await first.came
+            frame = await first.outcome
         finally:
             await self.stop()
         self._size = (frame.width, frame.height)

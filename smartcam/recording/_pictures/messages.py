@@ -238,7 +238,7 @@ def picture_of(
     fields = _Values(values)
     try:
         pixel_format = find_format(fields.text("pixel_format", 100))
-        marks = drawings if number and fields.whole("annotations_from") == number else ()
+        marks = drawings if number and fields.integer("annotations_from") == number else ()
         frame = _frame(fields, pixel_format, marks)
         pixel_format.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
@@ -247,7 +247,7 @@ def picture_of(
         raise ValueError(f"a picture: {exc!s:.300}") from exc
     camera = fields.text("frame_id", MAX_NAME_CHARACTERS)
     made = fields.number_of_result(), received
-    return RecordedPicture(camera, at, frame, fields.whole("left_out"), *made)
+    return RecordedPicture(camera, at, frame, fields.integer("left_out"), *made)
 
 
 def _frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
@@ -263,14 +263,14 @@ def _frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, 
         format=pixel_format,
         width=width,
         height=height,
-        stride=fields.whole("stride"),
+        stride=fields.integer("stride"),
         captured=fields.real("captured"),
         utc=fields.real("utc"),
         moment=Moment[moment],
         duration=duration,
         device_time=fields.real("device_time") if fields.has("device_time") else None,
-        sequence=fields.whole("sequence"),
-        lost=fields.whole("lost"),
+        sequence=fields.integer("sequence"),
+        lost=fields.integer("lost"),
         source=fields.text("source", MAX_NAME_CHARACTERS),
         remark=fields.text("remark", MAX_NAME_CHARACTERS),
         drawings=drawings,
@@ -296,12 +296,12 @@ class _Values:
             raise ValueError(f"{name}: {len(text)} bytes, expected {4 * most} at most")
         return str(text, "utf-8")
 
-    def whole(self, name: str) -> int:
+    def integer(self, name: str) -> int:
         number: int = self._values.get(name, 0)
         return number
 
     def side(self, name: str) -> int:
-        side = self.whole(name)
+        side = self.integer(name)
         if not 1 <= side <= MAX_SIDE_PX:
             raise ValueError(f"{name}: {side} came, expected 1 to {MAX_SIDE_PX} pixels")
         return side
@@ -313,7 +313,7 @@ class _Values:
         return number
 
     def number_of_result(self) -> int | None:
-        return self.whole("result_number") or None
+        return self.integer("result_number") or None
 
     def result_received_at(self) -> datetime | None:
         seconds = self.real("result_received")

@@ -113,7 +113,7 @@ class _Track:
     untriggered: _PendingRuns  # runs without a trigger
     current: RecordedRun | None = None  # the take of the inspection under way
     # further containers to be sent
-    rest: list[bytes] = field(default_factory=list[bytes])
+    pending: list[bytes] = field(default_factory=list[bytes])
     # place of the client's numbers in containers; None: containers keep their own numbers
     numbers: _Numbers | None = None
     # function that is called with each recorded container when it is sent
@@ -129,7 +129,7 @@ class _Track:
             self.on_picture(data)
         if self.numbers is not None:
             containers = [self.numbers.put(data, number, byte_order) for data in containers]
-        first, *self.rest = containers
+        first, *self.pending = containers
         return first
 
 
@@ -313,8 +313,8 @@ class ReplayedCamera(EmulatedCamera):
             track.current = None
         elif track.waits and track.current is None:
             self._begin(track, track.triggered.pop())
-        if track.rest:
-            pending, track.rest = track.rest, []
+        if track.pending:
+            pending, track.pending = track.pending, []
             self._send(pending)
         self._arm_drops(track)
         self._play_unasked(track)
