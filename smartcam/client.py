@@ -191,7 +191,7 @@ class SmartCamera(Camera[ValueT]):
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline, timeout)
             deadline = self._connection.in_seconds(timeout)
-            await lock.turn(deadline, timeout)  # as hold() does, without an object for it
+            await lock.turn(deadline, timeout)  # same effect as hold(), without an object
             try:
                 return await triggers.trigger(request, deadline, timeout)
             finally:

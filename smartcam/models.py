@@ -127,7 +127,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 def as_status(word: int) -> Status:
     """Return the status of a word; for the receiving path, since ``Status(word)`` is slow."""
-    known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
+    known = Status._value2member_map_.get(word)  # texts of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
 
@@ -438,7 +438,7 @@ class StatusChanged(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ApplicationChanged(CameraEvent):
-    """Another application is active than the client knew."""
+    """The active application is another one than in the client's last information."""
 
     application: int
     previous: int | None

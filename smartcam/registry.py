@@ -47,7 +47,7 @@ class Registry:
         aliases: other accepted names of built-ins.
 
     Attributes:
-        revision: number that changes with what is registered, or looked for anew.
+        revision: number that changes when a plug-in is registered, or a search begins anew.
     """
 
     def __init__(

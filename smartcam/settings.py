@@ -128,7 +128,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     url = check_text(url, "camera address")
     if model is not None:
         model = check_text(model, "camera model", least=1, most=200)
-    if "@" in url:  # with a password, which must not be kept
+    if "@" in url:  # the URL has a password, which must not be kept
         return _read_address(url, model)
     return _known_address(url, model, PROTOCOLS.revision)
 
@@ -146,7 +146,7 @@ def _read_address(url: str, model: str | None) -> Address:
         parts = urlsplit(full)
         host, port = parts.hostname, parts.port
     except ValueError as exc:
-        if shown != url and "'" in str(exc):  # its text quotes the URL, and so the password
+        if shown != url and "'" in str(exc):  # the error's text quotes the URL, and so the password
             raise ConfigurationError(
                 f"camera address {shown!r} is no URL; in a password each of / ? # [ ] stands as "
                 "%2F %3F %23 %5B %5D"
@@ -353,7 +353,7 @@ class CameraSettings:
         """Validate the options of ``connect()``.
 
         Raises:
-            ConfigurationError: names the option, what came and what was expected.
+            ConfigurationError: names the option, the given value and the expected one.
         """
         return cls.of(parse_address(url, model=model), options)
 
@@ -362,7 +362,7 @@ class CameraSettings:
         """Validate options for an address.
 
         Raises:
-            ConfigurationError: names the option, what came and what was expected.
+            ConfigurationError: names the option, the given value and the expected one.
         """
         usual = address.path or f"{address.host}:{address.port}"
         try:
@@ -412,7 +412,7 @@ def _validated(given: dict[str, Any]) -> dict[str, Any]:
     """Return options as pydantic's model reads them, which judges all that is unusual.
 
     Raises:
-        ConfigurationError: names the option, what came and what was expected.
+        ConfigurationError: names the option, the given value and the expected one.
     """
     from pydantic import ValidationError
 

@@ -86,7 +86,7 @@ class Queue(Generic[T]):
         # Bytes are counted when items come; only then are those of taken items subtracted, so that
         # taking costs nothing. A parcel came together: number of its last item, items, bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
-        self._bytes = 0  # of all parcels, of which some may be of items that are gone
+        self._bytes = 0  # bytes of all parcels, some of which may belong to dropped items
         self._missed = 0
         self.since: float = -math.inf  # time of the subscription, on the clock of the items
         self._evicted = 0  # dropped items that were queued before: only these have numbers

@@ -347,7 +347,9 @@ class _Sources:
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
-                if camera.settings.y_down != options.y_down:  # a fleet's agent knows it
+                if (
+                    camera.settings.y_down != options.y_down
+                ):  # the fleet's agent has the calibration
                     raise ConfigurationError(
                         f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
                         "the calibration is mirrored"

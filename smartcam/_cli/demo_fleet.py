@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SHARED = "line1/cam1"
 CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
-"""For each agent, the line of its cameras and their number."""
+"""Line of the cameras and their number, for each agent."""
 
 BY_ROBOT, BY_HAND = 9, 3
 """Triggers of two programs at the same time."""

@@ -145,7 +145,7 @@ class Seen(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
-    reached: list[BlockPose]  # those within reach of the gripper
+    reached: list[BlockPose]  # blocks within reach of the gripper
     block: BlockPose  # block to take
     top: BlockPose  # block on top of the tower
 
@@ -221,7 +221,7 @@ def loose_blocks(
     lying: list[BlockPose] = []
     for region in _regions(sight, colours):
         height = sight.camera[2] - region_depth(depth, region.mask).median
-        if abs(height - BLOCK[2]) < EDGE:  # it is not on the tower
+        if abs(height - BLOCK[2]) < EDGE:  # the block is not on the tower
             lying.append(_pose(sight, region, height))
     if not lying:
         raise _nothing(sight, colours)
@@ -369,7 +369,7 @@ def _text(rows: list[Compared]) -> str:
             1e3 * measured.height,
         )
         errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * measured.sigma)
-        known = errors if measured.sigma else errors[:2]  # this height was not measured
+        known = errors if measured.sigma else errors[:2]  # the height was not measured
         shown = [f"{value:8.2f}" for value in (*places, *known)]
         cells.append((label, *shown, *[""] * (8 - len(shown))))
     return table_text((*head, *titles), cells)

@@ -317,7 +317,7 @@ async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: 
     """Record a result's picture, before another trigger replaces the picture."""
     try:
         image = await camera.read_image()
-    except CommandRejectedError:  # it has none, as the recorded frames show
+    except CommandRejectedError:  # the camera has none, as the recorded frames show
         return
     if recorder.counts.results == results:
         await asyncio.to_thread(recorder.add_image, camera.name, image, result=result)

@@ -95,7 +95,7 @@ class CameraState:
         self.statuses_received += 1
         self.status, self.endian = status, report.endian
         self.bits = self._last_status = bits
-        if bits & _RUNNING_OR_BUSY == _BUSY:  # it loads an application
+        if bits & _RUNNING_OR_BUSY == _BUSY:  # the camera loads an application
             self._loaded_by_us = False
         elif (
             was is not None

@@ -415,7 +415,7 @@ class Correlation:
             self.doubted = False
             return False
         self.satisfied = False
-        self._newest_given = None  # that run uses it
+        self._newest_given = None  # the run of this trigger uses the number
         return self._complete and previous is not None
 
     def judge_marked(self, is_ours: bool) -> Match:

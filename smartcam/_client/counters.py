@@ -82,7 +82,7 @@ class ClientCounters:
         self.last_error: str | None = None
         self.round_trip: Times = Times()
         self.processing: Times = Times()
-        self._wire = Counters()  # of the links that are over
+        self._wire = Counters()  # counts of the links that have ended
         self._open: Counters | None = None
 
     def count(self, fate: str, containers: int = 1) -> None:

@@ -257,7 +257,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
-                with contextlib.suppress(OSError):  # it was reset just now
+                with contextlib.suppress(OSError):  # the buffer was reset just now
                     self._transport.write_eof()
             await self.wait_closed(timeout)
         finally:
@@ -447,7 +447,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         took = thread_time() - since
         turn = SHARED_TURN_TIME if links[self.loop] > 1 else TURN_TIME
         frames = int(self._busy_with * turn / max(took, 1e-9))
-        frames = max(frames, self._most // 2)  # one slow chunk may be an exception
+        frames = max(frames, self._most // 2)  # a single slow chunk may be an exception
         self._most = max(MIN_FRAMES_PER_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _pause(self) -> None:

@@ -52,7 +52,7 @@ class Requests:
     _state: CameraState
     # seconds that an answer may take, however short the caller's deadline is
     patience: float
-    _switch_patience: float  # the same bound for the answer to a switch
+    _switch_patience: float  # bound for the answer to a switch, too
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
@@ -160,7 +160,7 @@ class Requests:
             ResponseTimeoutError: the answer did not come. It stays pending if it may still come; if
                 it is overdue, too, the link is given up.
         """
-        if self.is_free(key):  # as post() does, without a coroutine for it
+        if self.is_free(key):  # same effect as post(), without a coroutine
             answer = self._send(message, key, deadline)
         else:
             answer = await self.post(message, key, deadline)

@@ -139,7 +139,7 @@ class Results:
         pending = self._pending
         if pending is None:
             return None
-        if pending.outcome.cancelled() and not pending.ended:  # its caller was not woken yet
+        if pending.outcome.cancelled() and not pending.ended:  # the call's task was not woken yet
             pending.ended = True
             self.correlation.give_up(pending)
         if not pending.ended:
@@ -269,7 +269,7 @@ class Results:
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
                 self.hand_on(container, None, fate, number, now, at)
-            elif not pending.ended:  # it has ended if the container before could not be read
+            elif not pending.ended:  # the call has ended if the container before could not be read
                 self.hand_on(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate

@@ -134,7 +134,7 @@ class StatusRequests:
             await self._requests.fence(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
-            pass  # its own time may not be over; keepalive detects a lost camera
+            pass  # the caller's time may not be over; keepalive detects a lost camera
         except LocalProtocolError as exc:  # the last one's answer never came
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 

@@ -59,10 +59,10 @@ _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGG
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
 _TELLS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR | Status.OVERTRIGGERED
-)  # of these, exactly Waiting is set if a trigger may go out at once
+)  # bits of which exactly Waiting is set if a trigger may go out at once
 _SPEAKS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
-)  # of these, exactly Waiting must be set before a trigger
+)  # bits of which exactly Waiting must be set before a trigger
 
 LATE_GRACE = 0.25
 """Seconds that a late result is waited for before it is made impossible: most are only a little
@@ -324,7 +324,7 @@ class Triggers:
             correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
-        waited = False  # in line with Queries, so that neither kind delays the other
+        waited = False  # waits in line with Queries, so that neither kind delays the other
         while True:
             status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
@@ -332,7 +332,7 @@ class Triggers:
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
             elif features.fences and (
-                self._waits.is_pending(m.QueryAnswer)  # one can be open
+                self._waits.is_pending(m.QueryAnswer)  # only one Query can be open
                 if waited
                 else not self._requests.is_free(m.QueryAnswer)
             ):

@@ -32,7 +32,7 @@ MIN_NEW_SCENE_SHARE: Final = 0.5
 
 @takes(scale=a_number)
 def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
-    """Return a depth map as float32 metres, 0 where there is none.
+    """Return a depth map as float32 metres, 0 for pixels without depth.
 
     Args:
         depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (disparities in

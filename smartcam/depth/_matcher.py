@@ -214,7 +214,7 @@ class StereoMatcher:
         return Disparity(*refined(first, second, disparity, self._refine))
 
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return OpenCV's disparities, NaN where there is none."""
+        """Return OpenCV's disparities, NaN for pixels without one."""
         cv2 = load("cv2")
         invalid = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
         sixteenths = self._padded(left, right)

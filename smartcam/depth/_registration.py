@@ -280,7 +280,7 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
     they are squared.
     """
     # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
-    # groups as Liang and Zeger have it (1986).
+    # groups by the method of Liang and Zeger (1986).
     places = np.unique(nearest, return_inverse=True)[1].reshape(-1)
     groups = np.zeros((int(places.max()) + 1, 6))
     np.add.at(groups, places, rows * across[:, None])

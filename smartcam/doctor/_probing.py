@@ -133,7 +133,7 @@ def other_ways(address: Address) -> list[Way]:
         scheme = next(iter(protocol.schemes))
         try:
             ways_found += ways(Address(protocol.name, scheme, address.host, port))
-        except ConfigurationError:  # it needs more than the URL has, such as a login
+        except ConfigurationError:  # the protocol needs more than the URL has, such as a login
             continue
     return ways_found
 

@@ -105,7 +105,7 @@ async def connect(exam: Examination) -> None:
         return
     exam.camera, exam.connected_at = camera, loop.time()
     if first is not None and len(times) > 1:
-        del times[0]  # it includes the search for the dialect
+        del times[0]  # the time includes the search for the dialect
     _say_session(exam, camera, first, times)
 
 

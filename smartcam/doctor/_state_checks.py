@@ -163,11 +163,11 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # this was reported already, and explains the rest
+        return  # the status was reported already, and explains the rest
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # it may have stopped meanwhile
+    stopped = _is_stopped(seen[-1])  # the camera may have stopped since
     if any(_waits(status) for status in seen) and not stopped:
         exam.may_trigger = True
         results_text = (

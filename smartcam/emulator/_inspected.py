@@ -72,7 +72,7 @@ class InspectedApplication(Application):
 
     @property
     def period(self) -> int | None:
-        """None: each run makes its own container."""
+        """No common container: each run makes its own."""
         return None
 
     @model_validator(mode="after")

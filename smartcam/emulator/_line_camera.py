@@ -229,7 +229,7 @@ class LineCamera(WireCamera):
         """Return a camera of a scenario; arguments win over the scenario's fields.
 
         Raises:
-            ConfigurationError: an argument is wrong, or not supported by such a camera.
+            ConfigurationError: an argument is wrong, or not supported by this kind of camera.
         """
         options = dict(plan.options)
         if plan.active is not None or plan.running:

@@ -102,7 +102,7 @@ class Port:
         return sock
 
     async def _reopen(self, before: asyncio.Task[None] | None) -> None:
-        if before is not None:  # it was cancelled, and has to release its socket
+        if before is not None:  # the start was cancelled, and has to release its socket
             await asyncio.wait({before})
         while True:
             try:

@@ -175,7 +175,7 @@ class Log(Sequence[LogEntry]):
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
             weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
-        else:  # its size once it is read
+        else:  # size of the entry once it is read
             _, _, _, message, fault, wire = entry
             size = len(message.payload if isinstance(message, Frame) else message)
             weight = _ENTRY_BYTES + _PER_BYTE * size

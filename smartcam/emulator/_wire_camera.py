@@ -202,7 +202,7 @@ class WireCamera(Server):
         """Return a camera of a scenario; the other arguments override it.
 
         Raises:
-            ConfigurationError: an argument is wrong, or not supported by such a camera.
+            ConfigurationError: an argument is wrong, or not supported by this kind of camera.
         """
 
     @classmethod

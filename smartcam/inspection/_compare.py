@@ -218,7 +218,7 @@ class Compare(Tool[CompareSettings]):
         fine = motion.copy()
         try:
             cv2.findTransformECC(self._taught, patch, fine, cv2.MOTION_EUCLIDEAN, end, None, 5)
-        except cv2.error:  # it did not converge
+        except cv2.error:  # the registration did not converge
             return motion
         turn = abs(math.atan2(fine[1, 0], fine[0, 0]))
         middle = np.array(self._size) / 2

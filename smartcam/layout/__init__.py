@@ -251,7 +251,7 @@ class Layout:
             InterpretationError: the payload does not fit, or a byte is no bool.
         """
         view = self._views.get(byte_order)
-        if view is not None and type(payload) is bytes:  # from bytes numpy makes read-only tables
+        if view is not None and type(payload) is bytes:  # numpy makes read-only tables of bytes
             try:
                 rows: np.ndarray[tuple[int], np.dtype[np.void]] = self._frombuffer(payload, view)
             except ValueError:
@@ -272,7 +272,7 @@ class Layout:
             try:
                 return [make(payload, view) for payload in payloads]
             except ValueError:
-                pass  # one of them has not whole records, or is empty
+                pass  # a payload has no whole records, or is empty
         return [self.parse_table(payload, byte_order) for payload in payloads]
 
     def sequence(self, payload: Payload, byte_order: ByteOrder = "little") -> int | None:

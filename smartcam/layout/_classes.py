@@ -253,7 +253,7 @@ def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
 
 
 def values_of(value: object) -> dict[str, Any] | None:
-    """Return the fields of an object of such a class by name; None for other objects."""
+    """Return the fields of an object of a layout's class by name; None for other objects."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
     kind = type(value)

@@ -235,7 +235,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             was_published(of, data, number, reason, properties)
 
         def on_connect(of: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
-            largest = getattr(properties, "MaximumPacketSize", None)  # of all of the packet
+            largest = getattr(properties, "MaximumPacketSize", None)  # size of the whole packet
             if largest is not None:
                 self._largest = min(self._largest, largest - MAX_HEADER_BYTES)
             was_connected(of, data, flags, reason, properties)

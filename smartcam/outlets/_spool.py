@@ -167,7 +167,7 @@ class Spool:
         before, last = counts.get("epoch", 0), self._last_epoch()
         self.epoch = max(before + 1, last + 1, time.time_ns() // 1000)
         with _transaction(database):
-            if counts.get("running"):  # nobody ended it: what waited in memory is gone
+            if counts.get("running"):  # no end was written: results that waited in memory are lost
                 why = "the process ended at once; what came behind the last entry may be missing"
                 for camera, epoch, number in _last_numbers(database):
                     _add_gap(database, _gap(camera, epoch, number + 1), 0, why, 0)

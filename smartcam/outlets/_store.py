@@ -60,7 +60,7 @@ _TYPES = {
     "string": "TEXT",
     "real32": "REAL",
     "real64": "REAL",
-    "uint64": "BLOB",  # as they come; an INTEGER's column makes a REAL of digits that are too many
+    "uint64": "BLOB",  # keeps values as they are; INTEGER makes a REAL of too many digits
 }
 _OWN = frozenset({"id", "record", "rowid"})
 
@@ -155,7 +155,7 @@ class _StoreFile:
         self._database: sqlite3.Connection | None = None
         self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns of one batch
         self._expired = 0.0
-        self._identity: object = None  # of the file that is open
+        self._identity: object = None  # identity of the open file
 
     def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
         """Run work in the thread; with ``last`` the thread ends afterwards."""

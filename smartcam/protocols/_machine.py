@@ -32,7 +32,7 @@ class State(enum.Enum):
     CONNECTING = "connecting"
     """Connect was sent, its answer has not come."""
     CONNECTED = "connected"
-    """In a session."""
+    """A session is open."""
     DISCONNECTED = "disconnected"
     """Disconnect was sent; messages that were under way may still come."""
     CLOSED = "closed"

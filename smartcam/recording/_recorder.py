@@ -711,7 +711,7 @@ class RecordingFile:
 
 def address_facts(url: str) -> dict[str, str]:
     """Return the facts about a camera that follow from its address."""
-    if is_fleet(url):  # only the agent knows the dialect
+    if is_fleet(url):  # only the agent has the dialect
         return {"url": url, "protocol": "fleet"}
     try:
         address = parse_address(url)

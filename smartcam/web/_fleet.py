@@ -223,7 +223,7 @@ async def _cameras(site: FleetSite, call: CallRequest) -> object:
     cameras: list[dict[str, Any]] = []
     for name in names[sight.first : sight.first + sight.count]:
         row = site.view.rows.get(name)
-        if row is not None:  # it was not forgotten meanwhile
+        if row is not None:  # the camera was not forgotten meanwhile
             cameras.append(row.fields())
             await asyncio.sleep(0)
     return {"found": len(names), "cameras": cameras}

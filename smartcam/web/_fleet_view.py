@@ -275,7 +275,7 @@ class FleetView:
             self._flags.subtract(flags)
             self._flags.update(row.flags)
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
-            self._aging.add(row)  # its reason may change without an event
+            self._aging.add(row)  # the reason of a loss may change without an event
         if row.agents:
             self._removed.pop(row.name, None)
         elif row.name not in self._removed:

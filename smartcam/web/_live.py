@@ -124,7 +124,7 @@ class LiveReader:
 
     def _results(self) -> Iterator[News]:
         view = self._view
-        if self._serial > view.serial:  # from an earlier process
+        if self._serial > view.serial:  # number from an earlier process
             self._serial = 0
         new = [entry for entry in view.entries if entry.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial

@@ -213,7 +213,7 @@ def _slopes(quads: Array, flat: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     around = flat - flat.mean(axis=1, keepdims=True)
     seen = quads - quads.mean(axis=1, keepdims=True)
-    squares = (around**2).sum(axis=(1, 2)) / 2  # of a square's corners, the same along x and y
+    squares = (around**2).sum(axis=(1, 2)) / 2  # offsets of a square's corners, equal along x and y
     slopes: Array = seen.transpose(0, 2, 1) @ around / squares[:, None, None]
     return slopes
 

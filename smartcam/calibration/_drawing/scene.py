@@ -61,7 +61,7 @@ class DrawnCamera(NamedTuple):
     """A camera in the scene."""
 
     name: str
-    pose: Rigid  # from the camera's frame into the scene's
+    pose: Rigid  # transform from the camera's frame into the scene's
     model: CameraModel | None = None
 
 
@@ -165,7 +165,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
 
 def _frustum(camera: DrawnCamera, length: float) -> Array:
     """Return a camera's centre, and the corners of its field of view at a depth, (5, 3)."""
-    x, y = 0.5, 0.375  # of a corner at depth 1
+    x, y = 0.5, 0.375  # coordinates of a corner at depth 1
     if camera.model is not None:
         x, y = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
     rim = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]

@@ -628,7 +628,7 @@ def _covariance(chosen: Candidate) -> Array:
     alike = [
         places == place for place in np.unique(places)
     ]  # poses of one place are left out together
-    steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # to first order
+    steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # correct to first order
     left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
     spreads = np.array([inverse_scaled(information_left)[:12, :12] for information_left in left])
     scatter = weighed_jackknife(steps, spreads, inverse_scaled(information)[:12, :12])
@@ -674,7 +674,7 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{places}{alike}"
         )
-    # a remark that one pose more or less would change helps nobody
+    # a remark that depends on a single pose is of no use
     turn = float(second_turns(problem.robot).max())
     if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(

@@ -1,4 +1,4 @@
-"""Estimate a robot's pose noise from what a camera on it sees.
+"""Estimate a robot's pose noise from the views of a camera on it.
 
 The sums of an adjustment are computed once. For any two standard deviations of the robot they give
 the restricted likelihood of the observations, from which the unknown poses of camera and target and

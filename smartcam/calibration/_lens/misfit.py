@@ -311,7 +311,7 @@ def misfit_remarks(
     Blunders are a change of the camera from one view on and flipped pictures; of a pair also
     cameras that move against each other, and views of different moments. In a flipped picture a
     board is found as well if it looks the same in a mirror; its points are then those of a camera
-    with a mirrored lens. But such a large misfit may have other causes: each cause is fitted, and
+    with a mirrored lens. But a large misfit may have other causes: each cause is fitted, and
     the best one counts.
 
     ``fitted``: the view, or the left and the right one of a pair, at each moment. ``more``:

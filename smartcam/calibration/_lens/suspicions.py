@@ -73,7 +73,7 @@ DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
 image."""
 
 DOUBTED_CENTRE_SIGMAS: Final = 5.0
-"""Such a principal point is doubted only if it is this many standard deviations off the centre."""
+"""Least distance of a doubted principal point from the centre, in standard deviations."""
 
 
 class Stray(NamedTuple):

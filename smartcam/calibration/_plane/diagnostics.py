@@ -83,7 +83,7 @@ class Evidence(NamedTuple):
     asked: bool  # whether the user named the model
     held_out: Array  # (N, 3), residuals of the chosen fit
     sigma: float | None  # standard deviation of a touch's coordinate; None if it was not given
-    most: float  # the same if it was given, else the largest plausible one
+    most: float  # the error that the user gave, else the largest plausible one
     place: Normalization  # centre and size of the points
     nominal_scale: float | None  # metres per unit of the camera's points; None if it was not given
     # cosine between tool and normal; None if the tool's axis was not given

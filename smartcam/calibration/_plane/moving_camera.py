@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 class Moved:
     """A rigid motion of everything, in the frame that the poses are in."""
 
-    motion: Transform  # from the robot's frame into the robot's frame
+    motion: Transform  # motion from the robot's frame into the robot's frame
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses after the motion."""

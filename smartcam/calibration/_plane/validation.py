@@ -99,7 +99,7 @@ def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
         if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < tolerance:
             number[np.isin(number, number[same])] = number[same[0]]
     first, number = np.unique(number, return_index=True, return_inverse=True)[1:]
-    order = np.argsort(first)  # in the order in which the points came
+    order = np.argsort(first)  # numbers in the order of the given points
     first, number = first[order], np.argsort(order)[number.ravel()]
     share = weights / np.bincount(number, weights)[number]
     means = [

@@ -227,7 +227,7 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     first, second = rotation[:, 0], rotation[:, 1]
     # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn w by
     # w x r = -[r]x w, and with its shift by d.
-    by_pose = np.zeros((3, 3, 6))  # of rows, columns of the matrix, by turn and shift
+    by_pose = np.zeros((3, 3, 6))  # derivatives of rows, columns of the matrix, by turn and shift
     by_pose[:, 0, :3], by_pose[:, 1, :3] = -cross_matrix(first), -cross_matrix(second)
     by_pose[:, 2, 3:] = np.eye(3)
     moved = by_pose.reshape(9, 6)

@@ -126,7 +126,7 @@ class PoseConvention(NamedTuple):
     metre: float  # number of length units in a metre
     # function that converts the numbers after the position to a rotation (3, 3)
     rotation: Callable[[Array], Array]
-    orientation: Callable[[Transform], list[float]]  # its inverse, from a pose
+    orientation: Callable[[Transform], list[float]]  # inverse function, from a pose
     title: str  # form of the orientation, in words
 
 

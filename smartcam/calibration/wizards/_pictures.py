@@ -91,7 +91,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     try:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
-    except cv2.error:  # for no bytes, and for more pixels than OpenCV allows
+    except cv2.error:  # error for no bytes, and for more pixels than OpenCV allows
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")

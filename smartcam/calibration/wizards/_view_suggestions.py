@@ -34,7 +34,10 @@ class Look(NamedTuple):
     tilt: float = 0.0  # tilt, degrees
     roll: float = 0.0  # turn about the line of sight, degrees
     fill: float = 0.6  # part of the image's width or height that the target takes
-    place: tuple[float, float] = (0.5, 0.5)  # its centre, as parts of the image's width and height
+    place: tuple[float, float] = (
+        0.5,
+        0.5,
+    )  # centre of the place, as parts of the image's width and height
 
 
 LOOKS: Final = (

@@ -102,7 +102,7 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
 
 @check("SC-A30, SC-B33, published", needs=Allow.TRIGGER, dialects=SMART)
 def dropped_trigger_is_told(camera: CameraUnderTest) -> None:
-    """Of two triggers at once one is dropped, and a status with Overtriggered says so."""
+    """One of two triggers at once is dropped, and a status with Overtriggered says so."""
     seen = overtrigger(camera)
     if seen.rose_at is None:
         if seen.results >= 2:

@@ -97,7 +97,7 @@ class ClientConformance:
             The data of the results, in order, each without the application's id.
 
         Raises:
-            NotImplementedError: the client cannot do such a task; its tests are skipped.
+            NotImplementedError: the client does not support the task; its tests are skipped.
             Exception: any error that means that the client has failed.
         """
         raise NotImplementedError

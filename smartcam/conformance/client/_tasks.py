@@ -2,7 +2,7 @@
 
 A command gets the task as arguments and prints one line for each result: the bytes of the result
 container after the application id as hex, or a JSON object that has them as ``data`` or ``raw``.
-Its exit code is 0 if it has done the task, 77 if it cannot do such a task at all, and any other
+Its exit code is 0 if it has done the task, 77 if it does not support the task, and any other
 number if it failed.
 """
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     Perform: TypeAlias = "Callable[[Task], Iterable[bytes] | Awaitable[Iterable[bytes]]]"
 
 UNSUPPORTED = 77
-"""Exit code of a command that cannot do such a task; automake's tests use it for "skipped"."""
+"""Exit code of a command that does not support a task; automake's tests use it for "skipped"."""
 
 MAX_OUTPUT_BYTES = 1 << 20
 """Largest number of bytes of a command's output that are read; a client that prints more has
@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
         results: data of the results that the client gave, in order.
         error: the client's text about its failure; None if the client reports success.
         ended: whether the client ended in time.
-        supported: whether the client can do such a task at all.
+        supported: whether the client supports the task.
         seconds: duration of the task.
         said: further output of the client, shortened.
     """
@@ -172,7 +172,7 @@ class _Worker:
     def cancel(self) -> None:
         inside = self._inside
         if inside is not None:
-            with contextlib.suppress(RuntimeError):  # its loop is closed already
+            with contextlib.suppress(RuntimeError):  # the transport's loop is closed already
                 inside[0].call_soon_threadsafe(inside[1].cancel)
 
     def _run(self) -> None:

@@ -90,7 +90,7 @@ class _Event(enum.IntEnum):
     BUSY_ENDS = 4
     FREE_RUN = 5
 
-    __hash__ = int.__hash__  # that of Enum is a slow function in Python
+    __hash__ = int.__hash__  # the hash of Enum is a slow function in Python
 
 
 class _Inspection(NamedTuple):

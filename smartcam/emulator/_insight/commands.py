@@ -239,7 +239,7 @@ def coded_image(image: NDArray[np.uint8]) -> CodedImage:
 
 
 def _seen_image(sight: Callable[[], Any]) -> CodedImage | None:
-    """Return the image of the last run; None if it is no image of such a camera."""
+    """Return the image of the last run; None if the camera could not have taken it."""
     try:
         return coded_image(check_image(sight()))
     except ConfigurationError as exc:

@@ -57,7 +57,7 @@ class _PendingEvent:
             on_code(code)
 
     def end(self, code: StatusCode) -> None:
-        """Finish the event, whatever its outcome."""
+        """Finish the event, also after a failure."""
         self.over = True
         self.report(code)
 

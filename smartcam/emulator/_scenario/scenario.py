@@ -102,7 +102,7 @@ class Scenario(EmulatorData):
 
     def mistake(self) -> Mistake | None:
         """Return the place of something that the camera cannot do, and the reason; or None."""
-        from smartcam.emulator._makes import emulated_class  # it imports this module
+        from smartcam.emulator._makes import emulated_class  # that module imports this one
 
         try:
             kind = emulated_class(self.protocol)

@@ -57,7 +57,7 @@ _Seconds = Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)]
 
 
 class _OneOrMore:
-    """In a schema, one fault stands for a list of one."""
+    """Allow a single fault instead of a list of one in a schema."""
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -152,7 +152,7 @@ class _CueState:
     """A cue and its counts."""
 
     cue: Cue
-    random: Random  # its own random numbers, so that no cue changes those of another
+    random: Random  # the cue's random numbers, so that no cue changes another's
     seen: int = 0  # number of times that its moment came
     done: int = 0  # number of times that its faults were injected
 

@@ -297,7 +297,7 @@ def _build(name: str, fields: Mapping[str, int | str]) -> m.Message:
 
 
 class HalfOpen(EndingFault):
-    """From this message on nothing is sent and nothing is read on the connection.
+    """Nothing is sent and nothing is read on the connection from this message on.
 
     The connection stays open, as when a cable is pulled; it keeps the session until another client
     connects. It ends with a reset after ``seconds``, when the emulator stops or when the faults are

@@ -81,7 +81,7 @@ _NEEDS: Mapping[type[DeviceFault], str] = {
 
 
 def kinds_of(device: object) -> frozenset[str]:
-    """Return the kinds of faults that a camera with such a device supports."""
+    """Return the kinds of faults that a camera with this kind of device supports."""
     return frozenset(
         kind
         for kind, fault in f.FAULTS.items()

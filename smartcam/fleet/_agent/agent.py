@@ -724,7 +724,7 @@ class Agent:
             return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
-        if entered is not None:  # it was carried out, which its program does not know
+        if entered is not None:  # the call was carried out, which its program does not know
             camera, before = entered
             camera.leave(before)
 

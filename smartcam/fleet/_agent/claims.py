@@ -335,7 +335,7 @@ class Claims:
         """Take over a camera without agent."""
         if self._standby is None or self._others.get(name):
             return
-        away = not self._bus.reached  # this agent was cut off, not the others
+        away = not self._bus.reached  # only this agent was cut off, not the others
         await asyncio.sleep(HOLD_OFF * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:

@@ -222,7 +222,7 @@ class Reloader:
             raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
 
     async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
-        if self._applying is not None:  # its caller was cancelled
+        if self._applying is not None:  # the reload's caller was cancelled
             await asyncio.wait({self._applying})
         folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
         new, changes = await self._read(file, folder, agent.name)
@@ -247,7 +247,7 @@ class Reloader:
         self, file: str | Path | FleetFile, folder: Path, agent: str
     ) -> tuple[LoadedFleet, FleetChanges]:
         """Read and check a file, and find its changes, in a thread."""
-        if self._reading is not None:  # its caller was cancelled, or timed out
+        if self._reading is not None:  # the reload's caller was cancelled, or timed out
             _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
             if late:
                 raise ConfigurationError(

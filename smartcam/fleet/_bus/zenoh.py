@@ -232,7 +232,7 @@ class ZenohEnd(ZenohSession, Bus):
                 session.put(key, payload, **self._dropping[express])
             else:
                 publisher.put(payload)
-        except self._zenoh.ZError as exc:  # it ends meanwhile
+        except self._zenoh.ZError as exc:  # the session ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
         if self._loop.time() - begun >= ROOM_TIMEOUT:
             self._hand_over(self._queue_of(key), session, key, payload, express, doubtful=True)

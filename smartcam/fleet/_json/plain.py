@@ -281,7 +281,7 @@ class Plain:
         try:
             check_name(order.camera)
         except ConfigurationError as error:
-            _reply(question, order.failed(error))  # every agent says the same
+            _reply(question, order.failed(error))  # every agent gives the same answer
             return
         if self._is_full(question, order):
             return

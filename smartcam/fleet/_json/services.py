@@ -291,7 +291,7 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
         )
     fields = to_fields(frame, 0.0, took, 0)
     own_fields = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
-    if "trigger" in own_fields:  # its time is by the agent's clock
+    if "trigger" in own_fields:  # times of the event are by the agent's clock
         own_fields["trigger"] = {
             name: own_fields["trigger"][name] for name in ("number", "evidence")
         }

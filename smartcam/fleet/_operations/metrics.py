@@ -61,7 +61,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     kept_results = kept_bytes = waiting = reserved = 0
     for begin in range(0, len(hosts), CAMERAS_PER_SLICE):
         for host in hosts[begin : begin + CAMERAS_PER_SLICE]:
-            if agent.hosts.get(host.name) is host:  # it may have been removed meanwhile
+            if agent.hosts.get(host.name) is host:  # the camera may have been removed meanwhile
                 read.append((host, _camera(host)))
                 kept_results += host.results.kept
                 kept_bytes += host.results.kept_bytes

@@ -455,7 +455,7 @@ class Caller:
         Raises:
             SmartCamError: the agent replied with this error, or is gone or silent.
 
-        Cancellation: the agent is told.
+        Cancellation: the agent receives a cancelling message.
         """
         met = self.require()
         reply = await self._exchange(
@@ -516,7 +516,7 @@ class Caller:
         Raises:
             SmartCamError: like :meth:`call`.
 
-        Cancellation: the agent is told.
+        Cancellation: the agent receives a cancelling message.
         """
         met = self.require()
         interpretation = request.interpretation

@@ -145,7 +145,7 @@ class FleetCamera(Camera[ValueT]):
             lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
-        self.opening: asyncio.Task[None] | None = None  # its maker waits for its agent
+        self.opening: asyncio.Task[None] | None = None  # the fleet that made it waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
         self._trying = True  # whether the agent's first attempt to connect has not ended

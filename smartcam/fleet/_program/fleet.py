@@ -736,7 +736,7 @@ class Fleet:
                 }
         finally:
             for doing_of_camera in doing.values():
-                doing_of_camera.close()  # its task may never have begun
+                doing_of_camera.close()  # the cancelled task may never have begun
         outcomes = {name: task.result() for name, task in tasks.items()}
         if all(isinstance(outcome, ConfigurationError) for outcome in outcomes.values()):
             raise next(iter(outcomes.values()))

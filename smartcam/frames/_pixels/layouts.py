@@ -79,7 +79,7 @@ class PixelLayout(ABC):
         raise picture.wrong("a format of Y, U and V", "one without")
 
     def check(self, picture: RawPicture) -> None:
-        """Check that the bytes can be such a picture."""
+        """Check that the bytes can be a picture of this layout."""
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
             raise picture.wrong("a width and a height of 1 or more", f"{width}x{height}")
@@ -140,7 +140,7 @@ class SampleLayout(PixelLayout):
         return stride * (height - 1) + self.least_stride(width)
 
     def check(self, picture: RawPicture) -> None:
-        """Check that the bytes can be such a picture."""
+        """Check that the bytes can be a picture of this layout."""
         if self.packing is not None and picture.stride == 0:
             width = picture.width * picture.height
             picture = picture._replace(width=width, height=1, stride=self.least_stride(width))

@@ -63,7 +63,7 @@ CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
 """Formats of conversion on request, with FFmpeg's names."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
-_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
+_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # PyAV's names
 BT709, BT601, BT2020 = 1, 6, 9  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M, AVCOL_SPC_BT2020_NCL
 
 MATRIX_OF_SPACE: Final = {

@@ -140,7 +140,7 @@ class Ranges:
 
 
 class PyramidLevel:
-    """One level of a picture's pyramid; what is worked out of it is kept."""
+    """One level of a picture's pyramid; computed values are kept."""
 
     def __init__(self, grey: NDArray[np.uint8], noise: float) -> None:
         self.grey = grey

@@ -90,9 +90,9 @@ class FineSettings(NamedTuple):
     contrast: Array  # (N,), grey levels from the darker to the brighter side at least
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
-    scaled: bool = False  # whether the scale is anything; else it is near that of the start
-    least_score: float = 0.0  # of a pose whose ground matters
-    turned: bool = True  # whether the angle is fitted; that of a round part is not
+    scaled: bool = False  # whether any scale is allowed; else only one near the start's
+    least_score: float = 0.0  # ground beside the edges, for a pose that it changes
+    turned: bool = True  # whether the angle is fitted; for a round part it is not
 
 
 class PartShape(NamedTuple):
@@ -100,7 +100,7 @@ class PartShape(NamedTuple):
 
     pose: PixelPose
     stretch: float = 0.0  # longer along the taught x and shorter along y, in parts
-    shear: float = 0.0  # the same along the diagonals
+    shear: float = 0.0  # shear: the stretch along the diagonals
     growth: float = 0.0  # pixels of the picture that edges are nearer to their brighter side
 
     def moved(self, move: Array) -> PartShape:
@@ -259,7 +259,7 @@ def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
 
 
 def _misfits(fit: StepFit, use: FineSettings) -> Array:
-    """Return the rms about each step beyond the noise, in parts of what an edge may have."""
+    """Return the RMS around each step beyond the noise, as a part of the largest allowed one."""
     # by chance a band's pixels stray more or less than others
     noise = use.noise**2 * (1 + 3 * np.sqrt(2 / fit.freedoms))
     beyond = np.sqrt(np.maximum(fit.variances - noise, 0.0))
@@ -347,7 +347,7 @@ def _result(
     use: FineSettings,
     expected: Expected,
 ) -> FinePose | None:
-    """Return the pose with what the steps at it say."""
+    """Return the pose, with the brightness steps along its outline."""
     free = np.array([True, True, use.turned, True, True, True, True])
     fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
@@ -407,7 +407,7 @@ def _settled(
     rows, shifts, weights = equations
     away = np.abs(shifts) * np.sqrt(weights)
     used, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
-    if used.any():  # where the whole part is not quite the taught one, as in too much light
+    if used.any():  # if the whole part differs from the taught one, as in too much light
         spread = max(1.4826 * float(np.median(away[used])), 1.0)
     for _ in range(3):
         used = (weights > 0) & (away <= CUT * spread)
@@ -432,7 +432,7 @@ def _changed(
     sigmas: Array,
     chi_square: float,
 ) -> tuple[Array, Array] | None:
-    """Return the solution in which the part is as it is expected where it may be.
+    """Return the solution in which the part has its expected shape, as far as that is allowed.
 
     What the edges say of a change beyond their own error says how large that change may be.
     """

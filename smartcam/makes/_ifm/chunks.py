@@ -1,4 +1,4 @@
-"""Images as PCIC has them: chunks, each with a header of numbers and a picture."""
+"""Images in PCIC's form: chunks, each with a header of numbers and a picture."""
 
 from __future__ import annotations
 

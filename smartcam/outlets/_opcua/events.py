@@ -114,6 +114,6 @@ def _type_of(field: str, data_type: Any) -> ua.VariantType:
         return ua.VariantType.NodeId
     if field in _TYPES:
         return _TYPES[field]
-    if isinstance(data_type, ua.NodeId):  # of a time
+    if isinstance(data_type, ua.NodeId):  # type of a time
         return ua.VariantType.DateTime
     return ua.VariantType(data_type)

@@ -113,7 +113,9 @@ class VisionSystem:
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
         self._preparing = False
-        self._stopped = False  # this server stopped the camera: start it before the next trigger
+        self._stopped = (
+            False  # whether this server stopped the camera: start it before the next trigger
+        )
         self._owed_until = -1.0  # until then a result may belong to a job that was given up
         self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
         self._last_continuous: VisionJob | None = None
@@ -434,7 +436,7 @@ class VisionSystem:
         if job.single and job.trigger is None and owed:
             self._owed_until = loop.time() + OWED_SECONDS
         if job.trigger is not None:
-            self._by_trigger.pop(job.trigger, None)  # its end counts as its one result
+            self._by_trigger.pop(job.trigger, None)  # the end of the job counts as its only result
         if not job.single:
             self._last_continuous = job
             self._stopped = True
@@ -514,7 +516,7 @@ class VisionSystem:
         if job is None or job.single or at < job.started or (trigger and trigger < job.started):
             return None
         if clock < self._owed_until:
-            self._owed_until = -1.0  # it may be the result of a job that was given up
+            self._owed_until = -1.0  # the result may be one of a job that was given up
             return None
         if job.ended_clock is not None and clock > job.ended_clock + CONTINUOUS_GRACE:
             return None

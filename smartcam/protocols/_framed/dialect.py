@@ -268,7 +268,7 @@ class Codec:
             return make
         (fill_1, value_1), (fill_2, value_2), (fill_3, value_3), (fill_4, value_4) = others
 
-        def make_result(data: bytes) -> Message:  # as make() does, without a loop
+        def make_result(data: bytes) -> Message:  # same result as make(), without a loop
             made = new(kind)
             fill_1(made, value_1)
             fill_2(made, value_2)
@@ -516,7 +516,7 @@ class FramedDialect(Dialect):
         if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
             fields = codec.spell(frame.payload)
         else:
-            with contextlib.suppress(RemoteProtocolError):  # its error follows in the trace
+            with contextlib.suppress(RemoteProtocolError):  # the frame's error follows in the trace
                 message = self.decode(sender, frame)
                 names = self.fields(type(message))
                 fields = {name: jsonable(getattr(message, name)) for name in names}

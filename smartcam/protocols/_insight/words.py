@@ -94,7 +94,7 @@ class AnswerForm(enum.Enum):
     CODE = "code"
     """The code, nothing else."""
     BARE = "bare"
-    """One line with the value; no code comes before it."""
+    """Form of an answer: one line with the value, without a code before it."""
     LINE = "line"
     """The code, then one line."""
     INFO = "info"

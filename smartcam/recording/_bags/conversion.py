@@ -176,7 +176,7 @@ class BagConversion:
         """Return a result as it is written to the bag."""
         if self._readers:
             return self._readers[result.camera].read(result)
-        if result.value == result.raw.hex():  # as bytes stand in a recording
+        if result.value == result.raw.hex():  # text form of bytes in a recording
             return ReadResult(result._replace(value=result.raw))
         parts = parts_from_json(result.value)
         return ReadResult(result if parts is None else result._replace(value=parts))

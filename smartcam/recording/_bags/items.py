@@ -165,7 +165,7 @@ class BagItems:
 
     def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
         at, made = nanoseconds(result.received_at), camera.make
-        if result.application < 0:  # its application is unknown
+        if result.application < 0:  # the result's application is unknown
             result = result._replace(application=0)
         parts = None if error else camera.specs.parts(result)
         frames = {part.pose.header.frame_id for part in parts or ()}

@@ -121,7 +121,9 @@ class CameraResults:
         except ConfigurationError as exc:
             if kind != DETECTIONS:
                 raise
-            logger.info("%s: without %s: %s", self._node.full_name, name, exc)  # as in ROS 1
+            logger.info(
+                "%s: without %s: %s", self._node.full_name, name, exc
+            )  # ROS 1 does the same
 
     async def close(self) -> None:
         """Stop publishing, and withdraw the topics. Idempotent."""

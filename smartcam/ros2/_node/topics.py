@@ -200,7 +200,7 @@ class RosPublisher(RosEnd):
         attachment = self._attachment()
         waits = self._context.waits(self)
         if len(data) > MAX_DIRECT_BYTES and self._lane == "short" and not waits:
-            self._lane = "long"  # from now on, since a short message would overtake it
+            self._lane = "long"  # all later messages, too: a short one would overtake it
         if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1

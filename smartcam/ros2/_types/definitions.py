@@ -50,7 +50,7 @@ class MessageField(NamedTuple):
 
     @property
     def attribute(self) -> str:
-        """Its name in Python."""
+        """Name of the field in Python."""
         return f"{self.name}_" if keyword.iskeyword(self.name) else self.name
 
     @property

@@ -127,7 +127,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         Raises:
             ConfigurationError: the interpreter takes no layout, needs one, or not this one.
         """
-        spec = type(self).spec  # from the object, a function would be a method
+        spec = type(self).spec  # read from the object, a function would become a method
         if layout is None:
             return resolve(spec)
         if isinstance(spec, str):

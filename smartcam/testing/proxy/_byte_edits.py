@@ -104,7 +104,7 @@ class Editor:
             elif begins:
                 if isinstance(rule, Drip):
                     self._flush()
-                    self._edits.append(_gap(0.0))  # its first byte is written alone, too
+                    self._edits.append(_gap(0.0))  # the first byte is written alone, too
                 self._active[order] = rule
                 self._active = dict(sorted(self._active.items()))
             else:

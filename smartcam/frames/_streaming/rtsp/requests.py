@@ -56,7 +56,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
         raise RtspError(
             551, f"no option is known, {wanted[:80]!r} neither", (("Unsupported", wanted),)
         )
-    if method == "OPTIONS":  # this request needs no password
+    if method == "OPTIONS":  # OPTIONS needs no password
         return await _options(connection, request)
     connection.gate.check(request)
     for session in connection.sessions.values():

@@ -180,7 +180,7 @@ class MachineChecks(Parameters):
             if datagrams:
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
             if messages > MAX_MESSAGES:
-                break  # they are messages
+                break  # reports are messages
         bytes_kept = tracemalloc.get_traced_memory()[0] - before
         assert bytes_kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
             f"{where}: the machine has grown by {bytes_kept} bytes"
