@@ -2,8 +2,8 @@
 
 A part and a mark are taught from drawn pictures. The robot touches the mark at nine places, and
 these pairs give the calibration. Then the tool ``locate`` gives each part's pose in the
-robot's frame, and its uncertainty. The robot's actions are compared with the truth, which a
-real cell does not know.
+robot's frame, and its uncertainty. The robot's actions are compared with the true poses,
+which are unknown in a real cell.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ async def _run(demo: _Demo) -> None:
         places=len(pattern),
     )
     steps.step(
-        f"Models, calibration, cell file and pictures stand in {demo.folder}. Try on them what you "
-        "change:"
+        f"Models, calibration, cell file and pictures are in {demo.folder}. Try changed settings "
+        "on the pictures:"
     )
     cell, to = demo.folder / CELL_FILE, demo.folder / "judged"
     steps.detail(f"   smartcam inspect {cell} desk/camera 1 {to}")

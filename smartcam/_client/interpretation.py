@@ -1,8 +1,8 @@
 """Make a :class:`~smartcam.Result` from a result container: choose the interpreter, and run it.
 
 ``interpret_as`` is one specification for all containers, or a mapping from application id to one.
-``calibration`` follows the interpreter, for all applications or for each one; with it, only values
-that it has turned into poses of the robot pass.
+``calibration`` is applied after the interpreter, one for all applications or one for each. Then
+only values that are poses of the robot are returned.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def byte_order(endian: int) -> ByteOrder:
     )
 
 
-# takes half the time of a NamedTuple's own; a cast, since a bare tuple is generic
+# faster than a NamedTuple's own constructor; the cast gives it a type
 new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 MAX_NUMBER = (1 << 31) - 1
-"""Largest own sequence number: it fits into an int32 in the container."""
+"""Largest sequence number of a trigger: it fits into an int32 in the container."""
 
 
 Interpreted: TypeAlias = tuple[Any, int | None, int]
@@ -68,11 +68,11 @@ Interpreted: TypeAlias = tuple[Any, int | None, int]
 
 
 class Numbering(NamedTuple):
-    """The form in which a layout carries the sequence number.
+    """The place of the sequence number in a layout.
 
     Attributes:
-        highest: the largest number that its field holds, at most 2^31 - 1.
-        always: whether each container has it; False if it is in a record that may be missing.
+        highest: the largest number that the field holds, at most 2^31 - 1.
+        always: whether each container has the number, not only those with records.
     """
 
     highest: int
@@ -224,7 +224,7 @@ class Interpretation:
     def _context(
         self, application: int, endian: int, camera: str, number: int, at: datetime
     ) -> Context:
-        """Return the context for a plain interpreter: always one object, as none keeps it."""
+        """Return the context for a plain interpreter, a shared object."""
         context = self._plain_context
         if endian != self._endian:
             context.byte_order, self._endian = byte_order(endian), endian
@@ -243,9 +243,9 @@ class Interpretation:
         number: int,
         at: datetime,
     ) -> tuple[Sequence[Any], int] | None:
-        """Return the values of several containers that came together, and their empty slots.
+        """Return the values of several containers that arrived together, and their empty slots.
 
-        None if they are to be interpreted one by one: the interpreter uses a Reader, a sequence
+        None if the containers must be interpreted singly: the interpreter uses a Reader, a sequence
         number must be read, or one container does not fit.
         """
         reader = self._reader_for(application)
@@ -261,7 +261,7 @@ class Interpretation:
             values = reader.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
             if self._calibrations is not None and reader.calibrated:
-                # each alone, so that its bits do not depend on the way it came
+                # one by one, so that the bits of a value do not depend on its companions
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
             raise
@@ -271,7 +271,7 @@ class Interpretation:
 
 
 class _Calibrations:
-    """The calibrations that each application's values go through.
+    """The calibrations that are applied to each application's values.
 
     Args:
         given: a value of ``calibration``, not None.
@@ -296,14 +296,14 @@ class _Calibrations:
             )
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
-        """Raise if no value of an interpreter would ever pass.
+        """Raise if the calibration can apply to no value of an interpreter.
 
         Args:
             application: id of the application whose results are read; None: any.
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: no value would pass; the text names the possible values.
+            ConfigurationError: it can apply to none; the text names the possible values.
         """
         given, known = [self._reader_of_all], self._by_application
         of = "" if application is None else f" of application {application}"
@@ -323,7 +323,7 @@ class _Calibrations:
             )
 
     def apply(self, value: object, application: int) -> Any:
-        """Return localizations in the robot's frame; if the calibration is None, any value.
+        """Return localizations in the robot's frame; the value itself if the calibration is None.
 
         Raises:
             InterpretationError: the value is no list of localizations, or the calibration failed,
@@ -411,7 +411,7 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 
 def without_poses(interpreter: Interpreter) -> str | None:
     """Return an interpreter's name if it is in ``_WITHOUT_POSES``; a subclass does not count."""
-    # exactly these types: a user's subclass may give anything
+    # exactly these types, since a subclass may return any value
     names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
     return next(names, None)
 

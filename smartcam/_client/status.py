@@ -1,4 +1,4 @@
-"""Get the camera's status, and wait for it."""
+"""Request the camera's status, and wait for a particular one."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 BUSY_PAUSE = 0.02
-"""Seconds until a camera that was too busy for a request is asked again."""
+"""Seconds until a request is repeated that the camera was too busy for."""
 
 
 def is_ready(status: Status) -> bool:
-    """Running and not BUSY."""
+    """Return True if the camera is Running and not BUSY."""
     return Status.RUNNING in status and Status.BUSY not in status
 
 
 @dataclass(eq=False)
 class StatusRequests:
-    """Waits for statuses, and requests them if they do not come by themselves."""
+    """Waits for statuses, and requests them if the camera does not send them by itself."""
 
     _connection: Connection
     _requests: Requests
@@ -41,20 +41,20 @@ class StatusRequests:
     _waits: Waits
 
     def begin_session(self) -> None:
-        """Request the status from now on, if it does not come by itself."""
+        """Request statuses from now on, if the camera does not send them by itself."""
         self._polling.begin_session()
 
     def end_session(self) -> None:
-        """Request no status any more."""
+        """Stop requesting statuses."""
         self._polling.end_session()
 
     def wanted(self) -> None:
-        """Request statuses for a new subscriber, if they do not come by themselves."""
+        """Request statuses for a new subscriber, if the camera does not send them by itself."""
         self._polling.wanted()
 
     @property
     def last(self) -> Status:
-        """The last status; there is one since the session was made."""
+        """The last status; every session begins with one."""
         return self._state.status or Status(0)
 
     async def until(
@@ -74,8 +74,8 @@ class StatusRequests:
             insist: request the status again if a report of it may have been lost.
 
         Raises:
-            ResponseTimeoutError: the status did not come in time; the text names it and the last
-                one.
+            ResponseTimeoutError: the status did not arrive in time; the text names it and the last
+                received one.
         """
         begin = asyncio.get_running_loop().time()
         try:
@@ -93,7 +93,7 @@ class StatusRequests:
     async def wait(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
         """Return the first status, the present one included, that ``predicate`` accepts.
 
-        It gets every status in order. Its errors are raised here.
+        ``predicate`` is called with every status in order; its errors are raised here.
 
         Raises:
             TimeoutError: at ``deadline`` (loop time).
@@ -123,8 +123,8 @@ class StatusRequests:
     async def demand(self, deadline: float) -> None:
         """Make the camera send its status, by Get status if the dialect has it.
 
-        Otherwise Connect brings one (SC manual p. 29, published). A Query goes first: a client that
-        has lost the session must not take it back by this.
+        Otherwise the camera sends one after Connect (SC manual p. 29, published). A Query goes
+        first, so that a client that has lost its session does not take it back by the Connect.
         """
         link = self._connection.require_link()
         if self._connection.features.polled:
@@ -135,7 +135,7 @@ class StatusRequests:
             link.send(m.Connect())
         except ResponseTimeoutError:
             pass  # the caller's time may not be over; keepalive detects a lost camera
-        except LocalProtocolError as exc:  # the last one's answer never came
+        except LocalProtocolError as exc:  # the last request's answer never arrived
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     async def refresh(self, deadline: float) -> None:
@@ -171,7 +171,7 @@ class StatusRequests:
                 f"{self._connection.name}: waited until the time was over for {what}; "
                 f"status: {self.last}"
             )
-        with contextlib.suppress(TimeoutError):  # and a loss ends it at once
+        with contextlib.suppress(TimeoutError):  # a loss ends the pause at once
             await self.wait(_never, now + BUSY_PAUSE)
 
 

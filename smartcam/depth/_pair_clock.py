@@ -39,12 +39,12 @@ class PairClock:
 
     def saw(self, left: Frame, right: Frame) -> None:
         """Record a pair; restart if a camera's frame numbers restarted."""
-        now = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
+        pair = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
         if self._pairs and not all(
-            a < b for a, b in zip(self._pairs[-1].sequence, now.sequence, strict=True)
+            a < b for a, b in zip(self._pairs[-1].sequence, pair.sequence, strict=True)
         ):
             self._pairs.clear()
-        self._pairs.append(now)
+        self._pairs.append(pair)
 
     def skew(self) -> float | None:
         """Return the median time, seconds, by which the right frames of recent pairs are later."""

@@ -1,4 +1,4 @@
-"""The findings of a search: protocols of open ports, and the cameras that answered."""
+"""Results of a search: the protocols of open ports, and the cameras that answered."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ class FoundPort:
     Attributes:
         host: address of the host.
         port: number of the port.
-        protocols: names of the protocols that it may speak, the most probable first; empty if the
-            received bytes fit none of them.
-        evidence: ``greeted``: it sent the greeting of the protocol's cameras; ``silent``: it sends
-            nothing before it receives something, like such cameras; ``said``: it sent something,
-            and the cameras' greeting is not known; ``ended``: it closed the connection at once, as
-            a camera with a client may; ``other``: it is no such camera.
-        said: bytes that it sent unasked, up to 512.
+        protocols: names of the protocols that the port may use, the most probable first; empty if
+            the received bytes fit none.
+        evidence: ``greeted``: the port sent the greeting of the protocol's cameras; ``silent``: it
+            sent nothing, like cameras of the protocol; ``said``: it sent something, and the
+            cameras' greeting is unknown; ``ended``: it closed the connection at once, as a camera
+            with a client may; ``other``: no camera of a known protocol.
+        said: bytes that the port sent without a request, up to 512.
         seconds: time until the connection was open.
         answer: the camera's description of itself, if it was asked and has answered.
-        refusal: reason why the camera has not answered, if it was asked.
+        refusal: reason why the camera did not answer, if it was asked.
     """
 
     host: str
@@ -62,7 +62,7 @@ class FoundPort:
 
     @property
     def greeting(self) -> str:
-        """The first line of the bytes that it sent unasked, unprintable characters as dots."""
+        """The first line that the port sent without a request, unprintable characters as dots."""
         lines = self.said.decode("latin-1").strip().splitlines()
         return (
             "".join(c if c.isascii() and c.isprintable() else "." for c in lines[0])
@@ -95,7 +95,7 @@ def ports_of(
     """Return the ports to open, and the protocols that may be spoken there.
 
     Raises:
-        ConfigurationError: a name is not that of a protocol over TCP, or a number is no port.
+        ConfigurationError: a name is no protocol over TCP, or a number is no port.
     """
     known = tcp_protocols()
     chosen = [*known]

@@ -30,17 +30,17 @@ SESSION_COUNT = 5
 """Number of sessions made one after the other, for the spread of the connect time."""
 
 CONNECTS_WITHIN = 3.0
-"""Seconds after which no further session is begun: on a slow link one or two must suffice."""
+"""Seconds after which no further session is begun; on a slow link one or two suffice."""
 
 KNOCK_TIMEOUT = 1.0
 """Seconds for a bare TCP connection, which tells an absent camera from one that closed the link."""
 
 KNOCK_AFTER = 0.25
-"""Seconds to wait before this connection: a camera going down closes its port a moment later."""
+"""Seconds to wait before the bare connection: a camera that shuts down closes its port later."""
 
 TAKEN_WITHIN = 10.0
-"""Seconds after its Connect within which a lost session was probably taken, by the client's own
-rule (see :mod:`smartcam._client.supervisor`)."""
+"""Seconds after Connect in which a lost session was probably taken, by the client's own rule (see
+:mod:`smartcam._client.supervisor`)."""
 
 
 # ---------------------------------------------------------------------- the name
@@ -217,10 +217,9 @@ def _folded(trials_made: list[Trial]) -> str:
 async def explain_loss(exam: Examination, error: SmartCamError) -> None:
     """Report why a session is over, without taking the camera.
 
-    A client that makes a new session and loses it again knows that it was taken
-    (ConnectionTakenError), but takes the camera back once for that. This function only opens a
-    bare TCP connection to see whether the camera is still there. A Connect takes a session
-    over, a connection does not (inferred).
+    A client can detect that its session was taken (ConnectionTakenError) only by taking the camera
+    back once. This function only opens a bare TCP connection, to see whether the camera still
+    listens. A Connect takes over a session, a connection does not (inferred).
     """
     age = asyncio.get_running_loop().time() - exam.connected_at
     cause = error.__cause__

@@ -23,7 +23,7 @@ MAX_PICTURE_BYTES: Final = 1 << 28
 kept in any case."""
 
 MAX_RESULTS: Final = 1000
-"""Largest number of results of a camera that wait for a picture that comes later."""
+"""Largest number of results of a camera that wait for their pictures."""
 
 
 class JudgedResult(NamedTuple):
@@ -32,9 +32,9 @@ class JudgedResult(NamedTuple):
     Attributes:
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
-        told: True if the picture was recorded for this result, as after ``read_image()``; False
-            if it was found by its time. Without a trigger of this client it cannot be found by
-            time: the picture is None.
+        told: True if the picture was recorded with the result's number, as after ``read_image()``;
+            False if it was found by its time. That needs a trigger of this client: without one,
+            the picture is None.
     """
 
     result: Result[Any]
@@ -43,7 +43,7 @@ class JudgedResult(NamedTuple):
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
-    """Yield each result with its picture, as soon as no later picture can be the result's."""
+    """Yield each result with its picture once no later picture can belong to the result."""
     matchers: dict[str, PictureMatcher] = {}
     for item in items:
         if isinstance(item, (RecordedPicture, Result)):
@@ -75,7 +75,7 @@ class PictureMatcher:
         self._max_bytes = max_bytes
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
-        self._dropped = -math.inf  # start of the exposure of the last picture no longer kept
+        self._dropped = -math.inf  # exposure start of the last dropped picture
         self._latest = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
@@ -92,7 +92,7 @@ class PictureMatcher:
             too_many = False
 
     def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
-        """Yield the results whose picture is known, or cannot come any more."""
+        """Yield the results whose picture is known, or can no longer arrive."""
         while self.results:
             result = self.results[0]
             found = self._reported_picture(result)
@@ -142,9 +142,7 @@ class PictureMatcher:
                 picture.result_number is None
                 and triggered <= began <= picture.frame.utc <= received
             ):
-                missing = (
-                    picture.left_out or picture.frame.lost
-                )  # a missing picture may be the result's
+                missing = picture.left_out or picture.frame.lost  # perhaps the result's picture
                 return None if missing else picture.frame
         return None
 

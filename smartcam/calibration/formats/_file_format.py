@@ -37,7 +37,7 @@ class Measured(Generic[T]):
     """A value read from a file whose format does not fix the unit of lengths."""
 
     value: T
-    unit: str | None = None  # unit that the file itself says, or None
+    unit: str | None = None  # unit that the file names, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Format(Generic[T]):
     # any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`
     parse: Callable[..., T | Measured[T]]
-    # function that makes a text, without ``head``, of a value; None for a format that is only read.
+    # function that returns a value as text without ``head``; None for a format that is only read.
     # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
     compose: Callable[[T], str] | None = None  # None: it is only read
     head: str = ""  # text at the beginning of each file
@@ -65,7 +65,7 @@ class Format(Generic[T]):
     ) -> T:
         """Read a file; errors are those of ``parse``, and UNIT_UNKNOWN.
 
-        ``unit``: unit of its lengths; None for the unit that the file or its format says.
+        ``unit``: unit of its lengths; None for the unit that the file or its format names.
         """
         with Path(path).open("rb") as stream:
             body = stream.read(self.most + 1)
@@ -113,7 +113,7 @@ class Format(Generic[T]):
 
 
 def _motions(value: Any) -> list[Transform]:
-    """Return the motions in the value of a file: one, lists of them to any depth, or a chain's."""
+    """Return all motions in a file's value: a motion, nested lists of motions, or a chain."""
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
@@ -122,7 +122,7 @@ def _motions(value: Any) -> list[Transform]:
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """Return the value that a file holds, with all translations multiplied by a factor."""
+    """Return a file's value with all translations multiplied by a factor."""
     if isinstance(value, Transform):
         return dataclasses.replace(value, translation=factor * value.translation)
     if isinstance(value, tuple) and hasattr(value, "_replace"):

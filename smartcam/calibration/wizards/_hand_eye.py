@@ -59,13 +59,13 @@ ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
 
 MAX_VIEWS = 40
-"""A run takes at most this many views: far more than it needs."""
+"""Largest number of views of a run, far more than are needed."""
 
 ADVISED_VIEWS = 10
-"""From this number of views on, the wizard offers to calculate first."""
+"""Number of views from which on the calculation is the wizard's first choice."""
 
 CALCULATION_TIMEOUT = 120.0
-"""Seconds that the calculation may take; with 15 views it takes a few."""
+"""Timeout of the calculation, seconds; with 15 views it takes a few seconds."""
 
 _MOVES: Mapping[str, str] = {
     "eye-in-hand": "Bring the camera to where it looks at the sheet",
@@ -76,8 +76,7 @@ TOUCHES = 3
 """Number of touches that verify a calibration, at points of the sheet that are far apart."""
 
 SUGGESTIONS = tuple(look.text for look in LOOKS)
-"""Views to take, one after the other; then again from the beginning, a bit beside the earlier
-ones."""
+"""Suggested views in order; after the last one they are suggested again, slightly changed."""
 
 
 def hand_eye_wizard(
@@ -104,9 +103,9 @@ def hand_eye_wizard(
         take_picture: function that takes a picture while the robot stands still; or an open source
             of frames, of which the first frame exposed after the button is used.
         save_to: function that returns the file for a name.
-        target: target on the sheet, with its lengths as they are on paper; None: it is asked for.
-        suggested: default of the target that is asked for.
-        read_robot: function that reads the pose of the flange; None: it is typed.
+        target: target on the sheet, with the lengths on paper; None: the wizard asks for it.
+        suggested: default of the question for the target.
+        read_robot: function that reads the pose of the flange; None: the user types poses.
         camera: the camera's lens; None: calibrated from the same views.
         awaited: description, for people, of the picture that ``take_picture`` waits for, as from
             :attr:`PictureFolder.awaited`; empty if ``take_picture`` takes one.
@@ -169,7 +168,7 @@ async def _ask_setup(
 
 @dataclass(eq=False)
 class _Views:
-    """One run of the wizard; its state follows from the answers alone."""
+    """One run of the wizard; its state depends on the answers only."""
 
     _target: Target
     _setup: Setup
@@ -285,7 +284,7 @@ class _Views:
         return bool(sample)
 
     def _progress(self, count: int) -> str:
-        """Return a text with the number of views so far, and those advised and allowed."""
+        """Return a text with the numbers of views so far, advised and allowed."""
         end = (
             "to end, choose to calculate"
             if count >= MIN_POSES
@@ -298,7 +297,7 @@ class _Views:
         if answers.get("next") == "calculate":
             return {}
         typed = None
-        if isinstance(self._robot, str):  # a pose that is not valid must not cost a picture
+        if isinstance(self._robot, str):  # refuse an invalid pose before a picture is taken
             typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
         flange = typed or await self._flange()
@@ -409,7 +408,7 @@ class _Views:
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
-    """Return the inputs of a pose; if it is ``optional``, it may be left out to calculate."""
+    """Return the inputs of a pose; if ``optional``, an empty pose means to calculate."""
     convention = ROBOTS[robot]
     unit = "mm" if convention.metre > 1 else "m"
     return tuple(

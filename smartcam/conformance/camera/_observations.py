@@ -1,6 +1,6 @@
 """Observe events that several checks need: inspections, switches, a reboot.
 
-Each observation is made at most once for a camera, so that a part is not inspected twenty times.
+Each observation is made at most once for a camera, since inspections take time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INSPECTION_COUNT = 3
-"""Number of inspections that are observed, so that a changing order shows."""
+"""Number of observed inspections; several show whether the order of messages varies."""
 
 REBOOT_POLL_INTERVAL = 0.25
 """Largest number of seconds between two Connects to a camera that restarts."""

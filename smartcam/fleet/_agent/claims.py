@@ -1,14 +1,14 @@
-"""Decide which agent of a fleet has a name and a camera, and let one that stands by take over.
+"""Decide which agent of a fleet has a name and a camera, and when a standby agent takes over.
 
 Two agents of one name see each other's starts. The earlier start keeps the name; the later agent
 gives up its cameras, and logs that.
 
 An agent announces a camera by a presence. Another agent with the same camera either refuses to
-start, or stands by: without a session, until that presence ends. If two agents share one camera
-after a split of the network, the camera decides, which serves the newcomer: the agent that has lost
-its session and sees the other's presence asks the other, and leaves the camera to it. Both may give
-up at the same time; so an agent that gave the camera up, and sees that the other does not have it
-any more, stands by again.
+start, or stands by: it has no session until that presence ends. If two agents share one camera
+after a split of the network, the camera decides, since it serves the newest client: the agent that
+has lost its session and sees the other's presence asks the other, and leaves the camera to it. Both
+may give up at the same time. So an agent that gave up the camera stands by again when the other no
+longer has it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 HOLD_OFF = 0.2
-"""Seconds per step of preference until an agent that stands by takes a camera without agent."""
+"""Seconds per step of preference until a standby agent takes a camera that has no agent."""
 
 ASK_TIMEOUT = 0.5
 """Seconds for another agent's answer, and between two checks of its cameras."""
@@ -50,19 +50,19 @@ RESOLVE_TIMEOUT = 2.0
 """Seconds of the timeout for the addresses of a host's name."""
 
 RETURN_WAIT = 4.0
-"""Seconds for others to return to a bus that was lost, before their cameras are taken over."""
+"""Seconds for other agents to return after a loss of the bus, before their cameras are taken."""
 
 CONTESTED_SECONDS = 30.0
-"""Seconds after another agent with the same camera came or went, in which that agent may be the one
-that takes the camera."""
+"""Seconds after another agent with the same camera appeared or disappeared, in which it is the
+probable taker of the camera."""
 
 TAKE_ONCE_SECONDS = 600.0
-"""Seconds in which a camera that another client took is not taken back a second time: a client that
-is not an agent would take it again, too."""
+"""Seconds in which a camera that another client took is taken back at most once: otherwise two
+clients would take it from each other again and again."""
 
 
 class Claims:
-    """The cameras that an agent has, or stands by for.
+    """The cameras that an agent shares or stands by for.
 
     Args:
         agent: the agent.
@@ -71,7 +71,7 @@ class Claims:
         standby: settings of standing by; None: the agent does not stand by.
 
     Attributes:
-        given_up: errors for cameras that another agent has now, by the camera's name.
+        given_up: errors for cameras that were left to another agent, by the camera's name.
     """
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:

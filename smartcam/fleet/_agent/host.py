@@ -1,4 +1,4 @@
-"""Hold an agent's camera: its session, its last state, and the right to command it."""
+"""Manage one camera of an agent: its session, its last state, and the right to command it."""
 
 from __future__ import annotations
 
@@ -51,23 +51,22 @@ if TYPE_CHECKING:
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
 STATUS_DELAY = 0.005
-"""Seconds that a status may wait for others, so that one message carries them. The program that
-triggered gets it with the reply."""
+"""Seconds that a status may wait for others, to be sent in one message. The program that triggered
+gets the status with the reply."""
 
 CATCH_UP = 0.2
-"""Seconds after such a reply until the number of the next state is sent, if no state was: otherwise
-a lost reply would stay unnoticed."""
+"""Seconds after a reply with a status until the number of the next state is sent, if no state was:
+otherwise a lost reply would stay unnoticed."""
 
 RESULTS_INTERVAL = 0.002
-"""Seconds that must pass between two messages with results: those that come faster are sent
-together."""
+"""Least seconds between two messages with results: faster results are sent together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
 """Results of this many bytes are sent at once, without RESULTS_INTERVAL."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds after the last results until their numbers are sent again: otherwise a loss of the last
-ones would stay unnoticed."""
+"""Seconds after the last results at which their numbers are sent again: otherwise a loss of these
+results would stay unnoticed."""
 
 
 class Host:
@@ -88,16 +87,16 @@ class Host:
 
     Attributes:
         epoch: number of the agent's start, or of its current hold of the camera.
-        began: number of the first result since then.
-        final: whether no other agent takes the camera over after the last session.
+        began: number of the first result of this epoch.
+        final: whether no other agent will take over the camera after the last session.
         gate: gate that decides which program's commands may pass.
         results: the last results.
         states: the last states of the camera.
-        outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
+        outcomes: runs of running triggers, by owner; only for owners that have added a list.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: reason why there is no session yet, None if there is or was one.
-        triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
+        failure: reason why there was no session yet; None if there was one.
+        triggers: numbers of programs' triggers, by outcome (a word of ``OUTCOMES``).
     """
 
     def __init__(
@@ -177,7 +176,7 @@ class Host:
     # ------------------------------------------------------------------ life
 
     async def run(self) -> None:
-        """Keep a session once there is a camera; return after the last one."""
+        """Keep a session with the camera; return after the last session."""
         backoff = self.settings.reconnect
         delays = iter(()) if backoff is None else backoff.delays()
         try:
@@ -207,7 +206,7 @@ class Host:
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
-        self._opened.clear()  # later messages bring nothing new
+        self._opened.clear()  # later messages have no further effect
         try:
             await self.frames.close()
         finally:
@@ -256,7 +255,7 @@ class Host:
                 self.triggers[outcome] += 1
 
     async def enter(self, program: str, action: str, timeout: float) -> None:
-        """Let a command of ``program`` begin, as :meth:`Gate.enter` does.
+        """Wait for the turn of a command of ``program``, like :meth:`Gate.enter`.
 
         Raises:
             ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
@@ -268,12 +267,12 @@ class Host:
             raise self._not_granted(action, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
-        """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
+        """Keep the commands of other programs out, like :meth:`Gate.reserve`.
 
-        If another agent may take the camera over, only the agent that has it can reserve it.
+        If another agent may take over the camera, it can be reserved only during a session.
 
         Raises:
-            ResponseTimeoutError: another program has it for ``timeout`` seconds more.
+            ResponseTimeoutError: another program holds it for longer than ``timeout`` seconds.
             LinkError: there is no session, and another agent may have one.
         """
         try:
@@ -291,7 +290,7 @@ class Host:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
-            ReservationLostError: the reservation has ended, or was kept by another agent.
+            ReservationLostError: the reservation has ended, or another agent granted it.
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(
@@ -301,10 +300,10 @@ class Host:
             )
 
     async def keeps(self, reservation: Hashable, timeout: float) -> bool:
-        """Return True if a reservation still holds and no other agent has the camera by now.
+        """Return True if a reservation still holds, and this agent still has the camera.
 
-        If another agent may take over, the camera is asked: it serves one client, so that an agent
-        that gets an answer still has the camera.
+        If another agent may take over, a request is sent to the camera. The camera serves one
+        client, so an answer shows that this agent still has it.
 
         Raises:
             SmartCamError: the camera does not answer.
@@ -315,7 +314,7 @@ class Host:
         return self.gate.holds(reservation)
 
     def lose_reservation(self) -> None:
-        """End a reservation, if there is one, before its holder releases it."""
+        """End a reservation that its holder has not released, if there is one."""
         if self.gate.holder is not None:
             self.gate.forget(self.gate.holder)
 
@@ -327,7 +326,7 @@ class Host:
             self.topics.on_state()
 
     def _not_granted(self, action: str, timeout: float) -> SmartCamError:
-        """Return the error for a program that waited in vain for others to let go of the camera."""
+        """Return the error for a program whose wait for other programs timed out."""
         holder = self.gate.holder
         holder_text = (
             "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
@@ -341,7 +340,7 @@ class Host:
     # ------------------------------------------------------------------ what the camera is
 
     def state(self) -> dict[str, Any]:
-        """Return the camera's fields of every state message."""
+        """Return the fields of a state message."""
         camera = self._camera
         try:
             status: int | None = int(camera.status)
@@ -362,7 +361,7 @@ class Host:
         return fields
 
     def known(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return the presence of a session, its status and application, or why there is none."""
+        """Return the presence of a session, its status and application, or the reason for none."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)
@@ -372,7 +371,7 @@ class Host:
         return trouble is None, status, camera.active_application, why
 
     def about(self) -> dict[str, Any]:
-        """Return the fields of the camera that stay the same for a whole session."""
+        """Return the fields of the camera that do not change during a session."""
         camera, settings = self._camera, self.settings
         fields: dict[str, Any] = {
             "camera": self.name,
@@ -411,7 +410,7 @@ class Host:
             state["about"] = self.about()
         self._publish_state(state)
         if isinstance(event, Disconnected) and not (event.expected or self.final):
-            self.lose_reservation()  # another agent may have the camera meanwhile
+            self.lose_reservation()  # another agent may have taken the camera
 
     def _on_end(self) -> None:
         if self._opened.is_set() and self.failure is None:
@@ -424,11 +423,11 @@ class Host:
         self._publish_state({"kind": "Removed", "why": why})
 
     def _on_taken(self) -> None:
-        """Announce that another client has the camera, which is tried again at intervals."""
+        """Announce that another client has the camera; sessions are tried at intervals."""
         self._publish_state({"kind": "Taken"})
 
     def _publish_state(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
-        """Send an event with the camera's state, within ``hold`` seconds or with the next event."""
+        """Send the camera's state with an event: after ``hold`` seconds, or with the next event."""
         clock = asyncio.get_running_loop().time()
         state = {**fields, **self.state(), "number": self.states.following, "clock": clock}
         self._add_state(encode_state(state), clock, hold)

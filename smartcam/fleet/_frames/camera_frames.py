@@ -1,9 +1,9 @@
 """Share a camera's frames at its agent: one source for all programs.
 
-A program that wants a stream asks for one frame after the other: the next request is here before
-the next frame, so nothing is late, and a program that stops asking gets nothing. Between two
-requests the agent keeps a reader for the program, which skips and counts like any other. It ends
-with its program, or after a while without a request; with the last reader the device stops.
+A program with a stream requests one frame after the other. The request arrives before the next
+frame, so it costs no time; a program that stops requesting gets no frames. Between two requests the
+agent keeps a reader for the program, which skips and counts frames like any reader. The reader is
+closed with its program, or after a time without a request; the device stops with the last reader.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ MAX_STREAMS_PER_PROGRAM = 16
 """Largest number of streams of one camera that one program may have."""
 
 MAX_FRAME_CALLS_PER_PROGRAM = 16
-"""Largest number of calls for frames of one camera that one program may have pending: each may keep
+"""Largest number of calls for frames of one camera that one program may have pending: each may hold
 a frame."""
 
 MAX_ENCODINGS = 16
-"""Number of encodings whose last frame is kept, for viewers that want the same."""
+"""Number of encodings whose last frame is kept for other viewers with the same encoding."""
 
 MAX_VIDEO_SETTINGS = 4
 """Largest number of settings of H.264 that are encoded at one time."""
@@ -152,7 +152,7 @@ class SharedFrames:
         return None if self._source is None else self._source.statistics()
 
     def forget(self, program: str) -> None:
-        """Drop the streams of a program that is gone."""
+        """Drop the streams of a program that has left the bus."""
         for key in [key for key in self._viewers if key[0] == program]:
             self._viewers.pop(key).close()
 
@@ -163,7 +163,7 @@ class SharedFrames:
             UnsupportedError: the camera has none.
             FrameSourceError: the source cannot be opened; the next one tries again.
 
-        Cancellation: it is opened nevertheless, for the next viewer.
+        Cancellation: the source is opened nevertheless, for the next viewer.
         """
         if self._source is not None:
             return self._source
@@ -200,7 +200,7 @@ class SharedFrames:
     async def frame(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
-        """Send one frame, as :meth:`get` has it."""
+        """Send the frame that :meth:`get` returns."""
         asked_at = asyncio.get_running_loop().time()
         frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
         self._send([frame], order)
@@ -209,7 +209,7 @@ class SharedFrames:
     async def get(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> tuple[Frame, float]:
-        """Return one frame, and the seconds that it took to encode it.
+        """Return one frame, and the seconds of its encoding.
 
         Args:
             order: the asking program, and the form of the frame.
@@ -237,7 +237,7 @@ class SharedFrames:
         return {"came": asked_at, "frame": self._frame_fields(frame, took)}
 
     async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
-        """Trigger the device; return its picture, and the seconds that it took to encode it."""
+        """Trigger the device; return its picture, and the seconds of its encoding."""
         loop = asyncio.get_running_loop()
         end = loop.time() + order.timeout
         with self._counted(order):
@@ -265,7 +265,7 @@ class SharedFrames:
         return {"features": [feature_fields(feature) for feature in descriptions]}
 
     async def set_feature(self, name: str, value: Any, timeout: float) -> dict[str, Any]:
-        """Set a feature; return the value that the device has then."""
+        """Set a feature; return the value that the device accepted."""
         source = await self._soon(timeout)
         return {"value": await source.features[name].set(value, timeout=timeout)}
 
@@ -280,7 +280,7 @@ class SharedFrames:
                 return await self.source()
 
     async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
-        """Send the new frames of a stream; after a while without any, send that there are none."""
+        """Send the new frames of a stream; an empty list after a time without a frame."""
         asked_at = asyncio.get_running_loop().time()
         key = order.program, stream
         with self._counted(order):
@@ -358,7 +358,7 @@ class SharedFrames:
         return video
 
     def _leave_video(self, video: SharedVideo) -> None:
-        """Take one viewer from an H.264 stream, and end a stream without viewers."""
+        """Remove a viewer of an H.264 stream; end the stream with its last viewer."""
         video.viewers -= 1
         if video.viewers:
             return
@@ -410,7 +410,7 @@ class SharedFrames:
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
     def _all_fields(self, taken: list[TakenFrame]) -> dict[str, Any]:
-        """Return the fields that describe all frames that go together."""
+        """Return the fields that describe the frames of one reply."""
         if not taken[-1].number:
             return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
         units = [
@@ -436,7 +436,7 @@ class SharedFrames:
         return made, 0.0 if made is frame else time.perf_counter() - began
 
     def _begin(self, work: Coroutine[Any, Any, T], name: str) -> asyncio.Task[T]:
-        """Start work for tasks that wait for it; it ends with the agent."""
+        """Start a task that other tasks await; it ends with the agent at the latest."""
         task = asyncio.get_running_loop().create_task(
             work, name=f"smartcam.fleet.{self.name}.{name}"
         )
@@ -481,7 +481,7 @@ class SharedFrames:
 
     @contextlib.contextmanager
     def _within(self, seconds: float, operation: str) -> Iterator[None]:
-        """Make a timeout name what it waited for."""
+        """Raise a timeout in the block as an error that names the operation."""
         try:
             yield
         except TimeoutError as exc:

@@ -1,8 +1,8 @@
 """Subscribe once for many cameras, instead of once for each.
 
 A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.cover` declares
-one subscription for all, and the messages are distributed here by their keys; a dictionary costs
-less than the engine's subscription does, on both sides.
+one subscription for all, and this module distributes the messages by their keys: a dictionary
+costs less than a subscription of the engine, on both sides.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 ASK_AGAIN = 0.5
-"""Seconds for an agent's answer about its next numbers; then it is asked again."""
+"""Seconds for an agent's answer with its next numbers, after which the question is repeated."""
 
 MAX_AGENTS_NUMBERED = 1000
 """Largest number of agents whose bundles' numbers are remembered."""
@@ -77,7 +77,7 @@ class Exchange(Bus):
     # ------------------------------------------------------------------ for many
 
     def see_all(self, see: Callable[[str, bool], None]) -> None:
-        """Follow all cameras' presences from now on, for watchers of one camera or of all.
+        """Watch all cameras' presences from now on, for watchers of one camera or of all.
 
         ``see(key, present)`` is called for each.
         """
@@ -97,7 +97,7 @@ class Exchange(Bus):
             made = bus.watch(keys.camera("*", "**"), self._on_presence)
         self._covers[kind] = made
         for places in [*self._places.get(kind, {}).values()]:
-            # a message that comes twice meanwhile is taken once, by its number
+            # a message that arrives twice now is taken once, by its number
             for place in places:
                 own, place.cover = place.cover, None
                 if own is not None:
@@ -124,7 +124,7 @@ class Exchange(Bus):
         return place
 
     def _name(self, key: str) -> str:
-        """Return the name of a receiver's key; for a presence it is that of any agent."""
+        """Return the name in a receiver's key; for a presence, with any agent."""
         return key.split("/", 5)[5] if "/presence/camera/" in key else key
 
     def drop(self, place: _BusPlace) -> None:

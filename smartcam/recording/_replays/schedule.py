@@ -1,7 +1,8 @@
 """Plan a replay from a recording's frames, or from its results without frames; no I/O.
 
-A container belongs to the oldest trigger without one. Other containers came without a trigger of
-the client: by the digital input, if the application waits for triggers, or from a free run.
+A container belongs to the oldest trigger without a container. Other containers have no trigger of
+the client: they come from the digital input, if the application waits for triggers, or from a free
+run.
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ class RecordedRun:
 
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
-    seconds: float  # seconds from its beginning to its first container, or to its end without one
-    # seconds from the end of the take before, or from the start of the run, to its beginning; only
+    seconds: float  # seconds from the run's beginning to its first container, else to its end
+    # seconds from the end of the earlier take, or from the start of the run, to this one; only
     # for a take without a trigger
     gap: float = 0.0
-    drops: int = 0  # triggers that the camera dropped before it
+    drops: int = 0  # triggers that the camera dropped before this run
 
 
 @dataclass(slots=True)
@@ -77,7 +78,7 @@ class ApplicationRuns:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A condition that is set or cleared, seconds after the start of the first session."""
+    """A change of conditions at a time in seconds after the start of the first session."""
 
     at: float
     condition: Status
@@ -451,7 +452,7 @@ class _ScheduleMaker:
         self.began: float | None = None
         self.now: float = 0.0  # time of the last step, seconds
         self.first: int | None = None  # application of the first container; None before
-        self.ran_at_first: bool = False  # the first status said Running
+        self.ran_at_first: bool = False  # whether Running was set in the first status
         self.endian: int = 0  # byte order of the last status before the first container
         self.conditions: Status = Status(0)  # conditions of the first status
         self.changes: list[Change] = []  # changes of conditions so far
@@ -463,7 +464,7 @@ class _ScheduleMaker:
         self._drops = 0  # number of triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # times at which Waiting for Trigger rose, fell
         self._open: RecordedRun | None = None  # take whose inspection may send more containers
-        self._opened = 0.0  # time of its first container
+        self._opened = 0.0  # time of the first container of that take
         self._began_untriggered: float | None = None  # start of an inspection without a trigger
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._switching: tuple[float, int] | None = None
@@ -485,7 +486,7 @@ class _ScheduleMaker:
         self._takers[step.kind](step)
 
     def finish(self) -> None:
-        """End the plan, without the result of a trigger under way, which is unknown."""
+        """End the plan, without a trigger whose result was not recorded."""
         self._triggers.clear()
 
     # ------------------------------------------------------------------ steps
@@ -584,11 +585,11 @@ class _ScheduleMaker:
 
     @property
     def _waits(self) -> bool:
-        """True if the last status says that the camera waits for a trigger."""
+        """True if the camera waits for a trigger, by its last status."""
         return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
 
     def _is_over(self) -> bool:
-        """Return True if the camera waits, and was silent too long for more results."""
+        """Return True if the camera waits, and more results can no longer arrive."""
         return self._waits and self.now - self._opened > MAX_TIME_BEHIND_FIRST
 
     # ------------------------------------------------------------------ inside
@@ -599,7 +600,7 @@ class _ScheduleMaker:
         return gap
 
     def _give_up(self) -> None:
-        """End the inspection under way, whose trigger has no result."""
+        """End the running inspection, whose trigger has no result."""
         if self._active is not None and self._list(self._active).waits:
             for began in self._triggers:
                 ended = self._waits_from if self._waits_from > began else self.now
