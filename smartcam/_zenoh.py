@@ -286,7 +286,7 @@ class ZenohSession:
         self._woken = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
-        self._told_dropped = False
+        self._reported_dropped = False
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         self._reopening = False
@@ -521,8 +521,8 @@ class ZenohSession:
             waiting = self._bytes - self._taken_bytes
         if waiting + size <= MAX_WAITING_BYTES:
             return False
-        if not self._told_dropped:
-            self._told_dropped = True
+        if not self._reported_dropped:
+            self._reported_dropped = True
             logger.warning(
                 "%s ! this program does not read: %d bytes wait; more is dropped",
                 self._link.place,

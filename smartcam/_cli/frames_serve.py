@@ -182,7 +182,7 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
         lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
         value = {"page": site.url, **({"rtsp": urls} if urls else {})}
         options.show(value, "\n".join(lines))
-        jobs = [_tell_viewers(site, server), tries.watch()]
+        jobs = [_show_viewers(site, server), tries.watch()]
         if players.rtp is not None:
             jobs.append(send_rtp(site.sources[0], players, options))
         await first(jobs, options.seconds)
@@ -231,7 +231,7 @@ class _Tries:
 # ---------------------------------------------------------------------- viewers
 
 
-async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
+async def _show_viewers(site: FramesSite, server: RtspServer | None) -> None:
     """Report the viewers on a terminal's stderr, whenever they change; until cancelled."""
     if not sys.stderr.isatty():
         await asyncio.Event().wait()

@@ -91,7 +91,7 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
         make = stack.enter_context(options.cameras(url, reconnect=Backoff()))
         first = make()
         server = await stack.enter_async_context(Gateway(first, settings))
-        stack.callback(_tell_account, server, options)
+        stack.callback(_log_account, server, options)
 
         def show() -> None:
             value = {"gateway": server.address, "camera": url}
@@ -99,10 +99,12 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
 
         with contextlib.suppress(TimeoutError):  # --seconds are over
             async with asyncio.timeout(options.seconds):
-                await _have_open(server, make, show)
+                await _ensure_open(server, make, show)
 
 
-async def _have_open(server: Gateway, make: Callable[[], Camera], show: Callable[[], None]) -> None:
+async def _ensure_open(
+    server: Gateway, make: Callable[[], Camera], show: Callable[[], None]
+) -> None:
     """Keep the camera open, and show the gateway once opening was tried for the first time."""
     from smartcam._cli.live import have_open
 
@@ -174,7 +176,7 @@ async def _emulated(options: Options) -> AsyncIterator[str]:
         yield emulator.url
 
 
-def _tell_account(server: Gateway, options: Options) -> None:
+def _log_account(server: Gateway, options: Options) -> None:
     """Print the account of all requests and parts."""
     account = server.account
     if options.as_json:

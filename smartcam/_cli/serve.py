@@ -126,7 +126,7 @@ class Serving:
             if server.file.outlets is not None:
                 from smartcam.fleet._inside import FleetOutlets
 
-                await stack.enter_async_context(FleetOutlets(server, self._tell_outlet))
+                await stack.enter_async_context(FleetOutlets(server, self._notify_outlet))
             await self._enter(stack)
             stack.callback(notifier.stopping)
             server.reloads.on_reload = self._on_reload
@@ -167,7 +167,7 @@ class Serving:
         else:
             click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
 
-    def _tell_outlet(self, name: str, why: str) -> None:
+    def _notify_outlet(self, name: str, why: str) -> None:
         if not self._as_lines:  # otherwise it was logged
             text = why or "delivers again"
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)

@@ -51,12 +51,12 @@ class JsonErrors(click.Command):
         **extra: Any,
     ) -> click.Context:
         """Parse."""
-        with _told_as_json("--json" in args):
+        with _reported_as_json("--json" in args):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run."""
-        with _told_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
+        with _reported_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
             return super().invoke(ctx)
 
 
@@ -96,7 +96,7 @@ def write_commands(group: click.Group, ctx: click.Context, formatter: click.Help
 
 
 @contextlib.contextmanager
-def _told_as_json(wanted: bool) -> Iterator[None]:
+def _reported_as_json(wanted: bool) -> Iterator[None]:
     try:
         with _options_suggested(), _numbers_explained():
             yield

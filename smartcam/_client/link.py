@@ -252,7 +252,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         try:
             if self._transport is None or self._closed:
                 return
-            self._say_goodbye()
+            self._send_goodbye()
             if self._datagrams:
                 self._transport.close()
             elif not self._transport.is_closing():
@@ -272,7 +272,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def give_up(self, reason: BaseException) -> None:
         """Drop the link at once, but send Disconnect first if there is a session."""
         if self._transport is not None and not self._transport.is_closing():
-            self._say_goodbye()
+            self._send_goodbye()
         self.abort(reason)
 
     def lost_error(self) -> ConnectionLostError:
@@ -411,7 +411,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.machine.receive_data(data)
         return None
 
-    def _say_goodbye(self) -> None:
+    def _send_goodbye(self) -> None:
         if self.machine.state in {State.CONNECTED, State.CONNECTING}:
             self.machine.send(Disconnect())
             self._flush()

@@ -146,7 +146,7 @@ def _compare(exam: Examination, interpreter: Interpreter, containers: list[Resul
     readings: list[Reading] = [result.value for result in containers]
     for result, reading in zip(containers, readings, strict=True):
         if reading.error is not None:
-            _say_misfit(exam, interpreter, result, reading, reading.error)
+            _report_misfit(exam, interpreter, result, reading, reading.error)
             return
     fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
     exam.report("ok", f"{len(readings)} results {fit}", results=len(readings))
@@ -161,7 +161,7 @@ def _listed(sizes: Sequence[int]) -> str:
     return shown + (" ..." if len(sizes) > 8 else "")
 
 
-def _say_misfit(
+def _report_misfit(
     exam: Examination,
     interpreter: Interpreter,
     result: Result,

@@ -106,10 +106,10 @@ async def connect(exam: Examination) -> None:
     exam.camera, exam.connected_at = camera, loop.time()
     if first is not None and len(times) > 1:
         del times[0]  # the time includes the search for the dialect
-    _say_session(exam, camera, first, times)
+    _report_session(exam, camera, first, times)
 
 
-def _say_session(
+def _report_session(
     exam: Examination, camera: Camera, first: float | None, times: list[float]
 ) -> None:
     measured = figures(times)
@@ -136,7 +136,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
     address, trials_made = exam.address, await _try_all(exam)
     answer = trials_made[-1].answer
     if answer is None:
-        _say_no_session(exam, trials_made, None)
+        _report_no_session(exam, trials_made, None)
         return None
     exam.pin(answer.url)
     if exam.address.scheme == address.scheme and address.dialect in {None, exam.address.dialect}:
@@ -148,7 +148,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
             attempts=list(failure.attempts),
         )
     else:
-        _say_no_session(exam, trials_made, answer)
+        _report_no_session(exam, trials_made, answer)
     try:
         return await exam.make_camera().open()
     except ConnectFailedError as exc:
@@ -164,7 +164,7 @@ async def _try_all(exam: Examination) -> list[Trial]:
         return [trial async for trial in tries]
 
 
-def _say_no_session(
+def _report_no_session(
     exam: Examination, trials_made: list[Trial], answer: CameraAnswer | None
 ) -> None:
     address = trials_made[0].address

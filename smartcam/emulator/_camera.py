@@ -382,7 +382,7 @@ class EmulatedCamera(WireCamera):
                 self._active = None
                 link.session_ended()
         self._collect()
-        self.device.tell_entered()
+        self.device.report_entered()
         if faults:
             self._act(faults, "after")
 
@@ -399,9 +399,9 @@ class EmulatedCamera(WireCamera):
         """Let another client connect; it gets the session unless a quirk refuses newcomers."""
         if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
             return
-        self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
+        self._hand_session(SecondClientSession(self.spoken, self._notified_second_client))
 
-    def _told_second_client(self, frame: Frame) -> None:
+    def _notified_second_client(self, frame: Frame) -> None:
         self._note(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
 
     def _connect(self, link: ClientLink) -> None:
@@ -468,7 +468,7 @@ class EmulatedCamera(WireCamera):
             self._act(faults, "after")
 
     def _settle(self) -> None:
-        self.device.tell_entered()
+        self.device.report_entered()
         self._collect()
         if self._active is not None:
             self._active.flush()

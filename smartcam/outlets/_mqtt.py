@@ -322,7 +322,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def _hear(self, client: Any) -> None:
         """Publish states and receive commands until the broker's connection is lost."""
         loop = asyncio.get_running_loop()
-        telling = loop.create_task(self._tell_states(client))
+        telling = loop.create_task(self._send_states(client))
         listening_task = loop.create_task(self._take_commands(client))
         try:
             await asyncio.wait({telling, listening_task}, return_when=asyncio.FIRST_COMPLETED)
@@ -335,7 +335,7 @@ class MqttOutlet(Outlet[MqttSettings]):
                 task.cancel()
             await asyncio.wait({telling, listening_task})
 
-    async def _tell_states(self, client: Any) -> None:
+    async def _send_states(self, client: Any) -> None:
         while True:
             await self._changed.wait()
             self._changed.clear()

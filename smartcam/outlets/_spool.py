@@ -175,7 +175,7 @@ class Spool:
             database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
             if last > before:
                 why = "the spool is gone, or older than its last start; what it had is missing"
-                self._tell_all(database, 0, why)
+                self._add_common_gap(database, 0, why)
             _set(database, {"epoch": self.epoch, "running": 1})
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
@@ -192,7 +192,7 @@ class Spool:
             os.lseek(self._lock, 0, os.SEEK_SET)
             os.write(self._lock, b"%20d" % epoch)
 
-    def _tell_all(self, database: sqlite3.Connection, lost: int, why: str) -> None:
+    def _add_common_gap(self, database: sqlite3.Connection, lost: int, why: str) -> None:
         """Add a gap of all cameras."""
         ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
         gap = _gap("", epoch, number + 1)
@@ -349,7 +349,7 @@ class Spool:
                 "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
             )
             lost = _settle(database, counts)
-            self._tell_all(database, lost, "entries of the spool were damaged")
+            self._add_common_gap(database, lost, "entries of the spool were damaged")
             _set(database, counts)
         self._counts = counts
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()

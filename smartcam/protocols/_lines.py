@@ -631,9 +631,13 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        same = [one for one in self._open if one.row.request is row.request and not one.question]
+        same = [
+            request
+            for request in self._open
+            if request.row.request is row.request and not request.question
+        ]
         if kind is m.GetStatus:
-            if not all(one.sent for one in same):
+            if not all(request.sent for request in same):
                 return
         elif same:
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")

@@ -302,7 +302,7 @@ class RosbridgeNode(NamedNode):
 
     def on_connected(self) -> None:
         """Advertise everything to a new bridge."""
-        self._tell_change()
+        self._report_change()
         for publisher in self._publishers.values():
             if publisher.exists:
                 self.send(encoded(publisher.advertisement()))
@@ -314,7 +314,7 @@ class RosbridgeNode(NamedNode):
         self._new = [service for service in self._services.values() if service.exists]
         self._change()
 
-    def _tell_change(self) -> None:
+    def _report_change(self) -> None:
         try:
             self._on_change(self)
         except ENDS_PROGRAM:
@@ -390,7 +390,7 @@ class RosbridgeNode(NamedNode):
     async def on_lost(self, was: bool) -> None:
         """End calls and tasks for a lost bridge."""
         if self._running is not None and was:
-            self._tell_change()
+            self._report_change()
         for service in self._services.values():
             service.end_turn()
         self._new, self._changing = [], None

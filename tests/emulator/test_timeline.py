@@ -269,7 +269,7 @@ async def test_every_state_can_be_entered() -> None:
         device.stop()
         device.handle(m.Disconnect())
         device.reboot(1)
-        device.tell_entered()
+        device.report_entered()
     done = dict(zip(DeviceState, emulator.cues_done, strict=True))
     assert [state for state, count in done.items() if not count] == [DeviceState.INPUT_CONTAINER]
 

@@ -228,12 +228,12 @@ class WizardSession:
         self._run = self._resumed()
         if journal is not None and journal.header is None:
             journal.start(header)
-        self.resumed: dict[str, Any] | None = self._told_of(header)
+        self.resumed: dict[str, Any] | None = self._resumed_facts(header)
         self._errors: dict[str, str] = {}
         self._lock = asyncio.Lock()
         self._scope: asyncio.Timeout | None = None
 
-    def _told_of(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
+    def _resumed_facts(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return facts about the resumed journal; None if there is nothing to resume.
 
         They are shown because measurements may be old: touched marks may have moved since.

@@ -317,12 +317,12 @@ class Device:
         """Call a function for every state that the device enters from now on.
 
         It is called right after the event that led to the state; for a message or an operator's
-        action, by the next :meth:`tell_entered`.
+        action, by the next :meth:`report_entered`.
         """
         self._on_entered = on_entered
         self._bits = self._status_word()
 
-    def tell_entered(self) -> None:
+    def report_entered(self) -> None:
         """Report the states that were entered since the last call."""
         while self._entered and self._on_entered is not None:
             states, self._entered = self._entered, []
@@ -653,7 +653,7 @@ class Device:
             self._now = max(self._now, when)
             action()
             if self._entered:
-                self.tell_entered()
+                self.report_entered()
         self._now = target
 
     def _end_overtrigger(self) -> None:

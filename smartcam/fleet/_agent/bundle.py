@@ -156,9 +156,9 @@ class AgentBundle:
         self._end_reminding()
         if step < len(REMINDERS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+            self._reminder = loop.call_later(REMINDERS[step], self._send_number, step + 1)
 
-    def _say_number(self, step: int) -> None:
+    def _send_number(self, step: int) -> None:
         self._reminder = None
         if self.has_subscribers:
             self._put(self._number, 0, [])

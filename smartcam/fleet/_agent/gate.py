@@ -31,7 +31,7 @@ class InLine:
     wake: asyncio.Future[None] | None = None
 
 
-def _tell_nobody(change: Change, program: str) -> None:
+def _report_nothing(change: Change, program: str) -> None:
     """Report nothing."""
 
 
@@ -44,7 +44,7 @@ class Gate:
         holder: program that has reserved the camera; None if none has.
     """
 
-    on_change: Callable[[Change, str], None] = _tell_nobody
+    on_change: Callable[[Change, str], None] = _report_nothing
     holder: str | None = None
     _reservations: set[Hashable] = field(default_factory=set["Hashable"])
     _active: collections.Counter[str] = field(default_factory=collections.Counter[str])

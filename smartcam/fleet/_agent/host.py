@@ -536,9 +536,9 @@ class Host:
             self._reminder = None
         if step < len(REMINDERS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+            self._reminder = loop.call_later(REMINDERS[step], self._send_number, step + 1)
 
-    def _say_number(self, step: int) -> None:
+    def _send_number(self, step: int) -> None:
         self._reminder = None
         if self._results_out.has_subscribers:
             self._results_out.put(encode_runs(self.epoch, self.results.following, []))

@@ -328,13 +328,13 @@ class MemoryEnd(Bus):
         """Join the bus, or join it again."""
         if not self.attached:
             self._bus.ends.append(self)
-            self._tell_presence(True)
+            self._report_presences(True)
             self._check_subscribers("**")
 
     def detach(self) -> None:
         """Leave the bus like after a broken cable: both sides lose each other."""
         if self.attached:
-            self._tell_presence(False)
+            self._report_presences(False)
             self._bus.ends.remove(self)
             self._check_subscribers("**")
 
@@ -413,7 +413,7 @@ class MemoryEnd(Bus):
         """Return the ends that receive from this one: all on the bus, including itself."""
         return list(self._bus.ends) if self.attached else []
 
-    def _tell_presence(self, present: bool) -> None:
+    def _report_presences(self, present: bool) -> None:
         """Report this end's presences to all ends, and theirs to this one."""
         for end in self._others():
             for watcher in end.present_here:

@@ -299,7 +299,7 @@ class CameraTopics:
             if self._topics.subscribed("events", self._host.name) is not None:
                 at, name = datetime.now(UTC), self._host.name
                 changed = StatusChanged(camera=name, at=at, status=status, previous=before)
-                self._say_event(changed, number)
+                self._publish_event(changed, number)
 
     def on_event(self, event: CameraEvent) -> None:
         """Publish an event of the camera."""
@@ -308,7 +308,7 @@ class CameraTopics:
             self.trouble = event.reason
         elif isinstance(event, (Connected, Reconnected)):
             self.trouble = ""
-        self._say_event(event, number)
+        self._publish_event(event, number)
 
     def on_reservation(self, change: Change, program: str) -> None:
         """Publish that a program has reserved the camera, or no longer has."""
@@ -317,7 +317,7 @@ class CameraTopics:
         fields["by"] = in_words(program)
         self._put_event(change, fields, number)
 
-    def _say_event(self, event: CameraEvent, number: int) -> None:
+    def _publish_event(self, event: CameraEvent, number: int) -> None:
         if self._topics.subscribed("events", self._host.name) is not None:
             self._put_event(type(event).__name__, jsonable(event), number)
 

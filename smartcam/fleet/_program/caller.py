@@ -281,7 +281,7 @@ class Caller:
         failed: SmartCamError | None = None
         for agent in agents:
             try:
-                hellos.append(await self._say_hello(agent))
+                hellos.append(await self._greet_agent(agent))
             except SmartCamError as error:
                 failed = error
                 continue
@@ -303,11 +303,11 @@ class Caller:
     async def _ask_anew(self, met: Met) -> None:
         """Ask the agent again, and take its state if it has a session by now."""
         with contextlib.suppress(SmartCamError):
-            hello = await self._say_hello(met.agent)
+            hello = await self._greet_agent(met.agent)
             if self.met is met and not self.linked and hello.hello.get("connected"):
                 self._meet(hello)
 
-    async def _say_hello(self, agent: str) -> _HelloHeard:
+    async def _greet_agent(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)

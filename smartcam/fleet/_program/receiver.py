@@ -169,7 +169,7 @@ class Receiver:
         """Subscribe to the camera's states."""
         program = self._caller.program
         key = program.keys.states(self._camera)
-        self._handles["states"] = program.bus.subscribe(key, self._hear_states)
+        self._handles["states"] = program.bus.subscribe(key, self._take_state_message)
 
     async def close(self) -> None:
         """Unsubscribe."""
@@ -224,7 +224,7 @@ class Receiver:
         program = self._caller.program
         key = program.keys.results(self._camera)
         self._since, self._caller.streamed = since, True
-        self._handles["results"] = program.bus.subscribe(key, self._hear_results)
+        self._handles["results"] = program.bus.subscribe(key, self._take_result_message)
         self._begin("find", self._find())
 
     def _leave_results(self) -> None:
@@ -317,7 +317,7 @@ class Receiver:
 
     # ------------------------------------------------------------------ messages
 
-    def _hear_states(self, key: str, payload: bytes) -> None:
+    def _take_state_message(self, key: str, payload: bytes) -> None:
         origin = f"the agent's message about {self._camera}"
         try:
             message = decode(payload, origin)
@@ -346,7 +346,7 @@ class Receiver:
         self._states.receive(reply.epoch, reply.states, states)
         self._wake()
 
-    def _hear_results(self, key: str, payload: bytes) -> None:
+    def _take_result_message(self, key: str, payload: bytes) -> None:
         try:
             batch = decode_runs(payload, f"results of {self._camera}")
         except ProtocolError as exc:

@@ -215,7 +215,7 @@ class Door:
 
     # ------------------------------------------------------------------ connections
 
-    def _hear_knocks(self) -> None:
+    def _watch_connections(self) -> None:
         """Check at each new connection, which the engine accepts in its own threads."""
         self._forget_knocks()
         self._knocks = select.epoll()
@@ -293,7 +293,7 @@ class Door:
     def _find_again(self) -> None:
         with contextlib.suppress(OSError):  # no descriptor is left for the search
             self._listeners = self._find()
-            self._hear_knocks()
+            self._watch_connections()
         for number in self._listeners:
             self._filter(number)
 

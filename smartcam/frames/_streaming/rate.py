@@ -137,7 +137,7 @@ class RateControl:
         self._quality, self._fps = float(quality[0]), float(fps[1])
         self._rise = MAX_FIRST_RISE_PER_SECOND
         self._why: str = ""
-        self._told_fps = self._fps
+        self._reported_fps = self._fps
         self._went: float | None = None
         # frame rate of the source, frames per second; 0: unknown
         self._comes = 0.0
@@ -258,9 +258,12 @@ class RateControl:
         return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
 
     def _notify(self) -> None:
-        back = self._fps == self._rates[1] != self._told_fps
-        if back or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._told_fps < LOGGED_CHANGE_FACTOR:
-            self._told_fps = self._fps
+        back = self._fps == self._rates[1] != self._reported_fps
+        if (
+            back
+            or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._reported_fps < LOGGED_CHANGE_FACTOR
+        ):
+            self._reported_fps = self._fps
             logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
 
 

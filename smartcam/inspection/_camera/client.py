@@ -92,7 +92,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
     async def open(self) -> Self:
         try:
             await self._device.start()
-            self._go_to(self.settings.address._replace(port=self._device.emulator.port))
+            self._use_address(self.settings.address._replace(port=self._device.emulator.port))
         except BaseException:
             await finish(self._device.stop)
             raise

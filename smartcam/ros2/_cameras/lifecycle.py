@@ -72,7 +72,7 @@ class CameraLifecycle(Lifecycle):
         self._starting: asyncio.Task[None] | None = None
         self._ends: list[Any] = []
         limit = settings.connect_timeout + 2 * settings.switch_timeout + settings.request_timeout
-        super().__init__(node.full_name, {"configure": self._have_camera}, limit)
+        super().__init__(node.full_name, {"configure": self._ensure_camera}, limit)
 
     async def start(self) -> None:
         """Serve, and go to Active with ``autostart``."""
@@ -130,7 +130,7 @@ class CameraLifecycle(Lifecycle):
 
     # ------------------------------------------------------------------ work
 
-    async def _have_camera(self) -> None:
+    async def _ensure_camera(self) -> None:
         camera, application = self._camera, self._application
         await camera.wait_connected(camera.settings.connect_timeout)
         if application is None:

@@ -163,7 +163,7 @@ class NativeNode(NamedNode):
         spun = self._spun
         if spun is None:
             return
-        self._tell_missing()
+        self._report_missing()
         services = [endpoint for endpoint in self._ends if isinstance(endpoint, NativeService)]
         for end in tuple(self._ends):
             end.close()
@@ -360,9 +360,9 @@ class NativeNode(NamedNode):
         self._missing.setdefault(type.partition("/")[0], []).append(name)
         if self._telling is None:
             loop = asyncio.get_running_loop()
-            self._telling = loop.call_later(TELL_MISSING_AFTER, self._tell_missing)
+            self._telling = loop.call_later(TELL_MISSING_AFTER, self._report_missing)
 
-    def _tell_missing(self) -> None:
+    def _report_missing(self) -> None:
         if self._telling is not None:
             self._telling.cancel()
             self._telling = None

@@ -277,7 +277,7 @@ class Client:
 
     def time_out(self) -> None:
         """The deadline of the trigger under way is reached."""
-        self.results._timer._go_off()
+        self.results._timer._on_timer()
 
     def cancel(self) -> None:
         """The task that awaits the trigger is cancelled; it was not woken yet."""
