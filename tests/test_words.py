@@ -141,11 +141,6 @@ TIMES = {
 UNITS = {"Milliseconds": "MS", "Microseconds": "US", "Nanoseconds": "NS"}
 """Ends of the names of constants that count times in another unit, by the unit."""
 
-UNNAMED_TIMES = {
-    *("_cli", "conformance", "fleet", "ros1", "ros2", "web"),
-}
-"""Rooms in which some times still have names that do not say so; a room that is mended goes."""
-
 
 class Named(NamedTuple):
     """A constant, and the text that explains it."""
@@ -153,13 +148,6 @@ class Named(NamedTuple):
     module: str
     name: str
     text: str
-
-    @property
-    def room(self) -> str:
-        """The entry of :data:`UNNAMED_TIMES` for the constant's module, "" without one."""
-        inside = self.module.removeprefix("smartcam.")
-        found = [room for room in UNNAMED_TIMES if f"{inside}.".startswith(f"{room}.")]
-        return found[0] if found else ""
 
     @property
     def says_its_unit(self) -> bool:
@@ -188,9 +176,8 @@ def target_of(node: ast.stmt) -> str:
 
 
 def test_names_of_times_say_that_they_are_times() -> None:
-    wrong = [one for one in named_constants() if not one.says_its_unit]
-    assert [f"{one.module}.{one.name}: {one.text}" for one in wrong if not one.room] == []
-    assert {one.room for one in wrong} - {""} == UNNAMED_TIMES
+    wrong = [named for named in named_constants() if not named.says_its_unit]
+    assert [f"{named.module}.{named.name}: {named.text}" for named in wrong] == []
 
 
 COUNTED = re.compile(

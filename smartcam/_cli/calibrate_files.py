@@ -190,6 +190,7 @@ async def compare(
 )
 @click.option(
     "--what",
+    "drawing",
     type=click.Choice(["views", "scene", "uncertainty", "plane"]),
     help="What to draw.  [default: views; of a plane the plane]",
 )

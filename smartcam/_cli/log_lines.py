@@ -26,7 +26,7 @@ MAX_WAITING = 10_000
 MAX_TEXT_CHARACTERS = 1 << 16
 """Largest number of characters of a message, or of an exception's text; the rest is cut."""
 
-FAREWELL = 1.0
+FAREWELL_TIMEOUT = 1.0
 """Seconds that the last lines may take at the end."""
 
 FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
@@ -128,7 +128,7 @@ class LineHandler(logging.Handler):
             self._ending.set()
             with contextlib.suppress(queue.Full):
                 self._lines.put_nowait(None)  # wakes the thread, if it waits
-            self._over.wait(FAREWELL)
+            self._over.wait(FAREWELL_TIMEOUT)
         super().close()
 
     def _write_all(self) -> None:

@@ -303,7 +303,7 @@ class _Calibrations:
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: it can apply to none; the text names the possible values.
+            ConfigurationError: the calibration applies to none; the text names the possible values.
         """
         given, known = [self._reader_of_all], self._by_application
         of = "" if application is None else f" of application {application}"

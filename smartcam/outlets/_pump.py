@@ -59,7 +59,7 @@ class Arrival(NamedTuple):
         camera: name of the camera.
         number: number of the entry.
         at: time of arrival, seconds since 1970, UTC.
-        size: its size in memory, bytes.
+        size: size in memory, bytes.
         make: function that returns kind, application and body of the entry; called in the spool's
             thread.
     """

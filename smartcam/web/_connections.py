@@ -28,7 +28,7 @@ HEAD_TIMEOUT = 10.0
 """Seconds within which a request's head must be complete, from its first byte; for the first head
 of a connection, from the connection's beginning."""
 
-KEEP_ALIVE = 60.0
+KEEP_ALIVE_TIMEOUT = 60.0
 """Seconds that a connection stays open without a request, or with an unread answer."""
 
 MAX_HEAD_BYTES = 1 << 15
@@ -138,7 +138,7 @@ class Visitor(asyncio.Protocol):
         finally:
             if request.content.is_eof():
                 self._head, self._idle = bytearray(), True
-                self._acceptor.expect(self, KEEP_ALIVE, "no request")
+                self._acceptor.expect(self, KEEP_ALIVE_TIMEOUT, "no request")
             else:  # the connection ends with the request
                 self._stream = request.content
                 self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")

@@ -35,7 +35,7 @@ MAX_WAITING_CHANGES = 16
 """Largest number of calls that may wait for a log entry at a time: together with the event streams,
 half of the places."""
 
-LOOK_AGAIN = 0.02
+LOG_POLL_INTERVAL = 0.02
 """Seconds between two looks for a log entry."""
 
 MAX_PARTS = 100
@@ -99,7 +99,7 @@ class EmulatorSite(Site):
             loop = asyncio.get_running_loop()
             deadline = loop.time() + seconds
             while loop.time() < deadline and is_open(request) and not condition():
-                if await self.streams.pause(LOOK_AGAIN):
+                if await self.streams.pause(LOG_POLL_INTERVAL):
                     break
         finally:
             self._waiting -= 1

@@ -41,10 +41,10 @@ AT_ONCE: Final = 50
 MAX_SIFTED_ROWS: Final = 1000
 """Largest number of rows that are searched before other tasks of the loop have a turn."""
 
-BUCKET: Final = 5
+BAR_DURATION: Final = 5
 """Seconds of one bar of the outcomes."""
 
-SERIES: Final = 600
+SERIES_DURATION: Final = 600
 """Seconds over which outcomes are kept."""
 
 ORDER_LASTING_TIME: Final = 1.0
@@ -103,7 +103,9 @@ class FleetView:
         self._units = units
         self.rows: dict[str, FleetRow] = {}
         self.version: int = 0
-        self.series: collections.deque[tuple[int, ...]] = collections.deque(maxlen=SERIES // BUCKET)
+        self.series: collections.deque[tuple[int, ...]] = collections.deque(
+            maxlen=SERIES_DURATION // BAR_DURATION
+        )
         self.failing: dict[FleetRow, None] = {}
         self.ended: bool = True
         self.agents: set[str] = set()
@@ -312,7 +314,7 @@ class FleetView:
             if number % AT_ONCE == AT_ONCE - 1:
                 await asyncio.sleep(0)
         self._totals.append(self._count)
-        bar = int(wall) // BUCKET * BUCKET
+        bar = int(wall) // BAR_DURATION * BAR_DURATION
         if bar != self._bar_at:
             if self._bar.total() and self._bar_at:
                 self.series.append((self._bar_at, *(self._bar[name] for name in OUTCOMES)))

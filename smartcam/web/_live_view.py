@@ -34,7 +34,7 @@ MAX_PARTS = 500
 MAX_SHOWN_RAW_BYTES = 64
 """Largest number of bytes of a container that the page shows."""
 
-SERIES = 300
+SERIES_DURATION = 300
 """Seconds of rate and latency that the page draws."""
 
 IMAGE_PERIOD = 1.0
@@ -105,7 +105,7 @@ class LiveView:
         self._writes = history is None
         self.camera: Camera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
-        self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
+        self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES_DURATION)
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time of the last connection or loss

@@ -13,7 +13,7 @@ from smartcam.frames._gige.discovery import (
     MAX_ANSWERS_OF_ONE_ADDRESS,
     AnsweringCamera,
     Network,
-    _CameraSearch,
+    _NetworkSearch,
     find,
     networks,
 )

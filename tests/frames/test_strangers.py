@@ -18,7 +18,7 @@ from tests.frames.inside import (
     NEW_HOST_DELAY,
     Network,
     RtpPacket,
-    _CameraSearch,
+    _NetworkSearch,
     _ControlPort,
 )
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
@@ -151,7 +151,7 @@ async def test_events_of_a_gige_camera_are_those_of_its_address_alone() -> None:
 
 async def test_one_address_does_not_replace_all_gige_cameras() -> None:
     async with gige_camera() as there:
-        asking = _CameraSearch(Network("127.0.0.1", ()))
+        asking = _NetworkSearch(Network("127.0.0.1", ()))
         answer = await discovery_of(there.port)
         for number in range(300):
             asking.datagram_received(answer, ("10.0.0.9", number))

@@ -20,7 +20,7 @@ from smartcam.web import FleetSite
 from tests.handmade import until
 from tests.web.inside import (
     ALIVE_INTERVAL,
-    BUCKET,
+    BAR_DURATION,
     CALLS,
     ERROR_MARK_SECONDS,
     MAX_KEPT_BYTES,
@@ -382,7 +382,7 @@ async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> 
         for _ in range(MAX_QUEUE + 10):  # of these ten have no room
             world.fleet["line01/cam002"].send(GOOD)
         await asyncio.sleep(1.5)
-        later = time.time() + 2 * BUCKET
+        later = time.time() + 2 * BAR_DURATION
         monkeypatch.setattr(time, "time", lambda: later)
         await asyncio.sleep(1.5)
         sums = [sum(bar[place] for bar in view.series) for place in (1, 2, 3, 4)]

@@ -29,7 +29,7 @@ MAX_TRAIL = 60
 CLOSE_TIMEOUT = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
 
-LOOK_AGAIN = 0.01
+STATUS_POLL_INTERVAL = 0.01
 """Seconds between two requests for a status that does not come unasked."""
 
 
@@ -307,7 +307,7 @@ class RawClient:
             if left <= 0:
                 raise Differs(f"{expected} within {within:g} s", f"the status stays {word:#x}")
             if self.wire.is_bid:
-                self.listen(LOOK_AGAIN)
+                self.listen(STATUS_POLL_INTERVAL)
                 word = self.look()
             else:
                 self.next(left)

@@ -90,11 +90,11 @@ KNOWN_CALLS = 4096
 KNOWN_CAMERAS = 1000
 """Largest number of unshared cameras whose numbers would continue if they came back."""
 
-FIRST_TRY = 30.0
+FIRST_ATTEMPT_TIMEOUT = 30.0
 """Seconds of the timeout at the start for the first attempt to connect to a camera."""
 
 
-WORD_AHEAD = 0.02
+END_NOTICE_DELAY = 0.02
 """Seconds between the last message about a camera and the end of its presence, which would
 overtake the message in the engine."""
 
@@ -411,7 +411,7 @@ class Agent:
         try:
             try:
                 if not self._bus.local:
-                    await asyncio.sleep(WORD_AHEAD)
+                    await asyncio.sleep(END_NOTICE_DELAY)
             finally:
                 token.close()
                 running.cancel()
@@ -442,7 +442,7 @@ class Agent:
 
     async def wait_tried(self) -> None:
         """Wait until the first attempt with each camera has ended; bounded."""
-        end = asyncio.get_running_loop().time() + FIRST_TRY
+        end = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
         for host in tuple(self.hosts.values()):
             await host.tried(max(0.0, end - asyncio.get_running_loop().time()))
 

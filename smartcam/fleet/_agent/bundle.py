@@ -24,7 +24,7 @@ BUNDLE_INTERVAL = 0.005
 FULL_BUNDLE_BYTES = 1 << 15
 """Bytes of results with which a bundle is sent at once."""
 
-REMINDERS = (0.05, 0.2, 1.0, 5.0)
+REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
 """Seconds after the last bundle until the next number is sent again."""
 
 _HEAD = struct.Struct("<4sQQQI")
@@ -154,9 +154,9 @@ class AgentBundle:
     def _remind(self, step: int) -> None:
         """Send the next number again later; stop after the last reminder."""
         self._end_reminding()
-        if step < len(REMINDERS):
+        if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._send_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
 
     def _send_number(self, step: int) -> None:
         self._reminder = None

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-HOLD_OFF = 0.2
+HOLD_OFF_DELAY = 0.2
 """Seconds per step of preference until a standby agent takes a camera that has no agent."""
 
 ASK_TIMEOUT = 0.5
@@ -336,7 +336,7 @@ class Claims:
         if self._standby is None or self._others.get(name):
             return
         away = not self._bus.reached  # only this agent was cut off, not the others
-        await asyncio.sleep(HOLD_OFF * self._standby.preference)
+        await asyncio.sleep(HOLD_OFF_DELAY * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
                 if await self._appears(name, RETURN_WAIT):

@@ -54,7 +54,7 @@ STATUS_DELAY = 0.005
 """Seconds that a status may wait for others, to be sent in one message. The program that triggered
 gets the status with the reply."""
 
-CATCH_UP = 0.2
+CATCH_UP_DELAY = 0.2
 """Seconds after a reply with a status until the number of the next state is sent, if no state was:
 otherwise a lost reply would stay unnoticed."""
 
@@ -64,7 +64,7 @@ RESULTS_INTERVAL = 0.002
 FULL_MESSAGE_BYTES = 1 << 16
 """Results of this many bytes are sent at once, without RESULTS_INTERVAL."""
 
-REMINDERS = (0.05, 0.2, 1.0, 5.0)
+REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
 """Seconds after the last results at which their numbers are sent again: otherwise a loss of these
 results would stay unnoticed."""
 
@@ -491,7 +491,7 @@ class Host:
         """Drop the states that were not sent yet, since all their receivers have them."""
         self._held.clear()
         self._fresh_states.clear()
-        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP)
+        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP_DELAY)
 
     def flush(self, *, states: bool = True) -> None:
         """Send the results and, with ``states``, the states that were not sent yet."""
@@ -534,9 +534,9 @@ class Host:
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None
-        if step < len(REMINDERS):
+        if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._send_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
 
     def _send_number(self, step: int) -> None:
         self._reminder = None

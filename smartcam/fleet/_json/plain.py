@@ -69,7 +69,7 @@ MAX_CAMERAS_ADDED = 100
 CANCEL_GRACE = 0.5
 """Seconds beyond a service's timeout after which its task is cancelled."""
 
-FIRST_TRY = 600.0
+SETUP_WAIT = 600.0
 """Seconds for which Setup waits for a camera; its own timeout is shorter."""
 
 LOOK_TIMEOUT = 2.0
@@ -489,7 +489,7 @@ class Plain:
         host = self._agent.hosts.get(order.camera)
         if host is not None:
             if isinstance(request, SetupRequest):
-                await host.tried(FIRST_TRY)
+                await host.tried(SETUP_WAIT)
             return host
         if not isinstance(request, SetupRequest):
             raise ConnectionClosedError(f"{order.camera}: the camera was stopped meanwhile")
@@ -502,7 +502,7 @@ class Plain:
         self._added[order.camera] = request
         try:
             host = self._agent.share(order.camera, settings)
-            await host.tried(FIRST_TRY)
+            await host.tried(SETUP_WAIT)
             host.require()
         except BaseException:
             await self._take_back(order.camera, request)

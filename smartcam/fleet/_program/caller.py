@@ -48,17 +48,17 @@ HELLO_TIMEOUT = 2.0
 
 SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
 """Names of calls for users, if they differ."""
-LOOK_ELSEWHERE = 0.25
+OTHER_AGENT_INTERVAL = 0.25
 """Seconds between two checks for another agent with a session, if the present one has none."""
 
-ASK_ANEW = 5.0
+SESSION_QUESTION_INTERVAL = 5.0
 """Seconds until the present agent is asked whether it has a session by now: its message may be
 lost, and a camera without triggers causes no further ones."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
 
-INSIST_AFTER = 1.0
+RESEND_DELAY = 1.0
 """Seconds until an unconfirmed message is sent again, since it may have been lost."""
 
 
@@ -249,7 +249,7 @@ class Caller:
         while True:
             look = None
             if self.met is not None and not self.linked:
-                look = LOOK_ELSEWHERE if len(self._agents) > 1 else ASK_ANEW
+                look = OTHER_AGENT_INTERVAL if len(self._agents) > 1 else SESSION_QUESTION_INTERVAL
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(look):
                     await self._stirred.wait()
@@ -258,7 +258,7 @@ class Caller:
             met = self.met
             if met is not None and self.linked:
                 continue
-            if met is not None and loop.time() - quiet_since >= ASK_ANEW:
+            if met is not None and loop.time() - quiet_since >= SESSION_QUESTION_INTERVAL:
                 quiet_since = loop.time()
                 await self._ask_anew(met)
                 continue
@@ -613,7 +613,7 @@ class Caller:
         async def repeat(number: int, answer: Outcome) -> None:
             while True:
                 try:
-                    async with asyncio.timeout(INSIST_AFTER):
+                    async with asyncio.timeout(RESEND_DELAY):
                         await answer
                 except TimeoutError:
                     if self.met is not met or met is None:

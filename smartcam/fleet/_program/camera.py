@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from smartcam.observers import Observer
     from smartcam.settings import Address, CameraSettings
 
-ASK_AGAIN = 2.0
+QUESTION_TIMEOUT = 2.0
 """Seconds for the answer to a question; then it is asked again until its deadline."""
 
 REACH_TIMEOUT = 0.5
@@ -318,12 +318,12 @@ class FleetCamera(Camera[ValueT]):
                     left = max(0.0, deadline - loop.time())
                     try:
                         # by then the agent has restored the state, or gone back
-                        await self._do("wait_connected", min(left, ASK_AGAIN))
+                        await self._do("wait_connected", min(left, QUESTION_TIMEOUT))
                     except ConnectionLostError:
                         continue
                     except ResponseTimeoutError as exc:  # or the message was lost on the way
                         why = exc
-                        if left <= ASK_AGAIN:
+                        if left <= QUESTION_TIMEOUT:
                             raise TimeoutError from exc
                     else:
                         return
@@ -739,7 +739,7 @@ class FleetCamera(Camera[ValueT]):
         arguments = {"reservation": reservation}
         while True:
             caller.lease(reservation)
-            soon = min(deadline, self._deadline(ASK_AGAIN))
+            soon = min(deadline, self._deadline(QUESTION_TIMEOUT))
             try:
                 reply = await caller.call("reserved", soon, arguments)
             except ResponseTimeoutError as exc:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-ASK_AGAIN = 0.5
+NUMBERS_TIMEOUT = 0.5
 """Seconds for an agent's answer with its next numbers, after which the question is repeated."""
 
 MAX_AGENTS_NUMBERED = 1000
@@ -193,14 +193,14 @@ class Exchange(Bus):
         keys, bus = self._keys(), self._bus
         while agent in self._lacking:
             self._lacking.discard(agent)
-            cameras = await ask_cameras(bus, keys, agent, "**", ASK_AGAIN)
+            cameras = await ask_cameras(bus, keys, agent, "**", NUMBERS_TIMEOUT)
             for camera in cameras:
                 places = self._places.get("results", {})
                 for place in tuple(places.get(keys.results(camera.summary.camera), ())):
                     place.call(place.key, encode_runs(camera.epoch, camera.following, []))
-            if not cameras and await bus.present(keys.agent(agent), ASK_AGAIN):
+            if not cameras and await bus.present(keys.agent(agent), NUMBERS_TIMEOUT):
                 self._lacking.add(agent)
-                await asyncio.sleep(ASK_AGAIN)
+                await asyncio.sleep(NUMBERS_TIMEOUT)
 
     # ------------------------------------------------------------------ as a bus
 

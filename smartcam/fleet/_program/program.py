@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 
-LOOK_AGAIN = 0.1
+AGENT_SEARCH_INTERVAL = 0.1
 """Seconds between two checks for an agent."""
 
 LAST_LOOK_TIMEOUT = 1.0
@@ -161,7 +161,7 @@ class Program:
                     f"{self._camera}: there are several fleets: {', '.join(agents)}; choose one: "
                     f"?fleet={agents[0]}"
                 )
-            await asyncio.sleep(min(LOOK_AGAIN, left))
+            await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, left))
         thing, meant = "camera", ""
         if "*" not in self._camera:
             keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK_TIMEOUT)

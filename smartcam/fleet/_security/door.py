@@ -42,7 +42,7 @@ LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
 """Seconds between two checks of the free descriptors, and the same if there are hardly fewer than
 at the last check. A new connection causes a check at once."""
 
-LOOK_WHO_COMES_EVERY = 0.25
+CHECK_INTERVAL = 0.25
 """Seconds between two checks of connections while some are half-open and no other comes."""
 
 REST = 4.0
@@ -254,7 +254,7 @@ class Door:
         coming = collections.Counter(host for host, _ in self._connected() - links)
         self._rested = loop.time() + REST * (loop.time() - begun)
         if coming:
-            self._expect_look(LOOK_WHO_COMES_EVERY)
+            self._expect_look(CHECK_INTERVAL)
         many = [
             host
             for host, count in coming.most_common(MAX_BLOCKED_ADDRESSES)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-LOOK_EVERY = 10.0
+CHECK_INTERVAL = 10.0
 """Seconds between two checks of the files."""
 
 MAX_WAIT = 600.0
@@ -59,7 +59,7 @@ class CertificateWatch:
         """Check the files periodically, forever."""
         seen = self._end.identity
         while True:
-            await asyncio.sleep(LOOK_EVERY)
+            await asyncio.sleep(CHECK_INTERVAL)
             try:
                 seen = await self._follow(seen)
             except Exception:

@@ -102,13 +102,13 @@ async def find(
     Cancellation: safe.
     """
     loop = asyncio.get_running_loop()
-    searches: list[_CameraSearch] = []
+    searches: list[_NetworkSearch] = []
     transports: list[asyncio.DatagramTransport] = []
     try:
         for place in places:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, asking = await loop.create_datagram_endpoint(
-                    functools.partial(_CameraSearch, place),
+                    functools.partial(_NetworkSearch, place),
                     local_addr=(place.address, 0),
                     allow_broadcast=True,
                 )
@@ -131,7 +131,7 @@ async def find(
     return sorted(cameras.values(), key=lambda camera: (camera.info.label, camera.address))
 
 
-class _CameraSearch(asyncio.DatagramProtocol):
+class _NetworkSearch(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
         self.cameras: list[AnsweringCamera] = []

@@ -14,7 +14,7 @@ from smartcam.ros2._native.spinning import NoReplyError
 from smartcam.ros2._native.topics import profile_of
 from smartcam.ros2._node.qos import QoS
 from smartcam.ros2._node.refusals import refusal
-from smartcam.ros2._node.services import LOOK_AGAIN, MAX_CONCURRENT_CALLS
+from smartcam.ros2._node.services import MAX_CONCURRENT_CALLS, SERVER_POLL_INTERVAL
 from smartcam.ros2._node.topics import message_of
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ class NativeClient:
             async with asyncio.timeout(timeout):
                 while not self.served:
                     self._check_open()
-                    await asyncio.sleep(LOOK_AGAIN)
+                    await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} within {timeout:g} s",

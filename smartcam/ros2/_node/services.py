@@ -44,7 +44,7 @@ MAX_WAITING_CALLS = 256
 MAX_REQUEST_BYTES = 1 << 24
 """Largest number of bytes of a request."""
 
-LOOK_AGAIN = 0.02
+SERVER_POLL_INTERVAL = 0.02
 """Seconds between two checks whether a server exists."""
 
 
@@ -256,7 +256,7 @@ class RosClient(RosEnd):
             async with asyncio.timeout(timeout):
                 while not self.served:
                     self._check_open()
-                    await asyncio.sleep(LOOK_AGAIN)
+                    await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
             others = [
                 endpoint.ros_type for endpoint in self._context.graph.ends(self.name, SERVICE)

@@ -47,7 +47,7 @@ def message_of(message: object, fields: dict[str, Any]) -> object:
 MAX_SHORT_MESSAGES = 10_000
 """Largest number of waiting short messages of a topic; for long ones it is the topic's depth."""
 
-HEARTBEAT = 0.5
+HEARTBEAT_INTERVAL = 0.5
 """Seconds between two heartbeats of a latched topic (``rmw_publisher_data.cpp``)."""
 
 
@@ -150,7 +150,7 @@ class RosPublisher(RosEnd):
         if qos.latched:
             import zenoh.ext as more
 
-            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
+            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_INTERVAL)
             self._publisher = more.declare_advanced_publisher(
                 session,
                 self.entity.key,
