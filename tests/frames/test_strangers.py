@@ -18,8 +18,8 @@ from tests.frames.inside import (
     NEW_HOST_DELAY,
     Network,
     RtpPacket,
-    _NetworkSearch,
     _ControlPort,
+    _NetworkSearch,
 )
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
 from tests.frames.rtp.ways import HOST, two_ports
