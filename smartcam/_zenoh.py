@@ -88,7 +88,7 @@ MAX_WAITING_QUERIES = 4096
 CALLBACKS_PER_TURN = 64
 """Callbacks that run in one turn of the event loop."""
 
-PATIENT_TURN = 8
+PATIENT_CALLBACKS_PER_TURN = 8
 """Patient callbacks that run after the others in one turn of the event loop.
 
 A flood of patient callbacks delays other work only by the time of these few.
@@ -496,7 +496,7 @@ class ZenohSession:
                 raise
             except BaseException:
                 logger.exception(_NOT_TAKEN, self._link.place)
-        for _ in range(min(PATIENT_TURN, len(patient))):
+        for _ in range(min(PATIENT_CALLBACKS_PER_TURN, len(patient))):
             if not patient:
                 break
             call, arguments, size = patient.popleft()

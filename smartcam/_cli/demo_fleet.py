@@ -30,10 +30,10 @@ CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
 BY_ROBOT, BY_HAND = 9, 3
 """Triggers of two programs at the same time."""
 
-PATIENCE_TIMEOUT = 30.0
+STEP_TIMEOUT = 30.0
 """Seconds for any step; only a failure takes as long."""
 
-SOON_TIMEOUT = 0.3
+RESERVED_TIMEOUT = 0.3
 """Seconds that a program waits for a camera that another program has reserved."""
 
 
@@ -47,7 +47,7 @@ async def demo(options: Options) -> None:
     steps = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"
-    async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * PATIENCE_TIMEOUT):
+    async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * STEP_TIMEOUT):
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         agents: dict[str, Process] = {}
         for name, place in (("north", "listen"), ("south", "connect")):
@@ -88,7 +88,7 @@ async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
     )
     try:
         for _ in range(cameras):
-            async with asyncio.timeout(PATIENCE_TIMEOUT):
+            async with asyncio.timeout(STEP_TIMEOUT):
                 line = await process.stdout.readline() if process.stdout is not None else b""
             if not line:
                 raise ConnectionLostError(f"the agent of {file.name} did not start")
@@ -98,7 +98,7 @@ async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
             with contextlib.suppress(ProcessLookupError):
                 process.terminate()
         try:
-            async with asyncio.timeout(PATIENCE_TIMEOUT):
+            async with asyncio.timeout(STEP_TIMEOUT):
                 await process.wait()
         except TimeoutError:
             process.kill()
@@ -128,12 +128,12 @@ async def _share(
     statuses, recorded = dashboard.statuses(), recorder.results()
 
     async def trigger(camera: smartcam.Camera, times: int) -> list[int]:
-        return [(await camera.trigger(timeout=PATIENCE_TIMEOUT)).number for _ in range(times)]
+        return [(await camera.trigger(timeout=STEP_TIMEOUT)).number for _ in range(times)]
 
     async def record() -> list[int]:
         return [(await anext(recorded)).number for _ in range(BY_ROBOT + BY_HAND)]
 
-    async with asyncio.timeout(PATIENCE_TIMEOUT), asyncio.TaskGroup() as group:
+    async with asyncio.timeout(STEP_TIMEOUT), asyncio.TaskGroup() as group:
         recording = group.create_task(record())
         moving = group.create_task(trigger(robot, BY_ROBOT))
         pressing = group.create_task(trigger(dashboard, BY_HAND))
@@ -159,19 +159,19 @@ async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, steps: Step
     steps.step(
         f"One program has {SHARED} for itself; the dashboard's trigger waits, and says for whom:"
     )
-    async with camera.reserve(PATIENCE_TIMEOUT):
+    async with camera.reserve(STEP_TIMEOUT):
         try:
-            await other.trigger(timeout=SOON_TIMEOUT)
+            await other.trigger(timeout=RESERVED_TIMEOUT)
         except SmartCamError as exc:
             steps.detail(f"   {exc}", error=type(exc).__name__, reason=str(exc))
-    result = await other.trigger(timeout=PATIENCE_TIMEOUT)
+    result = await other.trigger(timeout=STEP_TIMEOUT)
     steps.detail(f"   and when it is given back: result {result.number}", number=result.number)
 
 
 async def _trigger_all(fleet: Fleet, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
     begin = loop.time()
-    outcomes = await fleet.trigger(timeout=PATIENCE_TIMEOUT)
+    outcomes = await fleet.trigger(timeout=STEP_TIMEOUT)
     taken = loop.time() - begin
     results: list[Result] = [
         outcome for outcome in outcomes.values() if not isinstance(outcome, SmartCamError)
@@ -191,7 +191,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Ste
     begin = loop.time()
     agent.kill()
     left: list[str] = []
-    async with asyncio.timeout(PATIENCE_TIMEOUT):
+    async with asyncio.timeout(STEP_TIMEOUT):
         while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS_OF_AGENT["south"][1]:
             left.append(type(await anext(events)).__name__)
     gone = left.count("CameraLeft")
@@ -201,7 +201,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Ste
         gone=gone,
         left=len(fleet),
     )
-    result = await robot.trigger(timeout=PATIENCE_TIMEOUT)
+    result = await robot.trigger(timeout=STEP_TIMEOUT)
     steps.detail(f"   the robot goes on: result {result.number}", number=result.number)
 
 
@@ -214,7 +214,7 @@ async def _drain(events: Any) -> None:
 async def _end(agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
     gone = robot.events()
     agent.terminate()
-    async with asyncio.timeout(PATIENCE_TIMEOUT):
+    async with asyncio.timeout(STEP_TIMEOUT):
         while not isinstance(await anext(gone), smartcam.Disconnected):
             pass
         await agent.wait()

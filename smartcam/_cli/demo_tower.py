@@ -34,7 +34,7 @@ PERSON: Final = {2: "add", 4: "remove"}
 OVERVIEW: Final = (0.38, 0.0, 0.75)
 """Place from which the camera sees the whole table, metres."""
 
-NEAR: Final = 0.25
+MEASURING_HEIGHT: Final = 0.25
 """Metres above the table at which the camera measures a block's pose."""
 
 ABOVE: Final = 0.45
@@ -234,7 +234,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
     Raises:
         FrameFormatError: the block is not there.
     """
-    sight = table.look((rough.x, rough.y, NEAR), maps=0)
+    sight = table.look((rough.x, rough.y, MEASURING_HEIGHT), maps=0)
     poses = [_pose(sight, region, BLOCK[2]) for region in _regions(sight, colours)]
     if not poses:
         raise _nothing(sight, colours)

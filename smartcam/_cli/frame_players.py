@@ -24,7 +24,7 @@ RTSP_USER = "smartcam"
 MAX_NAME_LETTERS = 60
 """Largest number of letters of a source's name in a URL, before its number."""
 
-LOOK_INTERVAL = 0.1
+CHECK_INTERVAL = 0.1
 """Seconds between two checks whether a source is open."""
 
 DESCRIPTION_TIMEOUT = 5.0
@@ -128,7 +128,7 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
                 noted, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
-            await asyncio.sleep(LOOK_INTERVAL)
+            await asyncio.sleep(CHECK_INTERVAL)
             continue
         except FrameSourceError as exc:
             if str(exc) != noted:
@@ -139,10 +139,10 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
 async def _first_frame(sender: RtpSender) -> None:
     """Wait for the first frame, but not for long."""
-    for _ in range(round(DESCRIPTION_TIMEOUT / LOOK_INTERVAL)):
+    for _ in range(round(DESCRIPTION_TIMEOUT / CHECK_INTERVAL)):
         if sender.statistics().frames:
             return
-        await asyncio.sleep(LOOK_INTERVAL)
+        await asyncio.sleep(CHECK_INTERVAL)
 
 
 async def _describe(to: str, sdp: str, file: str | None, options: Options, *, again: bool) -> None:

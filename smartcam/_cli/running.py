@@ -61,7 +61,7 @@ interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they diffe
 ended by Ctrl-C or SIGTERM."""
 
 
-TAKEN = (
+TAKEN_ADVICE = (
     "Has another client taken it? Most cameras serve one, and the newcomer wins. smartcam doctor "
     "tells more."
 )
@@ -154,7 +154,7 @@ def _one_line(error: Exception) -> str:
         and isinstance(cause, ConnectionError)
         and not isinstance(cause, LinkError)  # such as a lost agent
     )
-    return f"{text}. {TAKEN}" if hung_up else text
+    return f"{text}. {TAKEN_ADVICE}" if hung_up else text
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:

@@ -62,7 +62,7 @@ MAX_SECONDS = 60.0
 ASK_TIMEOUT = 10.0
 """Seconds for asking one camera, all ways together."""
 
-ASK_AT_ONCE = 16
+MAX_ASKED_AT_ONCE = 16
 """Number of cameras that are asked at the same time."""
 
 NAME_TIMEOUT = 5.0
@@ -283,7 +283,7 @@ class CameraSearch:
             await asyncio.sleep(SCARCE_PAUSE)
 
     async def _ask_all(self) -> None:
-        places = asyncio.Semaphore(ASK_AT_ONCE)
+        places = asyncio.Semaphore(MAX_ASKED_AT_ONCE)
 
         async def ask(key: tuple[HostAddress, int]) -> None:
             async with places:

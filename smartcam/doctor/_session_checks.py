@@ -32,10 +32,10 @@ SESSION_COUNT = 5
 CONNECTS_WITHIN = 3.0
 """Seconds after which no further session is begun; on a slow link one or two suffice."""
 
-KNOCK_TIMEOUT = 1.0
+CONNECTION_TIMEOUT = 1.0
 """Seconds for a bare TCP connection, which tells an absent camera from one that closed the link."""
 
-KNOCK_AFTER = 0.25
+CONNECTION_DELAY = 0.25
 """Seconds to wait before the bare connection: a camera that shuts down closes its port later."""
 
 TAKEN_WITHIN = 10.0
@@ -263,9 +263,9 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
 
 async def _knock(exam: Examination) -> bool:
     """Return True if the camera's port accepts a TCP connection."""
-    await asyncio.sleep(KNOCK_AFTER)
+    await asyncio.sleep(CONNECTION_DELAY)
     try:
-        async with asyncio.timeout(KNOCK_TIMEOUT):
+        async with asyncio.timeout(CONNECTION_TIMEOUT):
             _, writer = await asyncio.open_connection(exam.address.host, exam.address.port)
     except (OSError, UnicodeError):
         return False

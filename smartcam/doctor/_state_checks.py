@@ -28,7 +28,7 @@ QUERIES_WITHIN = 3.0
 SLOW_ROUND_TRIP_TIME = 0.05
 """A round trip of this many seconds gives a hint: on a local network it takes milliseconds."""
 
-MAX_SEEN = 1000
+MAX_WATCHED_STATUSES = 1000
 """Largest number of statuses kept while watching; the last ones stay."""
 
 CLOCK_MAY_DIFFER = timedelta(minutes=1)
@@ -211,7 +211,7 @@ def _report_free_run(exam: Examination, details: dict[str, Any]) -> None:
 
 async def _watch(exam: Examination, seconds: float) -> list[Status]:
     """Return every status within some seconds, the present one first."""
-    seen: deque[Status] = deque(maxlen=MAX_SEEN)
+    seen: deque[Status] = deque(maxlen=MAX_WATCHED_STATUSES)
 
     def note(status: Status) -> bool:
         seen.append(status)

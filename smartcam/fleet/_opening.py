@@ -99,7 +99,7 @@ def open(
     return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
 
 
-SESSIONS_OWN = frozenset(
+SESSION_OPTIONS = frozenset(
     {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
 )
 """Options of the session with the camera, which are set in the agent's file."""
@@ -122,7 +122,7 @@ def fleet_camera(
             "smartcam.fleet.open() takes the fleet"
         )
     settings = CameraSettings.of(address.of(address.camera), options)
-    refused = sorted(SESSIONS_OWN & options.keys())
+    refused = sorted(SESSION_OPTIONS & options.keys())
     if refused:
         raise UnsupportedError(
             f"{url}: {', '.join(refused)}: these are options of the camera's session, which its "

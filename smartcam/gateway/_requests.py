@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.gateway._settings import GatewaySettings
     from smartcam.models import Result
 
-GRACE: Final = 0.2
+CANCEL_GRACE: Final = 0.2
 """Seconds after the deadline after which a call that has not ended by itself is cancelled."""
 
 ASKING_FOR_PARTS = ("TRIGGER", "NEXT", "WAIT")
@@ -101,9 +101,9 @@ class RobotRequests:
     # ------------------------------------------------------------------ a request
 
     async def answer(self, request: RobotRequest, deadline: float) -> RobotAnswer:
-        """Return the answer to a request, no later than :data:`GRACE` after the deadline."""
+        """Return the answer to a request, no later than :data:`CANCEL_GRACE` after the deadline."""
         try:
-            async with asyncio.timeout_at(deadline + GRACE):
+            async with asyncio.timeout_at(deadline + CANCEL_GRACE):
                 answer = await self._answer(request, deadline)
         except (SmartCamError, TimeoutError) as exc:
             code = next((code for kind, code in CODES if isinstance(exc, kind)), AnswerCode.FAULT)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 READ_TIMEOUT = 20.0
 """Seconds of the timeout of a query."""
 
-STEPS_BETWEEN_LOOKS = 10_000
+STEPS_BETWEEN_CHECKS = 10_000
 """Steps of SQLite's machine between two checks of the time."""
 
 COLUMNS = (
@@ -87,7 +87,7 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
     end = time.monotonic() + READ_TIMEOUT
     try:
         with contextlib.closing(open_for_reading(path, timeout=5.0)) as database:
-            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_LOOKS)
+            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_CHECKS)
             return _read(database, question)
     except sqlite3.Error as exc:
         raise ConfigurationError(f"results {path}: expected a store of results: {exc}") from exc

@@ -49,7 +49,7 @@ camera's time (inferred)."""
 MAX_SHOWN_ENTRIES = 40
 """Largest number of entries of the log that a failure shows: the last ones."""
 
-LOOK_INTERVAL = 0.005
+CHECK_INTERVAL = 0.005
 """Seconds between two looks."""
 
 
@@ -210,7 +210,7 @@ class CameraLog(Sequence["LogEntry"]):
             if time.monotonic() >= end or found_text is None:
                 reasons = [text for text in (found_text, missing) if text]
                 raise AssertionError("\n".join([*reasons, _shown(entries)]))
-            time.sleep(LOOK_INTERVAL)
+            time.sleep(CHECK_INTERVAL)
 
 
 def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_LOOKS: Final = 16
 """Largest number of pictures that are asked for at a time: two for each of eight viewers."""
 
-MAX_KEPT: Final = 8
+MAX_VIEWERS_KEPT: Final = 8
 """Largest number of viewers whose pictures are kept."""
 
 PICTURES_PER_VIEWER: Final = 2
@@ -134,7 +134,7 @@ class ColourSite(ThreadedSite):
         queue = self._pictures.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
         queue.append(frame)
         self._pictures.move_to_end(viewer)
-        while len(self._pictures) > MAX_KEPT:
+        while len(self._pictures) > MAX_VIEWERS_KEPT:
             self._pictures.popitem(last=False)
         return frame
 

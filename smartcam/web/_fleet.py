@@ -38,7 +38,7 @@ MAX_CAMERAS: Final = 16
 LINGER: Final = 30.0
 """Seconds that a camera is followed after its own page has no viewer any more."""
 
-KEEP_PERIOD: Final = 1.0
+VIEWER_CHECK_PERIOD: Final = 1.0
 """Seconds between two checks for viewers."""
 
 
@@ -180,7 +180,7 @@ class FleetSite(Site):
         """Leave cameras without viewers, and follow new objects of the others."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(KEEP_PERIOD)
+            await asyncio.sleep(VIEWER_CHECK_PERIOD)
             for name, live in list(self._live.items()):
                 if not live.watched and loop.time() - live.used_at > LINGER:
                     del self._live[name]

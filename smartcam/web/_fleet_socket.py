@@ -38,7 +38,7 @@ ALIVE_INTERVAL: Final = 5.0
 QUICK_INTERVAL: Final = 0.05
 """Seconds that must pass between two messages to a page that scrolls or searches."""
 
-AT_ONCE: Final = 10
+ROWS_PER_TURN: Final = 10
 """Rows that are converted to JSON before other tasks of the loop have a turn."""
 
 TOTALS_INTERVAL: Final = 1.0
@@ -158,7 +158,7 @@ class FleetSocket(PageSocket):
             self._counts_sent[name] = row.version
             if seen.get(name) != row.version:
                 changed.append(row.as_json())
-                if len(changed) % AT_ONCE == 0:
+                if len(changed) % ROWS_PER_TURN == 0:
                     await asyncio.sleep(0)
         if changed:
             parts.append(f'"rows":[{",".join(changed)}]')

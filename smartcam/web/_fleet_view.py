@@ -31,11 +31,11 @@ MAX_EVENTS: Final = 50_000
 """Largest number of events of cameras between two looks; after more, the whole fleet is read
 again."""
 
-MAX_GONE: Final = 10_000
+MAX_REMOVED: Final = 10_000
 """Largest number of cameras shown although no agent shares them any more; the oldest are
 forgotten."""
 
-AT_ONCE: Final = 50
+ITEMS_PER_TURN: Final = 50
 """Rows or results that are handled before other tasks of the loop have a turn."""
 
 MAX_SIFTED_ROWS: Final = 1000
@@ -194,7 +194,7 @@ class FleetView:
     async def _take(self, stream: Subscription[FleetEvent], count: int) -> None:
         for number in range(count):
             self._on_event(await anext(stream))
-            if number % AT_ONCE == AT_ONCE - 1:
+            if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
                 await asyncio.sleep(0)
 
     def _on_event(self, event: FleetEvent) -> None:
@@ -247,7 +247,7 @@ class FleetView:
             if row.history.wants_picture:
                 self.failing[row] = None
             done += 1 + arrived
-            if done >= AT_ONCE:
+            if done >= ITEMS_PER_TURN:
                 done = 0
                 await asyncio.sleep(0)
 
@@ -282,7 +282,7 @@ class FleetView:
             self._removed.pop(row.name, None)
         elif row.name not in self._removed:
             self._removed[row.name] = None
-            if len(self._removed) > MAX_GONE:
+            if len(self._removed) > MAX_REMOVED:
                 self._forget(next(iter(self._removed)))
 
     def _forget(self, name: str) -> None:
@@ -311,7 +311,7 @@ class FleetView:
             if row.rate != rate:
                 self._change(row)
             self._refresh(row, now)
-            if number % AT_ONCE == AT_ONCE - 1:
+            if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
                 await asyncio.sleep(0)
         self._totals.append(self._count)
         bar = int(wall) // BAR_DURATION * BAR_DURATION

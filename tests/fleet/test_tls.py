@@ -173,7 +173,7 @@ async def test_cancelling_under_the_name_of_another() -> None:
 async def refused(url: str, timeout: float = PATIENCE) -> str:
     """Return why nobody comes in."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_zenoh, "LOOK_TIMEOUT", PATIENCE)
+        patch.setattr(_zenoh, "DIAGNOSIS_TIMEOUT", PATIENCE)
         with pytest.raises(ConnectFailedError) as caught:
             async with smartcam.connect(url, connect_timeout=timeout):
                 pass

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
-MAX_HEARD_BYTES = 1 << 24
+MAX_RECEIVED_BYTES = 1 << 24
 """Largest number of bytes of bodies that one client keeps: 256 of the largest results. More end the
 experiment."""
 
@@ -175,8 +175,8 @@ class RawClient:
         message = ReceivedFrame(time.monotonic(), message_id, body)
         self._note("<", self.wire.spell(message))
         self._kept += len(body)
-        if self._kept > MAX_HEARD_BYTES:
-            raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
+        if self._kept > MAX_RECEIVED_BYTES:
+            raise NotObserved(f"the camera sent more than {MAX_RECEIVED_BYTES} bytes meanwhile")
         self.received.append(message)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]

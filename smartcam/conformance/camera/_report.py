@@ -16,10 +16,10 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
-SAME_TIME = 0.2
+EQUAL_TIME_SHARE = 0.2
 """Part by which a measured time may differ from a quirk's default and still count as equal."""
 
-SAME_SECONDS = 0.02
+EQUAL_TIME_SECONDS = 0.02
 """Seconds by which a measured time may differ and still count as equal."""
 
 
@@ -209,5 +209,5 @@ def _decides(finding: CameraFinding) -> str:
 def _is_default(quirk: str, value: object) -> bool:
     default = Quirks.model_fields[quirk].default
     if isinstance(default, float) and isinstance(value, float):
-        return abs(value - default) <= max(SAME_SECONDS, SAME_TIME * default)
+        return abs(value - default) <= max(EQUAL_TIME_SECONDS, EQUAL_TIME_SHARE * default)
     return bool(value == default)

@@ -17,7 +17,7 @@ from smartcam.protocols.messages import Request, Sender
 if TYPE_CHECKING:
     from smartcam.conformance.client._runs import ClientRun, RecordedMessage
 
-GRACE = 0.05
+STATUS_GRACE = 0.05
 """Seconds that a status may take to reach the client, which cannot know it earlier."""
 
 
@@ -202,7 +202,7 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
         if isinstance(message.message, m.StatusReport) and not message.lost:
             busy = Status.BUSY in message.message.status
             since = None if not busy else message.time if since is None else since
-        elif since is not None and _is_command(message) and message.time - since > GRACE:
+        elif since is not None and _is_command(message) and message.time - since > STATUS_GRACE:
             return f"{_name(message)} came {message.time - since:.3f} s after BUSY was sent"
     return None
 

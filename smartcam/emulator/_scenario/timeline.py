@@ -44,7 +44,7 @@ _log = logging.getLogger("smartcam.emulator")
 MAX_PENDING = 10_000
 """Largest number of cues that wait for their time; a further one is dropped, with a warning."""
 
-MAX_AT_ONCE = 1000
+MAX_CUES_AT_ONCE = 1000
 """Largest number of cues at one instant, since cues that cause each other would go on forever. A
 further one is dropped, with a warning."""
 
@@ -293,8 +293,10 @@ class Timeline:
             row = self._waiting.pop(0)
             now, count = self._instant
             self._instant = (now, count + 1) if now == self._clock.now else (self._clock.now, 1)
-            if self._instant[1] > MAX_AT_ONCE:
-                _log.warning("! timeline: more than %d cues at once, one is dropped", MAX_AT_ONCE)
+            if self._instant[1] > MAX_CUES_AT_ONCE:
+                _log.warning(
+                    "! timeline: more than %d cues at once, one is dropped", MAX_CUES_AT_ONCE
+                )
                 continue
             row.done += 1
             try:

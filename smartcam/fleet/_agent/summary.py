@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-IN_A_TURN = 50
+CAMERAS_PER_TURN = 50
 """Number of cameras that are written, or read, in one turn of the event loop."""
 
 MAX_PATTERN_BYTES = 4096
@@ -103,8 +103,8 @@ class Summaries:
         key = self._keys.summary(self._agent.name)
         try:
             hosts = [host for host in self._agent.hosts.values() if meets(pattern, host.name)]
-            for begin in range(0, len(hosts), IN_A_TURN):
-                cameras = [_row(host) for host in hosts[begin : begin + IN_A_TURN]]
+            for begin in range(0, len(hosts), CAMERAS_PER_TURN):
+                cameras = [_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
                 summary = {
                     "agent": self._agent.name,
                     "standby": self._agent.stands_by,

@@ -31,7 +31,7 @@ from smartcam._zenoh import (
 )
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle, Publisher, never
-from smartcam.fleet._security.certificates import LOOK_TIMEOUT, read_identity, shake_hands
+from smartcam.fleet._security.certificates import DIAGNOSIS_TIMEOUT, read_identity, shake_hands
 from smartcam.fleet._security.door import plain_host
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class ZenohEnd(ZenohSession, Bus):
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
-            await super().open(timeout - min(LOOK_TIMEOUT, timeout / 3))  # the rest: to find causes
+            await super().open(timeout - min(DIAGNOSIS_TIMEOUT, timeout / 3))
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
@@ -181,7 +181,7 @@ class ZenohEnd(ZenohSession, Bus):
 
     async def _why_refused(self, folder: Path, left: float) -> str:
         """Return one endpoint's error of a handshake; empty if there is none."""
-        each = max(0.0, min(LOOK_TIMEOUT, left / len(self._link.connect)))
+        each = max(0.0, min(DIAGNOSIS_TIMEOUT, left / len(self._link.connect)))
         for endpoint in self._link.connect:
             kind, _, place = endpoint.partition("/")
             host, _, port = place.rpartition(":")

@@ -72,7 +72,7 @@ CANCEL_GRACE = 0.5
 SETUP_WAIT = 600.0
 """Seconds for which Setup waits for a camera; its own timeout is shorter."""
 
-LOOK_TIMEOUT = 2.0
+PRESENCE_TIMEOUT = 2.0
 """Seconds of the timeout for a question about presences on the bus."""
 
 
@@ -338,8 +338,8 @@ class Plain:
         """Return True if no other agent has a camera and this agent is the first by its name."""
         keys, bus = self._keys, self._bus
         having, agents_present = await asyncio.gather(
-            bus.present(keys.camera("*", camera), LOOK_TIMEOUT),
-            bus.present(keys.agent("*"), LOOK_TIMEOUT),
+            bus.present(keys.camera("*", camera), PRESENCE_TIMEOUT),
+            bus.present(keys.agent("*"), PRESENCE_TIMEOUT),
         )
         owners = {keys.tail(key, "presence/camera")[0] for key in having} - {self._agent.name}
         agents = {keys.tail(key, "presence/agent")[0] for key in agents_present} | {

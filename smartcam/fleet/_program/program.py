@@ -33,7 +33,7 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 AGENT_SEARCH_INTERVAL = 0.1
 """Seconds between two checks for an agent."""
 
-LAST_LOOK_TIMEOUT = 1.0
+OTHER_FLEETS_TIMEOUT = 1.0
 """Seconds of the timeout for finding other fleets than the wanted one."""
 
 
@@ -164,7 +164,7 @@ class Program:
             await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, left))
         thing, meant = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK_TIMEOUT)
+            keys = await self.bus.present(Keys("*").camera("*", "**"), OTHER_FLEETS_TIMEOUT)
             meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
             thing = f"camera {self._camera}"
         whose = self.bus.identity

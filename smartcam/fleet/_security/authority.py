@@ -39,7 +39,7 @@ RENEWAL_TIME = timedelta(days=30)
 BEFORE = timedelta(days=1)
 """Time before now at which certificates begin, since clocks in a plant differ."""
 
-HERE = ("localhost", "127.0.0.1", "::1")
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Hosts in every agent's certificate."""
 
 HOST = re.compile(r"[\w.:-]+", re.ASCII)
@@ -184,7 +184,7 @@ class _Authority:
         done = "kept"
         if role in LISTENING:
             had = [] if old is None else _hosts_of(old)
-            names = [*HERE, *(hosts or ([] if had else [socket.gethostname()]))]
+            names = [*LOCAL_HOSTS, *(hosts or ([] if had else [socket.gethostname()]))]
             hosts = [*dict.fromkeys([*had, *names])]
             stale = bool({*hosts} - {*had})
         else:
@@ -363,7 +363,7 @@ def _write_key(place: Path, key: Any) -> None:
 
 def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
     """Return a text on how to use a certificate."""
-    host = next((host for host in reversed(hosts) if host not in HERE), "HOST")
+    host = next((host for host in reversed(hosts) if host not in LOCAL_HOSTS), "HOST")
     if role == ROUTER:
         return f"zenohd --config {place / ROUTER_FILE}\n"
     if role == AGENT:

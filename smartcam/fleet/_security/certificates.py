@@ -29,7 +29,7 @@ WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 
 DAY = timedelta(days=1)
 
-LOOK_TIMEOUT = 1.0
+DIAGNOSIS_TIMEOUT = 1.0
 """Seconds of the timeout for finding out why a handshake failed."""
 
 RENEW = "smartcam fleet certificates DIR makes a new one"
@@ -221,7 +221,7 @@ class Handshake(NamedTuple):
 
 
 async def shake_hands(
-    host: str, port: int, folder: Path, within: float = LOOK_TIMEOUT
+    host: str, port: int, folder: Path, within: float = DIAGNOSIS_TIMEOUT
 ) -> Handshake:
     """Try a handshake, and return its outcome ``within`` seconds."""
     loop = asyncio.get_running_loop()

@@ -45,7 +45,7 @@ at the last check. A new connection causes a check at once."""
 CHECK_INTERVAL = 0.25
 """Seconds between two checks of connections while some are half-open and no other comes."""
 
-REST = 4.0
+CHECK_PAUSE_FACTOR = 4.0
 """Pause after a check of connections, in multiples of its duration: it reads every descriptor, and
 an agent may have thousands of cameras."""
 
@@ -62,7 +62,7 @@ RESERVED_DESCRIPTORS: Final = 256
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
 """Largest number of half-open connections of one address, which gets no further one then."""
 
-FEW_HALF_OPEN: Final = 4
+RESUMING_HALF_OPEN: Final = 4
 """Number of half-open connections at which an address gets a further one again."""
 
 MAX_BLOCKED_ADDRESSES: Final = 256
@@ -252,14 +252,14 @@ class Door:
             return
         begun = loop.time()
         coming = collections.Counter(host for host, _ in self._connected() - links)
-        self._rested = loop.time() + REST * (loop.time() - begun)
+        self._rested = loop.time() + CHECK_PAUSE_FACTOR * (loop.time() - begun)
         if coming:
             self._expect_look(CHECK_INTERVAL)
         many = [
             host
             for host, count in coming.most_common(MAX_BLOCKED_ADDRESSES)
             if count >= MAX_HALF_OPEN_CONNECTIONS
-            or (host in self.blocked and count > FEW_HALF_OPEN)
+            or (host in self.blocked and count > RESUMING_HALF_OPEN)
         ]
         if self.blocked == {*many}:
             return

@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.inspection._camera.device import SoftwareDevice
-from smartcam.inspection._camera.pairing import MAX_KEPT, JudgedResults
+from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, JudgedResults
 from smartcam.inspection._camera.pictures import png_of
 from smartcam.inspection._cell import load_cell
 from smartcam.models import Capabilities, Result, ValueT
@@ -159,7 +159,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         if judged is None:
             raise UnsupportedError(
                 f"{self.name}: the picture of result {result.number} is not here: expected one of "
-                f"the last {MAX_KEPT} results of this camera"
+                f"the last {MAX_PICTURES_KEPT} results of this camera"
             )
         return await self._png(judged, limit, drawn=drawn)
 

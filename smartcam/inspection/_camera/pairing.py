@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._camera.frame_inspector import Judged
     from smartcam.models import CameraEvent, Result
 
-MAX_KEPT: Final = 8
+MAX_PICTURES_KEPT: Final = 8
 """Number of last results whose pictures are kept, which bounds the memory."""
 
 MAX_PENDING: Final = 64
@@ -51,7 +51,7 @@ class JudgedResults(Observer):
         received: Callable[[], int],
         on_found: Callable[[Result, Judged], None],
         *,
-        max_kept: int = MAX_KEPT,
+        max_kept: int = MAX_PICTURES_KEPT,
     ) -> None:
         self._session, self._received, self._on_found = session, received, on_found
         self._max_kept = max_kept

@@ -31,7 +31,7 @@ SMOOTH_PX: Final = 1.0
 HALF_LENGTH_PX: Final = 4.0
 """Largest half length of a segment, pixels."""
 
-BESIDE_PX: Final = 1.0
+MAX_LINE_DISTANCE_PX: Final = 1.0
 """Largest distance of a segment's points from a straight line through its middle, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
@@ -131,7 +131,7 @@ def segments_of(edges: EdgePoints) -> Segments:
         normal = normals[start]
         offsets = points[around] - points[start]
         alike = normals[around] @ normal >= math.cos(MAX_TURN)
-        own = around[free[around] & alike & (np.abs(offsets @ normal) <= BESIDE_PX)]
+        own = around[free[around] & alike & (np.abs(offsets @ normal) <= MAX_LINE_DISTANCE_PX)]
         free[start] = False
         if len(own) < MIN_POINTS:
             continue

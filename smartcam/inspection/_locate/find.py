@@ -40,7 +40,7 @@ SCORE_MARGIN: Final = 0.1
 """Score by which a fit may raise the coarse score: once enough parts are found, a place is not
 fitted if its coarse score is lower than theirs by more."""
 
-SAME_SCORE: Final = 0.02
+EQUAL_SCORE_DIFFERENCE: Final = 0.02
 """Largest difference of two scores that count as equal."""
 
 RANGE_MARGIN: Final = math.radians(1.0)
@@ -273,11 +273,11 @@ class _SearchedPicture:
     ) -> LocatedPart:
         """Return a part, with a doubt if another rotation fits as well."""
         for angle, share in model.symmetry.alike:
-            if part.score >= share + SAME_SCORE:
+            if part.score >= share + EQUAL_SCORE_DIFFERENCE:
                 continue
             turned = _turned(part.pose, model.symmetry.about, angle)
             other = self._fit(model, turned, search)
-            if other is not None and other.score >= part.score - SAME_SCORE:
+            if other is not None and other.score >= part.score - EQUAL_SCORE_DIFFERENCE:
                 doubt = (
                     f"as much of it is seen if it is turned by {math.degrees(angle):.0f} degrees"
                 )

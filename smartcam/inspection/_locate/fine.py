@@ -34,7 +34,7 @@ MAX_STEPS: Final = 12
 GROUND_STEPS: Final = 2
 """Number of further steps of a fit if the brightness beside the edges varies."""
 
-STILL_PX: Final = 2e-4
+CONVERGENCE_PX: Final = 2e-4
 """A fit ends when no segment moves by more than this many pixels."""
 
 MAX_SHIFT_PX: Final = 2.0
@@ -43,20 +43,20 @@ MAX_SHIFT_PX: Final = 2.0
 MAX_BLUR_PX: Final = 4.0
 """Largest blur of edges that are fitted, pixels."""
 
-CUT: Final = 4.0
+MAX_DEVIATION_SIGMAS: Final = 4.0
 """Least distance from its place, in standard deviations, at which a segment is another edge."""
 
 EDGE_SIGNIFICANCE: Final = 4.0
 """Least height of an edge, standard deviations of the height."""
 
-SEEN_PX: Final = 1.0
+SCORED_DISTANCE_PX: Final = 1.0
 """Distance from its place, in pixels beyond the noise, at which a segment adds nothing to the
 score."""
 
 MAX_MISFIT: Final = 0.3
 """Largest RMS around an edge's step beyond the noise, as a part of the step's height."""
 
-MIN_SEEN: Final = 6
+MIN_SEGMENTS: Final = 6
 """Least number of segments that determine a pose."""
 
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
@@ -174,7 +174,7 @@ def fit_pose(
         shape = shape.moved(move)
         if first is None:
             widened = _widened(widened, fit.widening, float(np.median(blurs)))
-        if number >= 4 and float(np.abs(rows @ move).max()) < STILL_PX:
+        if number >= 4 and float(np.abs(rows @ move).max()) < CONVERGENCE_PX:
             break
     return _result(pixels, segments, shape, widened, use, expected)
 
@@ -305,7 +305,7 @@ def _solve(
     """
     rows, shifts, weights = equations
     used = weights > 0
-    if np.count_nonzero(used) < MIN_SEEN:
+    if np.count_nonzero(used) < MIN_SEGMENTS:
         return None
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
@@ -315,7 +315,7 @@ def _solve(
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
-        robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
+        robust = np.maximum(1 - (scaled / (MAX_DEVIATION_SIGMAS * 1.5 * spread)) ** 2, 0.0) ** 2
     return _least_squares((a, y, w * robust), free, residuals, sigmas)
 
 
@@ -356,7 +356,9 @@ def _result(
     fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
     # an edge counts more the nearer it is to its place, and the better it fits a step
-    deviations = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
+    deviations = np.abs(fit.shifts) / (
+        SCORED_DISTANCE_PX + MAX_DEVIATION_SIGMAS * np.minimum(_of_weights(weights), 1.0)
+    )
     seen = edges & (deviations <= 1)
     lengths = segments.halves / segments.halves.sum()
     score = float((lengths * (1 - deviations**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
@@ -414,8 +416,8 @@ def _settled(
     if used.any():  # if the whole part differs from the taught one, as in too much light
         spread = max(1.4826 * float(np.median(away[used])), 1.0)
     for _ in range(3):
-        used = (weights > 0) & (away <= CUT * spread)
-        if np.count_nonzero(used) < MIN_SEEN:
+        used = (weights > 0) & (away <= MAX_DEVIATION_SIGMAS * spread)
+        if np.count_nonzero(used) < MIN_SEGMENTS:
             return None
         freedom = max(int(used.sum()) - 4, 1)
         chi_square = float((away[used] ** 2).sum()) / freedom

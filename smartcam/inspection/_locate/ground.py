@@ -34,7 +34,7 @@ have at least where the ground is not of one level; by noise alone it is 1.3."""
 MIN_BANDS: Final = 12
 """Least number of bands from which the light on the ground is computed."""
 
-NEAR_PX: Final = 10.0
+GROUND_DISTANCE_PX: Final = 10.0
 """Standard deviation of the distance of the bands from which the ground beside a band is measured,
 in pixels of the taught picture."""
 
@@ -83,7 +83,7 @@ def ground_beside(
             continue
         at = segments.middles + shift * BAND_PX * segments.normals
         distances = np.linalg.norm(at[:, None] - at[measured], axis=2)
-        closeness = np.exp(-0.5 * (distances / NEAR_PX) ** 2) / noise
+        closeness = np.exp(-0.5 * (distances / GROUND_DISTANCE_PX) ** 2) / noise
         beyond = (closeness @ (squares - noise)) / np.maximum(closeness.sum(axis=1), 1e-9)
         grounds.append(np.sqrt(np.maximum(beyond, 0.0)))
     return Ground(*grounds) if any(ground.any() for ground in grounds) else None

@@ -23,7 +23,7 @@ MIN_ALIKE_SHARE: Final = 0.75
 MAX_FOLD: Final = 24
 """Largest fold of a symmetry that is distinguished from a round part."""
 
-NEAR_PX: Final = 1.5
+OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
@@ -123,7 +123,7 @@ def _centre(segments: Segments, count: int) -> Array:
     centre = np.zeros(2)
     index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
     for step in range(CENTRE_STEPS):
-        reach = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
+        reach = max(CENTRE_PX * (1 - step / 4), OUTLINE_DISTANCE_PX)
         rows, values = [], []
         for number in range(1, count):
             angle = 2 * math.pi * number / count
@@ -163,7 +163,7 @@ def _shares(points: Array, normals: Array) -> Array:
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
         met = point_of[nearest[rows, columns]]
         agreed = (normals[met] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(MAX_TURN)
-        shares[number] = (agreed & (distance[rows, columns] <= NEAR_PX)).mean()
+        shares[number] = (agreed & (distance[rows, columns] <= OUTLINE_DISTANCE_PX)).mean()
     return shares
 
 

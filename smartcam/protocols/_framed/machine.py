@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import Codec, FramedDialect
     from smartcam.protocols.messages import Message
 
-MANY_EVENTS = 64
+MAX_EVENTS_PER_READ = 64
 """Number of events of one read above which the next read takes fewer bytes: cutting frames, and
 making messages of them, must not delay other cameras."""
 
-MANY_FRAMES = 512
+MAX_FRAMES_PER_READ = 512
 """Number of frames of one read with the same effect, even if all are one burst of results: more
 than the receive task handles in a turn, so that reading would have to pause after each read."""
 
@@ -419,7 +419,7 @@ class Machine:
             before = self.counters.frames_received
             left = self._receive_frames()
             received = self.counters.frames_received - before
-            if received > MANY_FRAMES or len(self._events) > MANY_EVENTS:
+            if received > MAX_FRAMES_PER_READ or len(self._events) > MAX_EVENTS_PER_READ:
                 self._framer.read_less()
         if left and self._bounded:
             number = self.counters.frames_received

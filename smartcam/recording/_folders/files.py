@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
-LOOK_INTERVAL = 10.0
+LISTING_INTERVAL = 10.0
 """Seconds after which the folder is listed again when a file is begun."""
 
-ITEMS_PER_LOOK = 64
+ITEMS_PER_CHECK = 64
 """Number of items after which a file's size is checked."""
 
 
@@ -79,7 +79,7 @@ class FolderFiles:
         done = written = 0
         try:
             for place, item in enumerate(given):
-                if track.file is None or (not place % ITEMS_PER_LOOK and self._is_over(track)):
+                if track.file is None or (not place % ITEMS_PER_CHECK and self._is_over(track)):
                     self._flush(track, written)
                     done, written = place, 0
                     self._begin(track, item)
@@ -147,7 +147,7 @@ class FolderFiles:
             OSError: the file cannot be created.
         """
         now = self._clock()
-        if now - self._looked > LOOK_INTERVAL:
+        if now - self._looked > LISTING_INTERVAL:
             self._folder.look()
             self._looked = now
         at = _time_of(first)

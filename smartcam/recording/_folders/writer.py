@@ -46,7 +46,7 @@ MIN_FREE_BYTES = 4 * CHUNK
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that failed is tried again; the last delay is repeated."""
 
-EVENT_ROOM = 2
+EVENT_ROOM_FACTOR = 2
 """Factor by which more may wait before events are left out, since these have the camera's state."""
 
 
@@ -150,7 +150,7 @@ class FolderWriter:
         with self._more:
             waiting = self._waiting
             track.offered += 1
-            room = MAX_WAITING_BYTES * EVENT_ROOM if event else MAX_WAITING_BYTES
+            room = MAX_WAITING_BYTES * EVENT_ROOM_FACTOR if event else MAX_WAITING_BYTES
             if self._closing or waiting.bytes > room or size < 0:
                 self._leave_out(track, given)
                 return False

@@ -64,7 +64,7 @@ _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": 
 
 _STAMP = WireField(1, "message", TIMESTAMP)
 
-_OURS: Final = {
+_SMARTCAM_FIELDS: Final = {
     "pixel_format": WireField(101, "string"),
     "picture_width": WireField(102, "fixed32"),
     "picture_height": WireField(103, "fixed32"),
@@ -96,21 +96,21 @@ SCHEMAS: Final[dict[str, Fields]] = {
         "encoding": WireField(4, "string"),
         "step": WireField(5, "fixed32"),
         "data": WireField(6, "bytes"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
     COMPRESSED: {
         "timestamp": _STAMP,
         "frame_id": WireField(4, "string"),
         "data": WireField(2, "bytes"),
         "format": WireField(3, "string"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
     VIDEO: {
         "timestamp": _STAMP,
         "frame_id": WireField(2, "string"),
         "data": WireField(3, "bytes"),
         "format": WireField(4, "string"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
 }
 """Messages of pictures by their names, and their fields."""

@@ -20,7 +20,7 @@ _FLOAT32: Final = 7
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of numpy by the numbers of ``sensor_msgs/PointField``."""
 
-STEP: Final = 16
+POINT_BYTES: Final = 16
 """Number of bytes of a point: x, y, z and rgb."""
 
 NO_DISPARITY: Final = -1.0
@@ -165,7 +165,7 @@ def cloud_fields(
     rows = points if points.ndim == 3 else points[None]
     height, width = rows.shape[:2]
     names = ["x", "y", "z"]
-    step = STEP if colours is not None else STEP - 4
+    step = POINT_BYTES if colours is not None else POINT_BYTES - 4
     data = np.zeros((height, width, step // 4), "<f4")
     data[..., :3] = rows
     if colours is not None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-PATIENCE_TIMEOUT = 60.0
+CAMERA_WAIT = 60.0
 """Largest number of seconds of one wait for a camera, before the next wait begins."""
 
 RETRY = Backoff(initial=0.5, maximum=10.0)
@@ -144,7 +144,7 @@ class CameraLifecycle(Lifecycle):
         logged, delays = "", RETRY.delays()
         while True:
             try:
-                await self._camera.wait_connected(PATIENCE_TIMEOUT)
+                await self._camera.wait_connected(CAMERA_WAIT)
                 await self.configure()
                 await self.activate()
             except (LinkError, ResponseTimeoutError) as exc:

@@ -34,7 +34,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 OPEN_TIMEOUT = 60.0
 """Seconds for rclpy to make a node; a busy machine takes long to import rclpy for the first one."""
 
-TELL_MISSING_AFTER = 1.0
+MISSING_LOG_DELAY = 1.0
 """Seconds after which missing packages are logged, all at once."""
 
 BILLION = 1_000_000_000
@@ -360,7 +360,7 @@ class NativeNode(NamedNode):
         self._missing.setdefault(type.partition("/")[0], []).append(name)
         if self._telling is None:
             loop = asyncio.get_running_loop()
-            self._telling = loop.call_later(TELL_MISSING_AFTER, self._report_missing)
+            self._telling = loop.call_later(MISSING_LOG_DELAY, self._report_missing)
 
     def _report_missing(self) -> None:
         if self._telling is not None:

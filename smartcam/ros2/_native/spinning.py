@@ -24,10 +24,10 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 EXECUTOR_THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
-LOOK_INTERVAL = 1.0
+CHECK_INTERVAL = 1.0
 """Seconds between two checks of a spinning thread whether its event loop still runs."""
 
-AFTER_ERROR = 0.05
+ERROR_PAUSE = 0.05
 """Seconds for which a spinning thread pauses after an error, so that a repeated one is cheap."""
 
 EXIT_TIMEOUT = 2.0
@@ -242,7 +242,7 @@ class SpunNode:
             if not context.ok():
                 return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
             try:
-                self.executor.spin_once(LOOK_INTERVAL)
+                self.executor.spin_once(CHECK_INTERVAL)
             except shut_down:
                 continue
             except NoReplyError:
@@ -258,7 +258,7 @@ class SpunNode:
             self._logged.add(text)
             level = logging.DEBUG if closed else logging.WARNING
             logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)
-        time.sleep(AFTER_ERROR)
+        time.sleep(ERROR_PAUSE)
 
     def _close(self) -> None:
         with contextlib.suppress(Exception):  # the handles end with their context

@@ -34,7 +34,7 @@ FAILURE_GRACE: Final = 3.0
 DRAIN_TIMEOUT: Final = 5.0
 """Seconds for decoding queued frames after a stream's end."""
 
-DRAIN_LOOK_INTERVAL: Final = 0.005
+DRAIN_CHECK_INTERVAL: Final = 0.005
 """Seconds between two checks of the queue after a stream's end."""
 
 
@@ -142,7 +142,7 @@ class UnitDecoding:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DRAIN_TIMEOUT):
                 while self._units and not self._ended:  # noqa: ASYNC110 - there is no event
-                    await asyncio.sleep(DRAIN_LOOK_INTERVAL)
+                    await asyncio.sleep(DRAIN_CHECK_INTERVAL)
         self.over(error)
 
     def take(self, units: list[AccessUnit]) -> None:

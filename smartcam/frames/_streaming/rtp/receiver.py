@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_WAITING_PACKETS: Final = 1024
 """Largest number of packets that wait for missing packets."""
 
-LOOK_INTERVAL: Final = 0.005
+CHECK_INTERVAL: Final = 0.005
 """Seconds between two checks for missing packets."""
 
 RESEND_INTERVAL: Final = 0.02
@@ -275,7 +275,7 @@ class StreamReceiver:
         taken = self._depacketizer
         waits = taken.waits_since() is not None or taken.marked_at is not None
         if self._tick is None and (waits or self._tail_due()):
-            self._tick = self._loop.call_later(LOOK_INTERVAL, self._look)
+            self._tick = self._loop.call_later(CHECK_INTERVAL, self._look)
         if made:
             self._done(made)
 
