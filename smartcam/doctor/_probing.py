@@ -1,8 +1,8 @@
-"""Ask an address for its language: protocols, transports and dialects, each on a fresh link.
+"""Find out the protocol, transport and dialect of an address, each try on a new link.
 
-Every try is a :class:`Trial` with all sent and received bytes, decoded if possible, and as hex in
-any case. A camera that closes the link without a byte is asked once more without the Disconnect
-before Connect (see :mod:`smartcam._client.handshake`).
+Every try is a :class:`Trial` with all sent and received bytes, as hex and, if possible, decoded. If
+a camera closes the link without a byte, the try is repeated without the Disconnect before Connect
+(see :mod:`smartcam._client.handshake`).
 """
 
 from __future__ import annotations
@@ -77,14 +77,14 @@ class Trial(Try):
     other: bool = False
 
     def __str__(self) -> str:
-        """One line for an error text."""
+        """Text of one line for an error."""
         text = super(Trial, self).__str__()
         return (
             f"{self.address.protocol} at port {self.address.port}: {text}" if self.other else text
         )
 
     def keep(self, entry: TraceEntry) -> None:
-        """Keep an entry, unless there are too many."""
+        """Keep an entry, up to :data:`MAX_FRAMES`."""
         if self.answer is None and len(self.frames) < MAX_FRAMES:
             self.frames.append(entry)
         elif self.answer is None:
@@ -122,7 +122,8 @@ def ways(address: Address) -> list[Way]:
 def other_ways(address: Address) -> list[Way]:
     """Return every way to speak to an address's host in the other registered protocols.
 
-    They use the address's port; if that is its protocol's default, each uses its own default.
+    They use the address's port. If that is the default of the address's protocol, each protocol
+    uses its own default.
     """
     own_protocol = load_protocol(address.protocol)
     ways_found: list[Way] = []
@@ -146,7 +147,7 @@ async def trials(
     go_on: bool = False,
     every_protocol: bool = False,
 ) -> AsyncGenerator[Trial]:
-    """Try every way in turn and yield each try; the session of one that answers is ended first.
+    """Try every way in turn and yield each try; a session is ended before its try is yielded.
 
     The pinned options of ``address`` are tried first. ``timeout``: seconds for all tries; each has
     an equal share of the rest. ``trace``: called with every frame on the wire. ``go_on``: continue
@@ -170,7 +171,7 @@ async def trials(
         trial = await _try(way, share, trace, disconnect_first=disconnect_first)
         trial.other = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
-            left.appendleft((way, False))  # perhaps it closed because of the Disconnect
+            left.appendleft((way, False))  # the camera may have closed because of the Disconnect
         _put_greeted_first(left, trial)
         yield trial
         if trial.answer is not None and not go_on:
@@ -203,13 +204,13 @@ def _greets(protocol: Protocol, received: bytes) -> bool:
 
 
 async def locate(host: str, *, timeout: float) -> str:
-    """Return the URL of the camera at a bare ``HOST[:PORT]``, in the protocol that it answers.
+    """Return the URL of the camera at a bare ``HOST[:PORT]``, with the protocol that it answers.
 
-    The session for this is over then. ``timeout``: seconds for all ways together.
+    The session is ended before the return. ``timeout``: seconds for all ways together.
 
     Raises:
-        ConnectFailedError: the camera answered no protocol; the error has the most telling try, and
-            the cure.
+        ConnectFailedError: the camera answered no protocol; the error has the most informative
+            try, and the cure.
 
     Cancellation: the link is dropped.
     """
@@ -224,7 +225,7 @@ async def locate(host: str, *, timeout: float) -> str:
 
 
 def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
-    """Return the error for failed tries: the most telling one, and the cure."""
+    """Return the error for failed tries, with the most informative one and the cure."""
     ranked = by_telling(failed)
     where = ranked[0].address
     why = explain(ranked[:1], where, load_protocol(where.protocol))
@@ -237,10 +238,9 @@ def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectF
 
 
 def by_telling(trials_made: Iterable[Trial]) -> list[Trial]:
-    """Return failed tries, the most telling first.
+    """Return failed tries, the most informative first.
 
-    A refusal tells more than bytes that are no message, these more than other bytes, bytes more
-    than silence, and silence more than no link.
+    The order: a refusal, bytes of a frame that is no message, other bytes, silence, no link.
     """
 
     def rank(trial: Trial) -> tuple[bool, bool, bool, bool]:

@@ -1,7 +1,7 @@
 """Find cameras: search networks for addresses that listen on the ports of cameras.
 
-Ports are opened and not used: nothing is sent, unasked bytes are read. A caller that wants to
-know more allows asking, which speaks to the camera as ``smartcam probe`` does.
+A search opens ports and sends nothing; it reads bytes that a port sends by itself. If the caller
+allows it, the search also speaks to the found cameras, like ``smartcam probe``.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ MAX_SECONDS = 60.0
 """Largest number of seconds for one opening."""
 
 ASK_TIMEOUT = 10.0
-"""Seconds for asking one camera, all ways together."""
+"""Seconds for questions to one camera in all protocols together."""
 
 MAX_ASKED_AT_ONCE = 16
 """Number of cameras that are asked at the same time."""
@@ -93,14 +93,15 @@ async def find(
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
             network has at most 256 addresses.
-        ports: further ports to open; each of the protocols may be spoken there.
+        ports: further ports to open, which may serve any of the protocols.
         protocols: names of the protocols to look for; default: all that are known.
-        leave: addresses of cameras at work, which are not touched; written as ``networks``.
+        leave: addresses of working cameras that the search leaves out, in the form of
+            ``networks``.
         may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
         ask: also speak to the cameras that were found, which takes such a camera from its client.
         rate: largest number of openings per second.
         at_once: largest number of connections at a time.
-        timeout: seconds until a port is open, and as many again to read unasked bytes.
+        timeout: seconds to open a port, and again to read bytes that the port sends by itself.
         max_addresses: number of addresses above which a search is refused.
 
     Raises:
@@ -127,14 +128,14 @@ async def find(
 
 
 class CameraSearch:
-    """One search; its results stay, however it ends. Arguments as in :func:`find`.
+    """A search, whose results remain after its end or failure. Arguments as in :func:`find`.
 
     Attributes:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
-        counts: numbers of tries, by their outcome.
+        counts: numbers of tries by outcome.
         why: the first failure of this machine.
-        left: addresses that were left alone, by the texts that name them.
+        left: addresses that were left out, by the texts that name them.
         begun: whether the first port was tried.
     """
 
@@ -190,7 +191,7 @@ class CameraSearch:
 
     @property
     def exclusive(self) -> list[str]:
-        """Names of protocols whose cameras serve one client, and were found but not asked."""
+        """Names of protocols of found cameras that were not asked, since they serve one client."""
         if self._ask:
             return []
         names = {name for port in self._ports_found.values() for name in port.protocols}
@@ -265,7 +266,7 @@ class CameraSearch:
             self._ports_found[address, port] = found_port(str(address), port, opened, protocols)
 
     async def _socket(self, address: HostAddress) -> socket.socket:
-        """Return a socket, as soon as the system has one."""
+        """Return a socket; wait until the system has a free one."""
         loop = asyncio.get_running_loop()
         until = loop.time() + 4 * self._timeout
         while True:
@@ -331,7 +332,7 @@ def _check_count(count: int, most: int) -> None:
 
 
 async def asked(port: FoundPort) -> FoundPort:
-    """Ask a found camera, in each protocol that it may speak, and return the outcome."""
+    """Ask a found camera in each possible protocol, and return the outcome."""
     failed: list[str] = []
     for url in port.urls:
         async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:

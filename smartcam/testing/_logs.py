@@ -6,8 +6,8 @@
     emulated_camera.log.expect_nothing_while_busy()
     emulated_camera.log.expect_disconnect_before_close()
 
-Expected messages may still be on their way, so each method looks again and again until its time is
-over. A failure is an ``AssertionError`` that shows the log.
+Expected messages may still arrive, so each method repeats its check until its timeout. A failure is
+an ``AssertionError`` that shows the log.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ MAX_SHOWN_ENTRIES = 40
 """Largest number of entries of the log that a failure shows: the last ones."""
 
 CHECK_INTERVAL = 0.005
-"""Seconds between two looks."""
+"""Seconds between two checks of the log."""
 
 
 class CameraLog(Sequence["LogEntry"]):
-    """The log of an emulated camera's traffic, oldest first; read anew for each use.
+    """The log of an emulated camera's traffic, oldest first, which is read again for each use.
 
     Args:
         read: function that returns the entries.
@@ -111,16 +111,16 @@ class CameraLog(Sequence["LogEntry"]):
     # ------------------------------------------------------------------ expectations
 
     def expect(self, *expected: Expected, only: bool = False, timeout: float = 5.0) -> None:
-        """Check that these messages went over the wire, in this order.
+        """Check that messages were transferred in a given order.
 
         Args:
-            expected: messages of the client and of the camera; others may stand between them.
-            only: the client sent no other message. The camera's messages are ignored unless
-                expected.
+            expected: messages of the client and of the camera; others may be between them.
+            only: whether the client sent no other message. The camera's messages are ignored
+                unless expected.
             timeout: seconds to wait for them.
 
         Raises:
-            AssertionError: the messages did not come.
+            AssertionError: the messages did not arrive in time.
             ConfigurationError: there is no message of this name.
         """
         __tracebackhide__ = True

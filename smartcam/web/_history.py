@@ -1,4 +1,4 @@
-"""Keep the outcomes of a camera's results over a shift: a trend, and the last failures."""
+"""Keep the outcomes of a camera's results over a shift, as a trend and the last failures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_BARS: Final = SHIFT_SECONDS // BAR_SECONDS
 """Largest number of bars that are kept."""
 
 SLOT_SECONDS: Final = 1800
-"""Seconds of results in a place of the short trend."""
+"""Seconds of results in a slot of the short trend."""
 
 MAX_FAILURES: Final = 50
 """Largest number of failures that are kept; equal ones in a row are one."""
@@ -69,7 +69,7 @@ class ShiftHistory:
         version: number of changes.
         failed_since: time of the first failure after the last pass, seconds since 1970; None if
             the last result with a verdict has passed.
-        in_a_row: number of failed results since then.
+        in_a_row: number of failed results since the last pass.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
 
@@ -105,7 +105,7 @@ class ShiftHistory:
         self._fail(at, None, f"not readable: {text}")
 
     def add_missed(self, count: int, text: str) -> None:
-        """Count results that did not come, with a text."""
+        """Count missing results, with a text."""
         at = time.time()
         self._count_up("errors", at, count)
         self._newest = 0
@@ -150,7 +150,7 @@ class ShiftHistory:
 
     @property
     def wants_picture(self) -> bool:
-        """True if the newest result is a failure that has no picture yet."""
+        """True if the newest result is a failure without a picture."""
         return self._newest > 0 and self._newest not in self._pictures
 
     def attach(self, serial: int, picture: bytes) -> None:
@@ -172,7 +172,7 @@ class ShiftHistory:
 
     @property
     def last_failure(self) -> int:
-        """Serial of the failure that is the newest result; 0 if that is no failure."""
+        """Serial of the newest result if it is a failure, else 0."""
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
@@ -198,7 +198,7 @@ class ShiftHistory:
     def trend(self) -> dict[str, Any]:
         """Return the short trend, for a row of a table.
 
-        ``end`` is the end of its last place, seconds since 1970. Each place covers
+        ``end`` is the end of the last slot, seconds since 1970. Each slot covers
         :data:`SLOT_SECONDS` and is one character: the number of bad results in ten with a verdict,
         rounded up (X: all bad); ``-`` if none had a verdict, a space without results.
         """
@@ -217,7 +217,7 @@ class ShiftHistory:
 
 
 def _place(outcomes: list[int]) -> str:
-    """Return the character of a place of the short trend."""
+    """Return the character of a slot of the short trend."""
     passed, failed, other, errors = outcomes
     bad, judged = failed + errors, passed + failed + errors
     if judged:

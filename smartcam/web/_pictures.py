@@ -1,7 +1,7 @@
 """The newest frames of some sources, for viewers: the common part of pages with pictures.
 
-Each viewer of a source has a reader of it and a WebSocket, with one picture on the way at a
-time: when the page reports that it has shown the last picture, the newest one is sent. So a slow
+Each viewer of a source has its own reader and WebSocket, with at most one picture in transfer: when
+the page reports that it has shown the last picture, the newest one is sent. So a slow
 viewer skips pictures, and delays neither the device nor other viewers. Without viewers there is no
 reader, and the device does not stream.
 """
@@ -95,7 +95,7 @@ class SitePictures:
             self._presses = [Press(self._threads, self._quality) for _ in self.sources]
 
     def end_viewers(self) -> None:
-        """Tell all viewers that the site ends."""
+        """Notify all viewers of the site's end."""
         for viewer in self.viewers:
             viewer.end()
 
@@ -235,7 +235,7 @@ class Viewer(PageSocket):
         self._sent = 0
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show frames until the page goes."""
+        """Show frames until the page is closed."""
         self._pictures.viewers.add(self)
         try:
             return await super().serve()
@@ -248,7 +248,7 @@ class Viewer(PageSocket):
     async def _show(self) -> None:
         """Show frames, and read the source again after it ended.
 
-        A lost source stays lost for the page until a picture of it comes.
+        The page shows a lost source as lost until its next picture.
         """
         delays, lost = REOPEN_BACKOFF.delays(), False
         while True:
@@ -268,7 +268,9 @@ class Viewer(PageSocket):
                 lost = True
             else:
                 await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
-                await asyncio.Event().wait()  # a second message would make the page play it again
+                await (
+                    asyncio.Event().wait()
+                )  # after a second message the page would play the recording again
             if self._sent > before:
                 delays = REOPEN_BACKOFF.delays()
             await asyncio.sleep(next(delays))

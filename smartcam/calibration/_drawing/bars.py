@@ -1,4 +1,4 @@
-"""Draw a bar or two for each view, with lines at the values to compare them with."""
+"""Draw one or two bars for each view, with lines at the values of all views together."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ WIDTH, HEIGHT = 900.0, 260.0
 """Width and height of a chart, pixels."""
 
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
-"""Pixels beside a chart, above it, below it, and on the right."""
+"""Margins of a chart on the left, above, below and on the right, pixels."""
 
 LETTER_WIDTH_PX: Final = 7.5
 """Approximate width of a letter, pixels."""
 
 MAX_BAR_RATIO: Final = 3.0
-"""Bars longer than this many times the longest bar of a used view are cut, and their value is
-written."""
+"""Bars longer than this many times the longest bar of a used view are cut, and labelled with their
+value."""
 
 MAX_LINES: Final = 5
 """A chart has at most this many horizontal lines."""
@@ -98,7 +98,7 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
 
 
 def _largest(chart: Chart) -> float:
-    """Return the upper end of a chart, which views that were left out do not raise."""
+    """Return the upper end of a chart, from the views that were used."""
     used = [
         value
         for series in chart.series

@@ -1,7 +1,6 @@
-"""Send transmissions in order, each at its time. It knows no socket and no fault.
+"""Send transmissions in order, each at its time, without knowledge of sockets and faults.
 
-Everything that delays messages on a link uses it: the emulator's faults give it messages, the link
-proxy gives it bytes of a stream or datagrams.
+The emulator's faults delay messages by this module; the link proxy, bytes of a stream or datagrams.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ class Ending(NamedTuple):
     # event; ``eof`` means that the sender has ended
     how: Literal["close", "reset", "stall", "half_open", "eof"]
     cause: str  # kind of the fault, or name of the rule
-    # seconds that a half-open connection stays; None: as long as possible
+    # seconds for which a half-open connection stays; None: as long as possible
     seconds: float | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Transmission:
-    """Bytes that pass a link, with their delays and pauses."""
+    """Bytes for a link, with their delays and pauses."""
 
-    parts: list[bytes]  # bytes still to pass; each part is one write
+    parts: list[bytes]  # bytes still to send; each part is one write
     _: KW_ONLY
     pauses: list[float] = field(
         default_factory=list[float]
     )  # seconds before each part but the first
     delay: float = 0.0  # seconds before the first part
     overtaken: bool = False  # whether later parts may pass this one while it waits
-    # number of following parts to wait for, and the most seconds to wait
+    # number of later parts to wait for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
-    # without an order: whether it goes after those parts and not together with them
+    # without an order: whether the transmission is sent after those parts, not with them
     behind: bool = False
     end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
@@ -50,7 +49,7 @@ class Transmission:
 
     @property
     def size(self) -> int:
-        """The number of bytes still to pass."""
+        """The number of bytes still to send."""
         return sum(map(len, self.parts))
 
     def take(self) -> bytes:
@@ -62,7 +61,7 @@ T = TypeVar("T", bound=Transmission)
 
 
 class _Waiting(Generic[T]):
-    """A transmission that has not passed yet; ``missing`` is the number it still waits for."""
+    """A waiting transmission; ``missing``: number of later parts that it still waits for."""
 
     __slots__ = ("company", "due", "missing", "paused", "sent", "turns", "until")
 
@@ -73,12 +72,12 @@ class _Waiting(Generic[T]):
         # time until which it waits for others, nanoseconds
         self.until = self.due + nanoseconds(seconds)
         self.company: list[T] = []  # parts that it waited for, without an order
-        self.paused = False  # a part has passed, and its pause has not begun
-        self.turns = 0  # turns of the timer before it passes
+        self.paused = False  # whether a part was sent, and its pause has not begun
+        self.turns = 0  # turns of the timer before the next part is sent
 
     @property
     def when(self) -> int:
-        """Time at which the message passes if nothing more comes, nanoseconds."""
+        """Time at which the message is sent if no later one arrives, nanoseconds."""
         return self.until if self.missing > 0 else self.due
 
     def pause(self, now: int, turns: int) -> None:
@@ -92,7 +91,7 @@ class _Waiting(Generic[T]):
 class DelayLine(Generic[T]):
     """One direction of one link.
 
-    :meth:`put` transmissions, then call :meth:`run`. Passing bytes go to ``carry``.
+    :meth:`put` transmissions, then call :meth:`run`. ``carry`` is called with the bytes to send.
     """
 
     clock: Clock
@@ -108,7 +107,7 @@ class DelayLine(Generic[T]):
     turns: int = 0  # turns of the event loop that a pause of no time takes
 
     def __post_init__(self) -> None:
-        self.size: int = 0  # bytes on it
+        self.size: int = 0  # bytes of all waiting transmissions
         self.stopped: bool = False  # whether nothing passes until go_on()
         self._queue: deque[_Waiting[T]] = deque()
         self._loose: list[_Waiting[T]] = []
@@ -121,7 +120,7 @@ class DelayLine(Generic[T]):
     def put(self, sent: Iterable[T], amount: int = 1) -> None:
         """Add the transmissions of a message; call :meth:`run` next.
 
-        They count as ``amount`` for transmissions that wait for following ones.
+        They count as ``amount`` for transmissions that wait for later ones.
         """
         now = self._now
         gatherer = self._count(amount, now)
@@ -135,7 +134,7 @@ class DelayLine(Generic[T]):
                 self._loose.append(_Waiting(message, now))
 
     def run(self) -> None:
-        """Let all transmissions pass whose time has come."""
+        """Send all transmissions whose time has come."""
         if self._running or self.stopped:
             return
         self._running = True
@@ -147,12 +146,12 @@ class DelayLine(Generic[T]):
         self._arm()
 
     def stop(self) -> None:
-        """Let nothing pass until :meth:`go_on`."""
+        """Send nothing until :meth:`go_on`."""
         self.stopped = True
         self._timer.set(None)
 
     def go_on(self) -> None:
-        """Let waiting transmissions pass, as :meth:`run`, also if the line was stopped."""
+        """Send waiting transmissions like :meth:`run`, also after :meth:`stop`."""
         self.stopped = False
         self.run()
 
@@ -172,7 +171,7 @@ class DelayLine(Generic[T]):
         return nanoseconds(self.clock.now)
 
     def _count(self, amount: int, now: int) -> _Waiting[T] | None:
-        """Count new transmissions for those that wait; return the one to join."""
+        """Count new transmissions for waiting ones; return the transmission to join."""
         waiting = [
             waiting_message
             for waiting_message in (*self._queue, *self._loose)
@@ -190,7 +189,7 @@ class DelayLine(Generic[T]):
         return together[0] if together else None
 
     def _run_loose(self) -> None:
-        """Pass transmissions that may be overtaken, and all without an order."""
+        """Send transmissions that may be overtaken, and all without an order."""
         now = self._now
         due = [waiting_message for waiting_message in self._loose if waiting_message.when <= now]
         for waiting_message in sorted(
@@ -205,7 +204,7 @@ class DelayLine(Generic[T]):
                 self._pass_datagrams(waiting_message)
 
     def _pass_datagrams(self, waiting_message: _Waiting[T]) -> None:
-        """Pass the due parts, one datagram each; joined parts are one datagram."""
+        """Send the due parts, one datagram each; joined parts are one datagram."""
         sent = waiting_message.sent
         if sent.gather is not None and not sent.behind:
             self._loose.remove(waiting_message)
@@ -241,7 +240,7 @@ class DelayLine(Generic[T]):
             self._queue.popleft()
             if sent.end is not None:
                 batch = self._hand_over(batch)
-                if self.stopped:  # bytes before the end have not passed yet
+                if self.stopped:  # bytes before the end were not sent yet
                     self._queue.appendleft(first)
                 else:
                     self._finish(sent)

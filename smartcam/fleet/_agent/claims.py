@@ -78,8 +78,10 @@ class Claims:
         self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
         self._wanted: dict[str, CameraSettings] = {}
         self._others: dict[str, set[str]] = {}  # other agents with a camera of this agent
-        self._contested: dict[str, float] = {}  # time until which one of them may take it
-        self._calm: dict[str, float] = {}  # time until which this is excluded
+        self._contested: dict[
+            str, float
+        ] = {}  # loop time until which another agent may take the camera
+        self._calm: dict[str, float] = {}  # loop time until which a takeover is excluded
         self._settling: set[str] = set()
         self._again: set[str] = set()
         self._back: dict[str, asyncio.Event] = {}  # awaited presences of other agents
@@ -89,11 +91,11 @@ class Claims:
         self._name: list[Handle] = []
 
     async def refuse_namesake(self, timeout: float) -> None:
-        """Raise if there is another agent of this name; before using the name on the bus.
+        """Raise if another agent has the name; called before the name is used on the bus.
 
         Raises:
-            ConfigurationError: there is another agent, whose presence stays for longer than that of
-                a dead one.
+            ConfigurationError: there is another agent: its presence lasts longer than the presence
+                of an agent that has died.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         patience = loop.time() + LEASE_TIME + 1.0
@@ -119,7 +121,7 @@ class Claims:
         self._name.append(bus.watch(keys.start(name, "*"), self._on_namesake))
 
     def _is_earlier(self, key: str) -> bool:
-        """Return True if another start of this name is earlier; there are no ties."""
+        """Return True if another agent of this name was started earlier; there are no ties."""
         return _order(self._keys.tail(key, "presence/start")[-1]) < _order(self._start)
 
     def _namesake(self) -> ConfigurationError:
@@ -138,14 +140,14 @@ class Claims:
             )
         elif not present:
             for host in self._agent.hosts.values():
-                host.camera.take_again()  # the camera that it took
+                host.camera.take_again()  # take back the camera that the other agent took
 
     async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
         """Share the cameras that no other agent has.
 
         Raises:
-            ConfigurationError: another agent has a camera, and neither stands by; then nothing is
-                shared. Or an option of a camera is wrong.
+            ConfigurationError: another agent has a camera and neither stands by, or an option of a
+                camera is wrong; nothing is shared.
         """
         self._wanted = dict(cameras)
         keys, bus = self._keys, self._bus
@@ -189,10 +191,10 @@ class Claims:
             )
 
     async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
-        """Raise if the fleet has one of these cameras under another name: it serves one client.
+        """Raise if the fleet has one of these cameras under another name.
 
-        There is no await between the last check of this agent's own cameras and the return. Two
-        agents that check at the same time do not see each other.
+        A camera serves one client. There is no await between the check of this agent's own cameras
+        and the return. Two agents that check at the same time do not see each other.
 
         Raises:
             ConfigurationError: one of the addresses is taken; the text names it and its agent.
@@ -252,8 +254,8 @@ class Claims:
     async def _refuse(self) -> None:
         """Raise if another agent has a camera of this agent, and neither stands by.
 
-        An agent that does not answer while its presence stays may have died a moment ago: the
-        presence ends with the engine's lease.
+        An agent that does not answer may have died a moment ago: its presence ends only with the
+        engine's lease.
         """
         loop = asyncio.get_running_loop()
         patience = loop.time() + LEASE_TIME + 1.0
@@ -283,7 +285,7 @@ class Claims:
     # ------------------------------------------------------------------ other agents
 
     def _note(self, key: str, present: bool) -> str:
-        """Note another agent's presence at a camera; return the camera, "" for other cameras."""
+        """Note another agent's presence; return its camera, "" if this agent does not have it."""
         agent, *chunks = self._keys.tail(key, "presence/camera")
         name = "/".join(chunks)
         if agent == self._agent.name or name not in self._wanted:
@@ -309,12 +311,12 @@ class Claims:
                 self._consider(name)
 
     def _is_contested(self, name: str) -> bool:
-        """Return True if another agent has a camera of this agent, or had it a moment ago."""
+        """Return True if another agent announces a camera of this agent, or did a moment ago."""
         now = asyncio.get_running_loop().time()
         return bool(self._others.get(name)) or now < self._contested.get(name, now)
 
     def _consider(self, name: str) -> None:
-        """Decide about a camera in a task; one at a time for each."""
+        """Decide in a task which agent gets a camera; one task at a time for each camera."""
         self._again.add(name)
         if name not in self._settling:
             self._settling.add(name)
@@ -332,7 +334,7 @@ class Claims:
             self._settling.discard(name)
 
     async def _stand_by(self, name: str) -> None:
-        """Take over a camera without agent."""
+        """Take over a camera that no agent has."""
         if self._standby is None or self._others.get(name):
             return
         away = not self._bus.reached  # only this agent was cut off, not the others
@@ -377,10 +379,10 @@ class Claims:
             del self._back[name]
 
     async def _defend(self, name: str) -> None:
-        """Decide about a camera of this agent that has no session.
+        """Decide whether this agent keeps a camera without a session.
 
-        Another agent that announces the camera, too, keeps it if it has a session. If no other
-        agent announces it, and a client took the camera, this agent stands by.
+        Another agent that also announces the camera keeps it if it has a session. If no other agent
+        announces it, and another client took the camera, this agent stands by.
         """
         agent, away = self._agent, False
         while (host := agent.hosts.get(name)) and not host.connected:  # a later loss is an event
@@ -407,9 +409,9 @@ class Claims:
                 return
 
     async def _yields(self, host: Host, other: str) -> bool:
-        """Return True if this agent, without a session, leaves a camera to another agent.
+        """Return True if this agent, which has no session, leaves a camera to another agent.
 
-        Of two agents without a session the first one by name continues.
+        Of two agents without a session the first by name keeps the camera.
         """
         agent, name = self._agent, host.name
         cameras = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
@@ -429,7 +431,7 @@ class Claims:
 
 
 def _order(start: str) -> tuple[int, str]:
-    """Return the sort key of agents' starts: their time, then a random word."""
+    """Return the sort key of agents' starts: time, then a random word."""
     epoch, _, chance = start.partition("-")
     return int(epoch) if epoch.isdecimal() else 0, chance
 

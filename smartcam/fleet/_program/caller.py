@@ -1,4 +1,4 @@
-"""Find and call the agent of a fleet's camera; follow its presence and its clock."""
+"""Find and call the agent of a fleet's camera; track its presence and its clock."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ MAX_DRIFT_RATIO = 1e-4
 """Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
-"""Seconds for the answer to a hello; then it is sent again, as long as the agent is present."""
+"""Seconds for the answer to a hello, which is then sent again while the agent is present."""
 
 
 SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
-"""Names of calls for users, if they differ."""
+"""Names of calls in texts for users, if they differ from the call's own."""
 OTHER_AGENT_INTERVAL = 0.25
-"""Seconds between two checks for another agent with a session, if the present one has none."""
+"""Seconds between two searches for another agent with a session, if the current agent has none."""
 
 SESSION_QUESTION_INTERVAL = 5.0
-"""Seconds until the present agent is asked whether it has a session by now: its message may be
-lost, and a camera without triggers causes no further ones."""
+"""Seconds between two questions to an agent without a session whether it has one now: its message
+may be lost, and a camera without triggers causes no further ones."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
 
 RESEND_DELAY = 1.0
-"""Seconds until an unconfirmed message is sent again, since it may have been lost."""
+"""Seconds until an unconfirmed message, which may be lost, is sent again."""
 
 
 class Met:
@@ -121,7 +121,7 @@ class Caller:
         met: the agent; None while there is none.
         trouble: reason why there is no agent.
         end: reason why there will be no further agent.
-        linked: whether the agent has a session with the camera, as far as is known.
+        linked: whether the agent had a session with the camera when it last reported.
         leases: the reservations whose blocks run, oldest first, by the calls that made them.
         streamed: whether this program takes all results of the camera.
     """
@@ -147,7 +147,7 @@ class Caller:
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
         self.streamed: bool = False
-        self._commands_to = "", ""  # the agent called last, and the key of commands to it
+        self._commands_to = "", ""  # the agent of the last call, and the key of commands to it
         self._epochs: dict[str, int] = {}  # epochs of agents that have answered
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
@@ -156,9 +156,9 @@ class Caller:
         self._task: asyncio.Task[None] | None = None
         self._ahead = 0.0  # least seconds by which the agent's clock is ahead of the loop's
         self._measured = 0.0
-        self._most = math.inf  # largest seconds by which it is ahead
+        self._most = math.inf  # most seconds by which the agent's clock is ahead
         self._bounded = 0.0
-        self._removed = ""  # reason why the present agent no longer shares the camera
+        self._removed = ""  # reason why the current agent no longer shares the camera
         self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
@@ -181,7 +181,9 @@ class Caller:
             task.cancel()
             await asyncio.wait({task})
         if self._insisting:
-            await asyncio.wait(self._insisting)  # calls wait for an answer that has failed
+            await asyncio.wait(
+                self._insisting
+            )  # repeated messages wait for answers that have failed
 
     def finish(self, error: LinkError) -> None:
         """End for good: there will be no further agent."""
@@ -196,7 +198,7 @@ class Caller:
         """Return the agent.
 
         Raises:
-            ConnectionLostError: the agent is away.
+            ConnectionLostError: there is no agent now.
             ConnectionClosedError: the caller is not open, or closed.
         """
         if self.met is not None:
@@ -234,7 +236,7 @@ class Caller:
         self._removed = why
 
     def lose(self, why: str) -> None:
-        """End every running call with an unknown outcome, since the agent is gone."""
+        """End every running call with an unknown outcome, since the agent was lost."""
         if self.met is None:
             return
         self.met, self.linked = None, False
@@ -244,7 +246,7 @@ class Caller:
         self._on_lost(error)
 
     async def _attend(self) -> None:
-        """Connect to an agent whenever there is one; of several, to the one with a session."""
+        """Connect to an agent whenever there is one; of several, to the agent with a session."""
         loop, quiet_since = asyncio.get_running_loop(), 0.0
         while True:
             look = None
@@ -275,7 +277,7 @@ class Caller:
                         self._stirred.set()
 
     async def _choose(self, agents: list[str], met: Met | None) -> None:
-        """Choose an agent: of several, or instead of another, one that has a session."""
+        """Choose an agent, if possible with a session; it may replace the current one."""
         only_linked = met is not None
         hellos: list[_HelloHeard] = []
         failed: SmartCamError | None = None
@@ -288,7 +290,7 @@ class Caller:
             if hellos[-1].hello.get("connected") and not hellos[-1].hello.get("trying"):
                 break  # a camera has one session
         if self.met is not met:
-            return  # the agent came or went meanwhile
+            return  # an agent appeared or disappeared
         if not hellos:
             if failed is not None:
                 raise failed
@@ -301,7 +303,7 @@ class Caller:
         self._meet(best)
 
     async def _ask_anew(self, met: Met) -> None:
-        """Ask the agent again, and take its state if it has a session by now."""
+        """Ask the agent again, and take its state if it has a session now."""
         with contextlib.suppress(SmartCamError):
             hello = await self._greet_agent(met.agent)
             if self.met is met and not self.linked and hello.hello.get("connected"):
@@ -333,7 +335,7 @@ class Caller:
             self._on_met(self.met)
 
     def restarted(self, epoch: int) -> bool:
-        """Return True if an epoch is that of a newer start of the present agent."""
+        """Return True if an epoch is a newer start of the current agent."""
         met = self.met
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
@@ -344,14 +346,14 @@ class Caller:
         )
 
     def unlink(self) -> None:
-        """Leave an agent without a session: another one may have a session, or this one later."""
+        """Note that the agent has no session, and look for an agent that has one."""
         self.linked = False
         self._stirred.set()
 
     # ------------------------------------------------------------------ the clock
 
     def sample(self, clock: float) -> None:
-        """Use the time of the agent's clock in a message that has just come."""
+        """Use the agent's time in a message that has just arrived for its clock."""
         now = asyncio.get_running_loop().time()
         least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
@@ -387,7 +389,7 @@ class Caller:
         """Return a reservation of this program whose block runs.
 
         Raises:
-            ReservationLostError: the reservation is lost, as far as this program knows.
+            ReservationLostError: the reservation is known to be lost.
         """
         lease, met = self.leases[number], self.met
         if not lease.lost and met is not None and met.epoch != lease.epoch:
@@ -401,7 +403,7 @@ class Caller:
         return lease
 
     def lose_lease(self, number: int, why: str) -> None:
-        """Note that a reservation is lost: no further command of its block is sent."""
+        """Note that a reservation is lost; later commands of its block are refused."""
         self.leases[number].lost = why
         self.report_leases_lost()
 
@@ -420,7 +422,7 @@ class Caller:
                 self.lease(number)
 
     def _fence(self, do: str) -> int | None:
-        """Return the reservation in whose block a call is, the oldest; None if there is none.
+        """Return the oldest reservation whose block makes the call; None without one.
 
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
@@ -453,7 +455,7 @@ class Caller:
             timeout: seconds that the user gave; by default the time until ``deadline``.
 
         Raises:
-            SmartCamError: the agent replied with this error, or is gone or silent.
+            SmartCamError: the agent replied with this error, was lost, or did not answer.
 
         Cancellation: the agent receives a cancelling message.
         """
@@ -590,7 +592,7 @@ class Caller:
             self._insist(self._key(self.met.agent, do), fields)
 
     def come(self, number: int, offset: int | None) -> None:
-        """Report up to which byte a call's frame has come; None: no further bytes are wanted."""
+        """Report the number of received bytes of a call's frame; None: send no further bytes."""
         if self.met is not None:
             fields = {"call": number, "come": offset}
             self.program.send(self._key(self.met.agent, "frame"), fields)
@@ -599,9 +601,9 @@ class Caller:
         self._insist(key, {"cancel": number})
 
     def _insist(self, key: str, fields: dict[str, Any]) -> None:
-        """Send a message that may come twice, now and again until the agent confirms it.
+        """Send a message now, and repeatedly until the agent confirms it.
 
-        An agent that is gone, or was gone for a time, has already ended everything.
+        A lost agent has already ended the program's work.
         """
         program, met = self.program, self.met
 
