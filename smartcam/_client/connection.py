@@ -51,9 +51,8 @@ class Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
-        fences = (
-            ordered and not dialect.in_order
-        )  # if answers come in order, the answer itself is enough
+        # if answers come in order, the answer itself is enough
+        fences = ordered and not dialect.in_order
         tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
         return Features(
             ordered=ordered,

@@ -1,9 +1,9 @@
 """One TCP or UDP link to a camera, used once.
 
-The transport hands bytes to the machine of ``protocols/``. Its events wait in a bounded queue, as
-a chunk for each delivery, for the receive task, which takes one chunk in a turn of the event
-loop (:meth:`Link.receive`). So nothing that a chunk causes runs in the transport's callbacks, and a
-camera that floods takes no more of a turn than others.
+The transport passes bytes to the machine of ``protocols/``. The machine's events of each delivery
+wait as a chunk in a bounded queue. The receive task takes one chunk in a turn of the event loop
+(:meth:`Link.receive`). So no user code runs in the transport's callbacks, and a camera that floods
+takes no more of a turn than others.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ MAX_CHUNKS = 2
 """Largest number of chunks that may wait for the receive task before the link stops reading from
 TCP.
 
-The link stops sooner if one chunk is more than the task handles in a turn, and reads on when no
-chunk is left: a camera that sends results faster than they can be delivered has to wait.
+The link stops earlier if one chunk is more than the task handles in a turn, and continues when no
+chunk is left: so a camera cannot send results faster than they are delivered.
 """
 
 MAX_DATAGRAMS = 256
@@ -60,11 +60,11 @@ answers."""
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
 
-The time that one chunk took decides how many bytes the next one holds.
+The processing time of one chunk decides the size of the next one.
 """
 
 SHARED_TURN_TIME = 0.00005
-"""Seconds in place of :data:`TURN_TIME` if other links share the event loop.
+"""Seconds instead of :data:`TURN_TIME` if other links share the event loop.
 
 Each step of another link waits for one turn of every flooded link.
 """
@@ -74,7 +74,7 @@ MAX_PASSES = 4
 long as other tasks take longer than one turn."""
 
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
-"""Number of links that are open on each loop."""
+"""Number of open links of each loop."""
 
 MIN_FRAMES_PER_CHUNK = 5
 """Least number of frames of a cut chunk."""
@@ -83,8 +83,7 @@ FIRST_CHUNK = 64
 """Number of frames of a chunk until the time that they take is known."""
 
 LARGEST_CHUNK = 512
-"""Largest number of frames of a chunk, even if they are fast: the next ones may take
-longer."""
+"""Largest number of frames of a chunk, also after fast ones: the next frames may take longer."""
 
 MAX_REST_BYTES = 256
 """Largest number of bytes of an unfinished frame that a trace shows: it may be as long as the
@@ -93,12 +92,12 @@ largest frame."""
 
 @dataclass(slots=True)
 class Chunk:
-    """Events that one delivery of bytes gave, or some of them.
+    """The events of one delivery of bytes, or a part of them.
 
     Attributes:
         received_at: loop time of the delivery.
         events: events of the delivery, in order.
-        frames: number of frames in which the events came; an event may be made of many (In-Sight).
+        frames: number of frames of the events; an event may consist of several (In-Sight).
         delivery: number of the delivery on its link, from 1.
     """
 
@@ -109,21 +108,22 @@ class Chunk:
 
 
 class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
-    """One link. Made by :func:`open_link`; when it ends, a new one is made.
+    """A link, made by :func:`open_link` and used once.
 
     Args:
         machine: the protocol's client side.
         name: the camera's name, for logs and errors.
         host: address of the camera.
         port: port of the camera.
-        liveness_timeout: seconds after which the system, too, gives up a peer that acknowledges
-            nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
+        liveness_timeout: seconds after which the operating system, too, ends the connection of a
+            peer that acknowledges nothing (TCP keep-alive and user timeout, if supported); None
+            for the system's default.
 
     Attributes:
         loop: the event loop that the link is used in.
-        outcome: function that makes a future for one task to wait for, which the receive task or
-            another one sets.
-        wake_in_order: function that makes callers of the present delivery go on after subscribers.
+        outcome: function that makes a future that one task awaits and another task sets.
+        wake_in_order: function that makes callers of the current delivery continue after
+            subscribers.
         heard_at: loop time of the last byte received.
     """
 
@@ -145,7 +145,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.heard_at: float = self.loop.time()
         self._transport: Any = None
         self._datagrams = machine.transport is Transport.UDP
-        self._aside: socket.socket | None = None  # reads datagrams that have come already
+        self._aside: socket.socket | None = None  # socket for reading waiting datagrams directly
         self._replies = machine.replies
         # if the machine can send several at once
         each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
@@ -163,9 +163,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
         self.wake_in_order: Callable[[], None] = bell.wake_in_order
         self._closed = False
-        self._closers: list[asyncio.Future[None]] = []  # futures of the waits for its end
+        self._closers: list[asyncio.Future[None]] = []  # futures of the waits for the link's end
         self._loss: BaseException | None = None
-        self._full = False  # the transport takes no more at present
+        self._full = False  # whether the transport's send buffer is full
         self._writable = asyncio.Event()
         self._writable.set()
         self._closing = False
@@ -190,7 +190,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._flush()
 
     def send_all(self, messages: Sequence[Message]) -> None:
-        """Write messages at once: one write on TCP, a datagram each on UDP.
+        """Write several messages: one write on TCP, a datagram each on UDP.
 
         Raises:
             LocalProtocolError: the state forbids a message; those before it were written.
@@ -204,11 +204,11 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._flush()
 
     def is_writable(self) -> bool:
-        """Return True if the transport takes more at once, so that :meth:`drain` would not wait."""
+        """Return True if the send buffer has room, so that :meth:`drain` would not wait."""
         return not self._full
 
     async def drain(self) -> None:
-        """Wait until the transport takes more; bounded by the caller's deadline."""
+        """Wait until the send buffer has room; bounded by the caller's deadline."""
         await self._writable.wait()
 
     async def receive(self) -> Chunk:
@@ -242,10 +242,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return chunk
 
     async def close(self, timeout: float) -> None:
-        """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
+        """Send Disconnect and end the link in order; abort it after ``timeout`` seconds.
 
-        On TCP the sending side is closed first and the camera's end awaited: closing a socket with
-        unread bytes in it sends a reset, which can overtake the Disconnect.
+        On TCP the client closes its sending side first and waits for the camera's end: closing a
+        socket with unread bytes sends a reset, which can overtake the Disconnect.
         Cancellation: aborts the link.
         """
         self._closing = True
@@ -287,7 +287,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return error
 
     async def wait_closed(self, timeout: float) -> None:
-        """Wait until the link is over, ``timeout`` seconds at most."""
+        """Wait until the link has ended, ``timeout`` seconds at most."""
         if self._closed:
             return
         waiter: asyncio.Future[None] = self.loop.create_future()
@@ -301,7 +301,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     @property
     def lost(self) -> bool:
-        """True once the link is lost; chunks that came before may still wait to be taken."""
+        """True once the link is lost; earlier chunks may still wait for the receive task."""
         return self._loss is not None
 
     @property
@@ -320,7 +320,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._aside = second_socket(transport)
         sock = transport.get_extra_info("socket")
         if sock is not None and not self._datagrams:
-            # the camera sets it and advises it (SC manual p. 40: published)
+            # the camera sets it, too, and its manual recommends it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
                 _keep_alive(sock, self._liveness_timeout)
@@ -358,7 +358,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._lose(ConnectionResetError("the camera closed the connection"))
 
     def error_received(self, exc: Exception) -> None:
-        """asyncio: the system refused a datagram: nothing listens there."""
+        """asyncio: the system reports that nothing listens at the address."""
         self._lose(exc)
         self._transport.abort()
 
@@ -396,7 +396,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
 
     def _read_aside(self, sock: socket.socket) -> OSError | None:
-        """Read the datagrams that have come already, without a turn of the loop for each.
+        """Read the waiting datagrams, without a turn of the loop for each.
 
         Returns:
             The system's error about a datagram that this side has sent; None without one.
@@ -434,7 +434,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._doorbell.deliver()
 
     async def _give_way(self) -> None:
-        """Let the loop make a turn, or several if busy other links share it."""
+        """Wait for a turn of the loop, or for several if other busy links share it."""
         for _ in range(MAX_PASSES if links[self.loop] > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
@@ -442,7 +442,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 break
 
     def _adapt(self, since: float) -> None:
-        """Set the size of the next chunks to one turn's time, by the time of the last chunk."""
+        """Set the size of the next chunks by the processing time of the last one."""
         self._busy_since = None
         took = thread_time() - since
         turn = SHARED_TURN_TIME if links[self.loop] > 1 else TURN_TIME
@@ -477,10 +477,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
-    """Return a larger chunk's first frames, ``frames`` of them, and its rest; a burst may be cut.
+    """Split a chunk after a number of frames; a burst of results may be split, too.
 
-    A trigger's answer and the events after it stay together, since one frame may be both: otherwise
-    a caller that waits for the answer would send before the result of that frame is judged.
+    A trigger's answer and the events after it stay together, since one frame may be answer and
+    result: otherwise the answer's caller would send before the result is handled.
     """
     at, events = chunk.received_at, chunk.events
     if chunk.frames == len(events):  # one frame for each event
@@ -523,7 +523,7 @@ async def open_link(
 
     Args:
         protocol: function that makes the machine.
-        dialects: one, or several that begin a session alike.
+        dialects: one dialect, or several that begin a session alike.
         transport: TCP or UDP.
         host: the camera's name or address.
         port: port of the camera.
@@ -533,7 +533,7 @@ async def open_link(
         liveness_timeout: see :class:`Link`.
 
     Raises:
-        OSError: the name does not resolve, nothing listens, no way to the host.
+        OSError: the name does not resolve, nothing listens, or the host is unreachable.
     """
     loop = asyncio.get_running_loop()
     machine: LinkMachine

@@ -41,9 +41,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 # as plain integers: operations of an IntFlag cost more than the rest of handling a status
-_TELLING = int(
-    Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING
-)  # a change of these bits may mean that the running trigger has failed
+# a change of these bits may mean that the running trigger has failed
+_TELLING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING)
 
 _CURRENT = {"triggered", "nobody"}
 """Fates of containers that are not known to belong to an older trigger."""
@@ -103,9 +102,8 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        self._numbering: Interpretation | None = (
-            None  # reads the numbers in results after the first trigger with a number
-        )
+        # reads the numbers in results after the first trigger with a number
+        self._numbering: Interpretation | None = None
         self._warned_extra = self._warned_others = False
         self._lossy = False  # whether a message may arrive twice, or not at all
         self._timer = DeadlineTimer(lambda: self.give_up(TimeoutError()))
@@ -346,9 +344,8 @@ class Results:
         if active != container.application:
             state.set_active(container.application, at)
         if expected is not None and container.application != expected:
-            self.give_up(
-                self._wrong_application(container, expected)
-            )  # the trigger's result may still arrive
+            # the trigger's result may still arrive
+            self.give_up(self._wrong_application(container, expected))
             if state.shared:  # the result may be for another program
                 self.hand_on(container, None, "streamed", None, now, at)
             else:

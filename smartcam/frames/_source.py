@@ -62,7 +62,7 @@ class SourceStatistics:
 
     Attributes:
         streaming: whether the device streams now.
-        readers: number of present readers.
+        readers: number of current readers.
         started: number of starts of the device's stream.
         frames: number of received frames, with or without a reader.
         lost: number of frames lost in the camera or on the way.
@@ -118,7 +118,7 @@ class FrameSource(FrameSink):
         self._took = asyncio.Event()  # set when a reader takes a frame or is closed
         self._held_up = False  # whether the driver waits for readers
         self._streaming = False
-        # error that the driver ended with, in a tuple
+        # error with which the driver ended, in a tuple
         self._over: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
@@ -378,9 +378,9 @@ class FrameSource(FrameSink):
             OvertriggeredError: the device reports that it missed the trigger.
             FrameLostError: the picture was certainly or possibly lost on the way.
             TriggerTimeoutError: no picture came within ``timeout``.
-            FrameSourceError: the device does not stream, or is gone.
+            FrameSourceError: the device does not stream, or was lost.
 
-        Cancellation: the source goes on; a late picture goes only to readers.
+        Cancellation: the source continues; a late picture is passed only to readers.
         """
         seconds = check_seconds(timeout, "timeout", "trigger", above=True)
         check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
@@ -413,7 +413,7 @@ class FrameSource(FrameSink):
     # called by the driver
 
     def trigger_failed(self, error: SmartCamError) -> None:
-        """Fail the pending trigger, whose picture will not come."""
+        """Fail the pending trigger, whose picture was lost."""
         self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:
@@ -462,7 +462,7 @@ class FrameSource(FrameSink):
             reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
-        """Record that no more frames come."""
+        """Record that there will be no more frames."""
         self._over = (error,)
         self._changed.set()
 
@@ -529,7 +529,7 @@ class FrameSource(FrameSink):
             self._end_readers(over[0])
 
     async def _while_read(self) -> None:
-        """Wait until the driver ends or is stuck, or the linger after the last reader is over."""
+        """Wait until the driver ends or is stuck, or the linger has passed."""
         while self._over is None and not self._again:
             if not self._readers:
                 left = self._idle_since + self._linger - asyncio.get_running_loop().time()

@@ -1,4 +1,4 @@
-"""Read a recording, whole or cut off."""
+"""Read a recording, complete or cut off."""
 
 from __future__ import annotations
 
@@ -59,8 +59,7 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Number of values that the messages of every file may have: ten seconds of
-work."""
+"""Number of values that the messages of any file may have: ten seconds of work."""
 
 VALUES_PER_BYTE = 100
 """Number of values for each byte that a larger file may have. Real recordings have less than one,
@@ -99,7 +98,7 @@ class Recording:
     """An MCAP file of :class:`~smartcam.recording.Recorder`; made by :func:`load_recording`.
 
     Or a folder of :class:`~smartcam.recording.FleetRecorder`. Its items are read from the file each
-    time, in the order in which they were recorded; those of a folder camera by camera.
+    time, in the order of recording; for a folder, camera by camera.
 
     Attributes:
         path: the file, or the folder.
@@ -220,8 +219,8 @@ class Recording:
         """Yield each result with its picture, if the picture is known.
 
         The picture was recorded for its result, or is found by its time: the first picture of the
-        camera that was certainly exposed after the trigger, and before the result came. A result
-        without a trigger of its client has a picture only if it was recorded for it.
+        camera that was certainly exposed after the trigger and before the result. A result without
+        a trigger of the recording client has a picture only if it was recorded for the result.
         """
         return judged(self.items(camera))
 
@@ -279,7 +278,7 @@ def load_recording(
 
 
 def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
-    """Yield each readable item of a file or of a folder, without scanning it before.
+    """Yield each readable item of a file or of a folder, without a scan.
 
     Args:
         path: the file or folder.
@@ -422,7 +421,7 @@ class _Scan:
     """One pass through a file."""
 
     path: Path
-    # facts about the file; filled during the pass, as the next two
+    # facts about the file; filled during the pass, like the next two
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
     # facts about cameras, by their names
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])

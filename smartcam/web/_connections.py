@@ -72,9 +72,8 @@ class Visitor(asyncio.Protocol):
         self._inner: asyncio.Protocol | None = None  # protocol for the bytes; None: none
         self._head: bytearray | None = None  # received part of an unfinished head
         self._idle = False  # between requests, when the next may take long
-        self._stream: StreamReader | None = (
-            None  # body of a request that was refused before its end
-        )
+        # body of a request that was refused before its end
+        self._stream: StreamReader | None = None
         self._peer = "?"
 
     # ------------------------------------------------------------------ from the transport

@@ -268,9 +268,8 @@ class Viewer(PageSocket):
                 lost = True
             else:
                 await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
-                await (
-                    asyncio.Event().wait()
-                )  # after a second message the page would play the recording again
+                # after a second message the page would play the recording again
+                await asyncio.Event().wait()
             if self._sent > before:
                 delays = REOPEN_BACKOFF.delays()
             await asyncio.sleep(next(delays))

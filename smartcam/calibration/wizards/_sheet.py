@@ -174,9 +174,8 @@ class _SheetSource(PointSource):
             if picture_taken["camera"] is None
             else CameraModel.from_data(picture_taken["camera"])
         )
-        self._lens_covariance = picture_taken.get(
-            "lens_covariance"
-        )  # older journals have no entry for it
+        # older journals have no entry for it
+        self._lens_covariance = picture_taken.get("lens_covariance")
         self._svg = picture_taken["preview"]
 
     def shown(self, mark: Mark) -> dict[str, Any]:

@@ -181,9 +181,8 @@ class Caller:
             task.cancel()
             await asyncio.wait({task})
         if self._insisting:
-            await asyncio.wait(
-                self._insisting
-            )  # repeated messages wait for answers that have failed
+            # repeated messages wait for answers that have failed
+            await asyncio.wait(self._insisting)
 
     def finish(self, error: LinkError) -> None:
         """End for good: there will be no further agent."""

@@ -191,9 +191,8 @@ class V4L2Driver(FrameDriver):
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
         asked_format = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
-        self._wanted = WantedSetting(
-            asked_format, size, self._wanted.rate
-        )  # keep the device's choice
+        # keep the device's choice
+        self._wanted = WantedSetting(asked_format, size, self._wanted.rate)
         return StreamFormat(setting.format, *size, rates)
 
     def _begin(self) -> CaptureStream:

@@ -109,15 +109,13 @@ class VisionSystem:
         self._simulated = simulated
         # whether the camera is connected; None: unknown
         self._connected: bool | None = None
-        self._by_client = (
-            False  # whether clients prepare recipes: then none becomes ready by itself
-        )
+        # whether clients prepare recipes: then none becomes ready by itself
+        self._by_client = False
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
         self._preparing = False
-        self._stopped = (
-            False  # whether this server stopped the camera: start it before the next trigger
-        )
+        # whether this server stopped the camera: start it before the next trigger
+        self._stopped = False
         self._late_until = -1.0  # loop time until which a result may belong to an aborted job
         self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
         self._last_continuous: VisionJob | None = None

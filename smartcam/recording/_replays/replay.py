@@ -2,16 +2,16 @@
 
 The device is the emulator's own. Its applications send the recorded containers, byte for byte:
 
-- The n-th trigger of an application gets the n-th recorded container of a trigger, after the same
-  time; if the recorded trigger had no result it gets none, and if it was dropped it is dropped.
-- Containers without a trigger come by themselves: the first at its time after the start of the
-  run, each other at its time after the one before. They wait while the camera is stopped or has
-  another application; none is left out.
-- Overheat and System Error come and go at their times after the start of the first session.
+- The n-th trigger of an application gets the container of the n-th recorded trigger, after the same
+  time. If the recorded trigger had no result or was dropped, so has or is the n-th trigger.
+- Containers without a trigger are sent by themselves: the first at its time after the start of the
+  run, each other at its time after the container before. They wait while the camera is stopped or
+  has another application; none is left out.
+- Overheat and System Error rise and fall at their times after the start of the first session.
 
-Only sequence numbers are not as recorded, if the client sets them, as a client does whose layout
-has an ``@sequence`` field. Such a client gets its own numbers in that field, whose place is known
-from the ``interpret_as`` in the recording.
+Sequence numbers differ from the recorded ones if the client sets them, as it does if its layout has
+an ``@sequence`` field. Then containers have the client's numbers in that field; the
+``interpret_as`` in the recording gives its place.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ class _PendingRuns:
 
     @property
     def head(self) -> RecordedRun | None:
-        """The next take; None if none is left."""
+        """The next take; None after the last one."""
         return self._runs[self._next] if self._next < len(self._runs) else None
 
     @property
     def left(self) -> int:
-        """Number of runs that are left, in this round."""
+        """Number of remaining runs of this round."""
         return len(self._runs) - self._next
 
     def pop(self) -> RecordedRun | None:
@@ -111,7 +111,7 @@ class _Track:
     waits: bool  # whether the camera waits for triggers
     triggered: _PendingRuns  # takes for triggers
     untriggered: _PendingRuns  # runs without a trigger
-    current: RecordedRun | None = None  # the take of the inspection under way
+    current: RecordedRun | None = None  # the take of the running inspection
     # further containers to be sent
     pending: list[bytes] = field(default_factory=list[bytes])
     # place of the client's numbers in containers; None: containers keep their own numbers
@@ -134,7 +134,7 @@ class _Track:
 
 
 class _PlayedApplication(Application):
-    """An application whose containers come from a track."""
+    """An application that sends the containers of a track."""
 
     _track: _Track | None = PrivateAttr(default=None)
 
@@ -160,15 +160,15 @@ class _PlayedApplication(Application):
 class ReplayedCamera(EmulatedCamera):
     """An emulated camera that replays a recording.
 
-    Its application is that of the first container, and runs if there are containers. At the end of
-    the recording, triggers get no result and no containers come any more, unless ``loop``. All
+    Its application is that of the first container, and runs if there are containers. After the end
+    of the recording, triggers get no result and no containers are sent, unless ``loop``. All
     containers are kept in memory.
 
     Args:
         recording: recording to replay.
         camera: name of the camera in it; default the only one.
         speed: factor by which to replay faster than recorded, 0.001 to 1000.
-        loop: begin again at the end: each application's takes on their own.
+        loop: whether to begin again at the end, separately for each application's takes.
         host: address to listen on.
         port: port to listen on, 0 for a free one.
         transport: default the recorded one.
@@ -246,7 +246,7 @@ class ReplayedCamera(EmulatedCamera):
         self._numbers = _numbers(recording.camera(camera).interpret_as)
         self.device.set_endian(self.plan.endian)
         self._set_conditions(self.plan.conditions)
-        self._armed: RecordedRun | None = None  # the take before which triggers are to be dropped
+        self._armed: RecordedRun | None = None  # the take before which triggers will be dropped
         self._ready: int | None = None  # the application that may send without a trigger now
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._alarm: TimerHandle | None = None

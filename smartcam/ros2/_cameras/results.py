@@ -121,9 +121,8 @@ class CameraResults:
         except ConfigurationError as exc:
             if kind != DETECTIONS:
                 raise
-            logger.info(
-                "%s: without %s: %s", self._node.full_name, name, exc
-            )  # ROS 1 does the same
+            # ROS 1 does the same
+            logger.info("%s: without %s: %s", self._node.full_name, name, exc)
 
     async def close(self) -> None:
         """Stop publishing, and withdraw the topics. Idempotent."""

@@ -66,9 +66,9 @@ class RtpStatistics:
 
     Attributes:
         packets: number of received packets, duplicates included.
-        lost: packets that never came.
+        lost: packets that never arrived.
         repaired: packets received after a request.
-        duplicates: packets that came twice or too late.
+        duplicates: packets that arrived twice or too late.
         damaged: incomplete encoded frames.
         overflows: number of times that frames were dropped because decoding was too slow.
         strange: datagrams from other senders or without RTP.
@@ -115,7 +115,7 @@ class StreamReceiver:
         payload_type: payload type of the stream's packets.
         repair: seconds to wait for a missing packet after a request.
         done: function that is called with complete encoded frames.
-        gone: function that is called when the sender says goodbye.
+        gone: function that is called with the reason when the sender ends the stream.
         only: addresses of accepted hosts; empty: any host.
         kind: kind of the payloads; None: H.264.
         agreed: whether the stream was negotiated: then a new stream of the same host replaces it at
@@ -163,7 +163,7 @@ class StreamReceiver:
         pair.read(self._packet, self._report_came, self._read)
 
     def close(self) -> None:
-        """Say goodbye and stop receiving. Idempotent."""
+        """Send the RTCP message BYE and stop receiving. Idempotent."""
         for timer in (self._tick, self._next_report):
             if timer is not None:
                 timer.cancel()
@@ -192,7 +192,7 @@ class StreamReceiver:
         return self._depacketizer.proofs
 
     def utc(self, timestamp: int) -> float | None:
-        """Return a time on the sender's wall clock; None: not reported yet."""
+        """Return a time on the sender's wall clock; None if the sender has not reported it yet."""
         return None if self._reception is None else self._reception.utc(timestamp)
 
     def want_picture(self) -> None:
