@@ -262,8 +262,8 @@ class Agent:
             await self._claims.refuse_namesake(timeout)
             declared.append(bus.watch(keys.program("*"), self._on_program))
             for role in (None, *ROLES_OF_NAMES):
-                pattern, hear = self._calls_of(role, "**"), self._hears(role)
-                declared.append(bus.subscribe(pattern, hear, patient=role == VIEWER))
+                pattern, on_call = self._calls_of(role, "**"), self._call_handler(role)
+                declared.append(bus.subscribe(pattern, on_call, patient=role == VIEWER))
             self._plain.open()
             self._summaries.open()
             self._bundle.open()
@@ -552,11 +552,11 @@ class Agent:
             keys.command(self.name, camera) if role is None else keys.ask(role, self.name, camera)
         )
 
-    def _hears(self, role: str | None) -> Callable[[str, bytes], None]:
+    def _call_handler(self, role: str | None) -> Callable[[str, bytes], None]:
         """Return the callback for calls of one kind: a role's questions, or with None commands."""
         root, command = self._calls_of(role, ""), role is None
 
-        def hear(key: str, payload: bytes) -> None:
+        def on_call(key: str, payload: bytes) -> None:
             name = key.removeprefix(root)
             try:
                 host, order = self.hosts[name], decode_order(payload, "a call")
@@ -569,7 +569,7 @@ class Agent:
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! a call that cannot be read: %s", name, exc)
 
-        return hear
+        return on_call
 
     def _caller(self, token: str, role: str | None) -> ProgramName:
         """Return the name of the calling program.

@@ -104,8 +104,8 @@ class Bus(abc.ABC):
         """
 
     @abc.abstractmethod
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        """Call ``hear(key, head, data)`` for parts that are sent under ``pattern``."""
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        """Call ``on_part(key, head, data)`` for parts that are sent under ``pattern``."""
 
     @abc.abstractmethod
     def publisher(
@@ -125,13 +125,13 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        """Call ``hear(key, payload)`` for messages under ``pattern``.
+        """Call ``on_message(key, payload)`` for messages under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
-            hear: the callback.
+            on_message: the callback.
             patient: whether messages wait after all others, with a bound of their own.
         """
 
@@ -165,8 +165,8 @@ class Bus(abc.ABC):
         """Return the keys of the present ends that become known within ``timeout`` seconds."""
 
     @abc.abstractmethod
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        """Call ``see(key, present)`` for present ends, and for those that come and go."""
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
+        """Call ``on_presence(key, present)`` for present ends, and for those that come and go."""
 
 
 class BusQuestion(abc.ABC):
@@ -348,8 +348,8 @@ class MemoryEnd(Bus):
             for subscription in end.part_subscriptions.meeting(key):
                 self._loop.call_soon(_call, subscription, key, head, data)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        return _MemoryDeclared(self.part_subscriptions, pattern, hear)
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        return _MemoryDeclared(self.part_subscriptions, pattern, on_part)
 
     def publisher(
         self,
@@ -361,9 +361,9 @@ class MemoryEnd(Bus):
         return _MemoryPublisher(self, self.publishers, key, on_subscribers)
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        made = _MemoryDeclared(self.subscriptions, pattern, hear)
+        made = _MemoryDeclared(self.subscriptions, pattern, on_message)
         self._check_subscribers(pattern)
         return made.then(lambda: self._check_subscribers(pattern))
 
@@ -400,8 +400,8 @@ class MemoryEnd(Bus):
             token.pattern for end in self._others() for token in end.present_here.meeting(pattern)
         ]
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        made = _MemoryDeclared(self.watched, pattern, see)
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
+        made = _MemoryDeclared(self.watched, pattern, on_presence)
         for end in self._others():
             for token in end.present_here.meeting(pattern):
                 self._loop.call_soon(_call, made, token.pattern, True)

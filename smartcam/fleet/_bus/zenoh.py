@@ -268,13 +268,13 @@ class ZenohEnd(ZenohSession, Bus):
             payload = bytes(data) if isinstance(data, memoryview) else data
             quietly(self._session.put, key, payload, attachment=head, **self._behind_all)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
         def on_sample(sample: Any) -> None:
             head = sample.attachment
             data = sample.payload.to_bytes()
             if head is not None and not self.full(len(data)):
                 part_head, key = head.to_bytes(), str(sample.key_expr)
-                self.in_loop(declared.call, len(data), hear, key, part_head, data)
+                self.in_loop(declared.call, len(data), on_part, key, part_head, data)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
@@ -341,7 +341,7 @@ class ZenohEnd(ZenohSession, Bus):
         return _ZenohPublisher(self, key, on_subscribers, urgent=urgent)
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
         in_loop = self.in_loop_patiently if patient else self.in_loop
         full = functools.partial(self.full, patient=True) if patient else self.full
@@ -352,7 +352,7 @@ class ZenohEnd(ZenohSession, Bus):
             payload = sample.payload.to_bytes()
             if not full(len(payload)):
                 key_text = key or str(sample.key_expr)
-                in_loop(declared.call, len(payload), hear, key_text, payload)
+                in_loop(declared.call, len(payload), on_message, key_text, payload)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
@@ -432,24 +432,24 @@ class ZenohEnd(ZenohSession, Bus):
         )
         return [key for key, _ in answers]
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
         names_present: dict[str, None] = {}
 
-        def on_presence(key: str, present: bool) -> None:
+        def note_presence(key: str, present: bool) -> None:
             if present:
                 names_present[key] = None
             else:
                 names_present.pop(key, None)
-            see(key, present)
+            on_presence(key, present)
 
         def lost() -> None:  # a new session does not report ends that have gone meanwhile
             for key in [*names_present]:
-                on_presence(key, False)
+                note_presence(key, False)
 
         def on_sample(sample: Any) -> None:
-            self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
+            self.in_loop(declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put)
 
         declared = _OnBus(self).when_lost(lost)
         return declared.of(

@@ -70,18 +70,18 @@ class Exchange(Bus):
         # epoch and next expected number of each agent
         self._bundles: dict[str, tuple[int, int]] = {}
         # functions that take the presences of all cameras
-        self._seers: list[Callable[[str, bool], None]] = []
+        self._presence_callbacks: list[Callable[[str, bool], None]] = []
         self._lacking: set[str] = set()  # agents with missing bundles
         self._asking: dict[str, asyncio.Task[None]] = {}
 
     # ------------------------------------------------------------------ for many
 
-    def see_all(self, see: Callable[[str, bool], None]) -> None:
+    def see_all(self, on_presence: Callable[[str, bool], None]) -> None:
         """Watch all cameras' presences from now on, for watchers of one camera or of all.
 
-        ``see(key, present)`` is called for each.
+        ``on_presence(key, present)`` is called for each.
         """
-        self._seers.append(see)
+        self._presence_callbacks.append(on_presence)
         self.cover("presence/camera")
 
     def cover(self, kind: str) -> None:
@@ -147,8 +147,8 @@ class Exchange(Bus):
         name = self._name(key)
         presences = self._present.setdefault(name, set())
         (presences.add if present else presences.discard)(key)
-        for see in self._seers:
-            see(key, present)
+        for on_presence in self._presence_callbacks:
+            on_presence(key, present)
         for place in tuple(self._places.get("presence/camera", {}).get(name, ())):
             place.call(key, present)
 
@@ -205,19 +205,19 @@ class Exchange(Bus):
     # ------------------------------------------------------------------ as a bus
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
         if "*" in pattern or self._kind(pattern) not in {"states", "results"}:
-            return self._bus.subscribe(pattern, hear, patient=patient)
-        return self._enter(pattern, hear, lambda: self._bus.subscribe(pattern, hear))
+            return self._bus.subscribe(pattern, on_message, patient=patient)
+        return self._enter(pattern, on_message, lambda: self._bus.subscribe(pattern, on_message))
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         if self._kind(pattern) != "presence/camera" or "*" in self._name(pattern):
-            return self._bus.watch(pattern, see)
-        place = self._enter(pattern, see, lambda: self._bus.watch(pattern, see))
+            return self._bus.watch(pattern, on_presence)
+        place = self._enter(pattern, on_presence, lambda: self._bus.watch(pattern, on_presence))
         if place.cover is None:
             for key in sorted(self._present.get(self._name(pattern), ())):
-                see(key, True)
+                on_presence(key, True)
         return place
 
     @property
@@ -257,8 +257,8 @@ class Exchange(Bus):
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         self._bus.put_part(key, head, data)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        return self._bus.subscribe_parts(pattern, hear)
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        return self._bus.subscribe_parts(pattern, on_part)
 
     def publisher(
         self,

@@ -71,7 +71,7 @@ class _FrameLink:
         static: message of a static transform; None if the transform changes.
         times: times of the moments, UTC, in order.
         moments: messages of the transform at these times.
-        came: time of the arrival of the newest one, by the monotonic clock.
+        arrived_at: time of the arrival of the newest one, by the monotonic clock.
     """
 
     child: str
@@ -83,7 +83,7 @@ class _FrameLink:
     moments: collections.deque[Any] = field(
         default_factory=lambda: collections.deque[Any](maxlen=MAX_MOMENTS)
     )
-    came: float = 0.0
+    arrived_at: float = 0.0
 
     def add(self, utc: float, message: Any) -> None:
         """Add the frame's transform at a time; ignore one that is older than the newest."""
@@ -93,11 +93,11 @@ class _FrameLink:
         if not self.times or utc > self.times[-1]:
             self.times.append(utc)
             self.moments.append(message)
-            self.came = time.monotonic()
+            self.arrived_at = time.monotonic()
 
     def check_new(self) -> None:
         """Raise BAD_TIME if the newest transform is old."""
-        silent, behind = time.monotonic() - self.came, time.time() - self.times[-1]
+        silent, behind = time.monotonic() - self.arrived_at, time.time() - self.times[-1]
         if silent > MAX_AGE or abs(behind) > MAX_AGE:
             direction = "behind" if behind > 0 else "ahead of"
             raise Code.BAD_TIME.refusal(
@@ -234,13 +234,13 @@ class TransformListener:
             CalibrationError: ``WRONG_FRAME``: TF does not know the frame.
         """
 
-        def found() -> str:
+        def root_of_chain() -> str:
             chain = self._chain(frame.strip("/"))
             if not chain:
                 raise self._strange(frame)
             return chain[-1].parent
 
-        return await self._until(found)
+        return await self._until(root_of_chain)
 
     async def _until(self, look: Callable[[], Found]) -> Found:
         """Return the result of ``look`` as soon as it succeeds; bounded."""

@@ -110,14 +110,14 @@ class NativePublisher:
         done = asyncio.Event()
         failed: list[Exception] = []
 
-        def say() -> None:
+        def publish() -> None:
             try:
                 self._pass_on(self.type.encode(encoded))
             except Exception as exc:  # noqa: BLE001 - passed to the waiting task
                 failed.append(exc)
             self._node.in_loop(done.set)
 
-        self._node.outbox.put(say)
+        self._node.outbox.put(publish)
         await done.wait()
         if failed:
             raise failed[0]

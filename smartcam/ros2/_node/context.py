@@ -237,7 +237,7 @@ class RosContext:
         return self._direct_messages <= MAX_DIRECT
 
     def send_later(self, owner: object, send: Callable[[], None], lane: str) -> None:
-        """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
+        """Call ``send`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:
             thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")

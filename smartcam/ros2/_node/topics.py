@@ -235,7 +235,7 @@ class RosPublisher(RosEnd):
             self._lane = self._slot.lane
         done: concurrent.futures.Future[None] = concurrent.futures.Future()
 
-        def say() -> None:
+        def publish() -> None:
             if not done.set_running_or_notify_cancel():
                 return
             try:
@@ -245,7 +245,7 @@ class RosPublisher(RosEnd):
             else:
                 done.set_result(None)
 
-        self._context.send_later(self, say, self._lane)
+        self._context.send_later(self, publish, self._lane)
         await asyncio.wrap_future(done)
 
     def _send_newest(self, data: bytes) -> None:
