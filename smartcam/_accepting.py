@@ -110,7 +110,7 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        what: name of the missing thing, which the log gives as the reason for closing.
+        label: name of the missing thing, which the log gives as the reason for closing.
         own: name of a session in the log, "a session".
 
     Attributes:
@@ -123,12 +123,12 @@ class Places(Generic[G]):
         most: int,
         *,
         within: float = HANDSHAKE_TIMEOUT,
-        what: str = "no session",
+        label: str = "no session",
         own: str = "a session",
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._within, self._missing, self._session_text = within, what, own
+        self._within, self._missing, self._session_text = within, label, own
         self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
@@ -180,18 +180,18 @@ class Places(Generic[G]):
             place.since = now
             self._places[occupant] = place
 
-    def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
+    def expect(self, occupant: G, within: float | None, label: str, now: float) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: name of the missing thing, for the log.
+            label: name of the missing thing, for the log.
             now: the moment.
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.within, place.missing = math.inf if within is None else within, what
+            place.within, place.missing = math.inf if within is None else within, label
             place.deadline = now + place.within
 
     def waits_longest(self) -> tuple[float, G] | None:
@@ -332,15 +332,15 @@ class Acceptor(Generic[G]):
         """Put a connection last in the line to make room: it was served, or its session ended."""
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
-    def expect(self, occupant: G, within: float | None, what: str) -> None:
+    def expect(self, occupant: G, within: float | None, label: str) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: name of the missing thing, for the log.
+            label: name of the missing thing, for the log.
         """
-        self.places.expect(occupant, within, what, asyncio.get_running_loop().time())
+        self.places.expect(occupant, within, label, asyncio.get_running_loop().time())
         self._set_timer()
 
     def _set_timer(self) -> None:

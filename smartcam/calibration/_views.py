@@ -122,12 +122,14 @@ def label(view: TargetView, number: int) -> str:
     return view.name or f"view {number}"
 
 
-def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
+def checked(value: Any, kinds: type | tuple[type, ...], label: str) -> Any:
     """Return a value if it is of one of some kinds; otherwise raise SHAPE, which describes it."""
     if isinstance(value, kinds):
         return value
     names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
-    raise Code.SHAPE.unexpected(f"{what}: expected a {' or '.join(names)}", names, described(value))
+    raise Code.SHAPE.unexpected(
+        f"{label}: expected a {' or '.join(names)}", names, described(value)
+    )
 
 
 def described(value: Any) -> str:
@@ -137,19 +139,21 @@ def described(value: Any) -> str:
     return kind if shape is None else f"{kind} of shape {tuple(shape)}"
 
 
-def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
+def as_views(views: Iterable[TargetView], label: str) -> list[TargetView]:
     """Return views as a list; raise SHAPE for no list, or for another kind of element."""
-    return as_list(views, TargetView, f"{what}: view")
+    return as_list(views, TargetView, f"{label}: view")
 
 
-def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
+def as_list(values: Any, kinds: type | tuple[type, ...], label: str) -> list[Any]:
     """Return values as a list; raise SHAPE unless each is of one of some kinds."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
-        raise Code.SHAPE.unexpected(f"{what}: expected a list of such", "a list", described(values))
-    return [checked(value, kinds, f"{what} {number}") for number, value in enumerate(values)]
+        raise Code.SHAPE.unexpected(
+            f"{label}: expected a list of such", "a list", described(values)
+        )
+    return [checked(value, kinds, f"{label} {number}") for number, value in enumerate(values)]
 
 
-def as_covariances(values: Any, count: int, what: str) -> Array:
+def as_covariances(values: Any, count: int, label: str) -> Array:
     """Return covariances of points in an image, (``count``, 2, 2).
 
     Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
@@ -157,12 +161,12 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     try:
         given = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.unexpected(f"{what}: expected numbers", (count, 2, 2), exc) from exc
+        raise Code.SHAPE.unexpected(f"{label}: expected numbers", (count, 2, 2), exc) from exc
     if given.shape != (count, 2, 2):
         raise Code.SHAPE.unexpected(
-            f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
+            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
         )
-    covariances = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
+    covariances = as_points(given.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
     trace = np.trace(covariances, axis1=1, axis2=2)
     uneven = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(
@@ -176,7 +180,7 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     if len(wrong):
         value = covariances[wrong[0]].tolist()
         raise Code.NO_COVARIANCE.refusal(
-            f"{what}: expected symmetric matrices of no negative variance, got {value} in row "
+            f"{label}: expected symmetric matrices of no negative variance, got {value} in row "
             f"{wrong[0]}",
             "covariances",
             value,

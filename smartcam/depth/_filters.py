@@ -181,13 +181,13 @@ def _parts(count: int) -> Iterator[slice]:
         yield slice(start, min(start + POINTS_AT_A_TIME, count))
 
 
-def _check_count(value: int, what: str) -> None:
+def _check_count(value: int, label: str) -> None:
     if not isinstance(value, int) or not 1 <= value <= MAX_NEIGHBOURS:
         raise ConfigurationError(
-            f"{what}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
+            f"{label}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
         )
 
 
-def _check_length(value: float, what: str) -> None:
+def _check_length(value: float, label: str) -> None:
     if not 0 < value < math.inf:
-        raise ConfigurationError(f"{what}: expected metres above 0, got {shown(value)}")
+        raise ConfigurationError(f"{label}: expected metres above 0, got {shown(value)}")

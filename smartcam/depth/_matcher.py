@@ -278,8 +278,8 @@ def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
     return merged
 
 
-def _wrong(what: str, expected: str, actual: object) -> ConfigurationError:
-    return ConfigurationError(f"StereoMatcher: {what}: expected {expected}, got {shown(actual)}")
+def _wrong(label: str, expected: str, actual: object) -> ConfigurationError:
+    return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {shown(actual)}")
 
 
 def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:

@@ -56,10 +56,10 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
         _fail("a header in ASCII", line)
 
 
-def count_of(text: str, what: str) -> int:
+def count_of(text: str, label: str) -> int:
     """Return a count from text; raise BadTableError if the text is no count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
-        _fail(f"a number of {what}", text)
+        _fail(f"a number of {label}", text)
     return int(text)
 
 

@@ -188,14 +188,14 @@ class FrameReader:
         return f": {waits}, and nothing triggered it" if waits else ""
 
     async def _first(
-        self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
+        self, label: str, timeout: float | None, wanted: Callable[[Frame], bool]
     ) -> Frame:
         """Return the first wanted frame."""
         end = self._deadline(timeout)
-        while (frame := await self._take(end, what)) is not None:
+        while (frame := await self._take(end, label)) is not None:
             if wanted(frame):
                 return frame
-        text = f"{self._name}: expected {what}, the source ended"
+        text = f"{self._name}: expected {label}, the source ended"
         raise FrameSourceError(text, source=self._name)
 
     @property
@@ -208,12 +208,12 @@ class FrameReader:
             return None
         return asyncio.get_running_loop().time() + timeout
 
-    async def _take(self, end: float | None, what: str) -> Frame | None:
+    async def _take(self, end: float | None, label: str) -> Frame | None:
         """Return the next frame; None at the end of the source."""
         while self._next is None and not self._ended:
             if not await self._woken(end):
                 raise FrameTimeoutError(
-                    f"{self._name}: expected {what}, got none in time{self._waits()}",
+                    f"{self._name}: expected {label}, got none in time{self._waits()}",
                     source=self._name,
                 )
         if self._next is not None:

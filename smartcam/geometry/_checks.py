@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def check_choice(value: object, among: Sequence[str], what: str) -> None:
+def check_choice(value: object, among: Sequence[str], label: str) -> None:
     """Raise SHAPE if an option is not in the list of known ones."""
     word = plain(value)  # a user's class may hash and compare in any way
     if not isinstance(word, str) or word not in among:
         known = list(among)
-        text = f"{what}: expected one of {known}, got {shown(value)}"
+        text = f"{label}: expected one of {known}, got {shown(value)}"
         raise Code.SHAPE.refusal(text, known, value)
 
 

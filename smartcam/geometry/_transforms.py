@@ -250,39 +250,39 @@ class Transform:
         return Transform(self.target, self.source, self.rotation @ step, translation, at)
 
 
-def _numbers(values: ArrayLike, what: str) -> Array:
+def _numbers(values: ArrayLike, label: str) -> Array:
     """Return a copy as float64; raise NOT_RIGID if it holds no numbers."""
     try:
         if np.iscomplexobj(values):
             raise TypeError("got complex numbers")
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.NOT_RIGID.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.NOT_RIGID.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
 
 
-def _rows(values: ArrayLike, count: int, what: str) -> Array:
+def _rows(values: ArrayLike, count: int, label: str) -> Array:
     """Return numbers (..., ``count``), NaN included; raise SHAPE."""
     try:
         if np.iscomplexobj(values):
             raise TypeError("got complex numbers")
         rows = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.SHAPE.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
     if rows.shape[-1:] != (count,):
         raise Code.SHAPE.unexpected(
-            f"{what}: expected shape (..., {count})", f"(..., {count})", rows.shape
+            f"{label}: expected shape (..., {count})", f"(..., {count})", rows.shape
         )
     return rows
 
 
-def as_motion(value: object, what: str, target: str, source: str) -> Transform:
+def as_motion(value: object, label: str, target: str, source: str) -> Transform:
     """Return the value if it is a :class:`Transform`, else raise an error of the code SHAPE."""
     if isinstance(value, Transform):
         return value
     shape = np.shape(value) if isinstance(value, np.ndarray) else ()
     kind = "None" if value is None else type(value).__name__
     raise Code.SHAPE.refusal(
-        f"{what}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
+        f"{label}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
         f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
         "Transform",
         kind,

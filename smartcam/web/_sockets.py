@@ -45,7 +45,7 @@ class PageSocket(ABC):
     Args:
         request: request that asks for the WebSocket.
         protocol: subprotocol of the WebSocket.
-        what: word for the shown messages, for the log.
+        label: word for the shown messages, for the log.
         heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
         longest: largest number of bytes of a message from the page.
     """
@@ -54,13 +54,13 @@ class PageSocket(ABC):
         self,
         request: web.Request,
         protocol: str,
-        what: str,
+        label: str,
         *,
         heartbeat: float | None = None,
         longest: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
-        self._subject = what
+        self._subject = label
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
             max_msg_size=longest,

@@ -272,14 +272,14 @@ def _number(
     return leftmost(black or ways, name), None
 
 
-def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
+def _white_origin(target: Checkerboard, label: str) -> CalibrationError:
     """Return the error for a board whose black corners are where the target has white ones.
 
     If the counts of columns and rows are both odd and differ, two corners that lie opposite each
     other are black, and turning the sheet exchanges no black one with a white one.
     """
     return Code.MIRRORED.refusal(
-        f"{what}: expected a black square outside of the corner at the origin, got a white one: "
+        f"{label}: expected a black square outside of the corner at the origin, got a white one: "
         "an image that is mirrored, or a negative, or the board is one of "
         f"{target.rows} x {target.columns}",
         "a black square",

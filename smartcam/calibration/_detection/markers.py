@@ -80,16 +80,16 @@ class MarkerAgreement(NamedTuple):
     contrary: int  # count of markers that agree with each other at other places
 
 
-def marker_dictionary(name: str, needed: int, what: str) -> Any:
+def marker_dictionary(name: str, needed: int, label: str) -> Any:
     """Return OpenCV's dictionary of a name, which must have at least ``needed`` markers.
 
-    ``what`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
+    ``label`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
     """
     cv2 = load("cv2")
     number = getattr(cv2.aruco, name, None)
     if not (name.startswith("DICT_") and isinstance(number, int)):
         raise Code.SHAPE.refusal(
-            f"{what}: expected the name of one of OpenCV's dictionaries such as "
+            f"{label}: expected the name of one of OpenCV's dictionaries such as "
             f"DICT_5X5_250, got {name!r}",
             "DICT_5X5_250",
             name,
@@ -98,7 +98,7 @@ def marker_dictionary(name: str, needed: int, what: str) -> Any:
     count = len(dictionary.bytesList)
     if needed > count:
         raise Code.SHAPE.unexpected(
-            f"{what}: expected at least {needed} markers in {name}", needed, count
+            f"{label}: expected at least {needed} markers in {name}", needed, count
         )
     return dictionary
 
@@ -165,16 +165,16 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
 
 
-def check_one_board(agreed: int, contrary: int, what: str) -> None:
+def check_one_board(agreed: int, contrary: int, label: str) -> None:
     """Raise WRONG_TARGET if markers are arranged as on another board, or as on several.
 
     ``agreed`` markers are arranged as on the board; ``contrary`` others agree with each other, but
-    not with these. ``what`` names the target.
+    not with these. ``label`` names the target.
     """
     if contrary >= MIN_CONTRARY_MARKERS and 2 * contrary >= agreed:
         raise Code.WRONG_TARGET.refusal(
-            f"{what}: expected markers of one such board, got {agreed} that stand to each other as "
-            f"on it and {contrary} others that do so elsewhere: columns and rows are others, or "
+            f"{label}: expected markers of one such board, got {agreed} that stand to each other "
+            f"as on it and {contrary} others that do so elsewhere: columns and rows are others, or "
             "several boards with the same numbers are in the picture",
             f"{agreed + contrary} markers of one board",
             agreed,

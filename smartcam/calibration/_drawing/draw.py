@@ -101,19 +101,19 @@ def draw_uncertainty(
     return draw_maps([Map(name, shown.size, shown.sigma, caption, points)], title, "px")
 
 
-def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[Any], Any]:
+def _of(calibration: object, table: Mapping[type, Any], label: str) -> Callable[[Any], Any]:
     drawing = next(
         (drawing for kind, drawing in table.items() if isinstance(calibration, kind)), None
     )
     if drawing is None:
-        raise _wrong(what, "a calibration of a lens, a pair, or a camera on a robot", calibration)
+        raise _wrong(label, "a calibration of a lens, a pair, or a camera on a robot", calibration)
     chosen: Callable[[Any], Any] = drawing
     return chosen
 
 
-def _wrong(what: str, expected: str, actual: object) -> CalibrationError:
+def _wrong(label: str, expected: str, actual: object) -> CalibrationError:
     return Code.WRONG_KIND.unexpected(
-        f"{what}: expected {expected}", expected, type(actual).__name__
+        f"{label}: expected {expected}", expected, type(actual).__name__
     )
 
 

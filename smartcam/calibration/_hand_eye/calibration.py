@@ -327,7 +327,7 @@ def calibrate_hand_eye_from_poses(
 
 
 def _robot(
-    robot_poses: Sequence[Transform | Pose], count: int, what: str, setup: str
+    robot_poses: Sequence[Transform | Pose], count: int, label: str, setup: str
 ) -> tuple[list[Transform], list[int], RobotPoses]:
     """Return the robot's poses, an order that depends only on their values, and the sorted poses.
 
@@ -337,7 +337,7 @@ def _robot(
     robot_poses = as_list(robot_poses, object, "pose of the robot")
     if len(robot_poses) != count:
         raise Code.SHAPE.refusal(
-            f"hand-eye: expected as many {what} as poses of the robot, got {count} and "
+            f"hand-eye: expected as many {label} as poses of the robot, got {count} and "
             f"{len(robot_poses)}",
             len(robot_poses),
             count,

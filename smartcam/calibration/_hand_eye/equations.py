@@ -38,12 +38,12 @@ Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 """Place of the camera: on the robot's hand, or beside the robot, looking at it."""
 
 
-def is_in_hand(setup: object, what: str) -> bool:
+def is_in_hand(setup: object, label: str) -> bool:
     """Return True if the camera is on the hand, False if it looks at the robot.
 
-    ``what`` names the calibration. Raises SHAPE if there is no such setup.
+    ``label`` names the calibration. Raises SHAPE if there is no such setup.
     """
-    check_choice(setup, get_args(Setup), f"{what}: setup")
+    check_choice(setup, get_args(Setup), f"{label}: setup")
     return setup == "eye-in-hand"
 
 

@@ -362,10 +362,10 @@ class HandEyeCalibration(storage.SavedCalibration):
         error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
         return error
 
-    def _lens(self, what: str) -> CameraModel:
+    def _lens(self, label: str) -> CameraModel:
         if self.camera is None:
             raise Code.NO_CALIBRATION.refusal(
-                f"{what}: expected a calibration with the camera's lens, got one from poses of "
+                f"{label}: expected a calibration with the camera's lens, got one from poses of "
                 "the target",
                 "camera",
             )

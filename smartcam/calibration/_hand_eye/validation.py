@@ -240,14 +240,14 @@ def check_poses(problem: Problem) -> Agreed:
     return agreement_found
 
 
-def poor_fit(what: str, error: float | None) -> CalibrationError:
+def poor_fit(label: str, error: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
-    ``what``: description of what came instead. ``error``: error of the target, metres; None if
+    ``label``: description of what came instead. ``error``: error of the target, metres; None if
     it is not known.
     """
     return Code.POOR_FIT.refusal(
-        f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
+        f"hand-eye: expected a camera that sees the target where it is, got {label}: are the poses "
         "those of the views, in their order and in metres, are their angles in the convention that "
         "was read, is the setup right, and is the target numbered from the same end in all views?",
         got=error,

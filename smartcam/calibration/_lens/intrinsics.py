@@ -362,19 +362,21 @@ def _numbered_alike(
 
 
 def check_views(
-    views: Sequence[TargetView], what: str, least: int, size: tuple[int, int] | None = None
+    views: Sequence[TargetView], called: str, least: int, size: tuple[int, int] | None = None
 ) -> None:
-    """Refuse views that do not belong together, and unusable ones; ``what`` is for messages.
+    """Refuse views that do not belong together, and unusable ones; ``called``: name for errors.
 
     ``least``: least number of views. ``size``: size of the images, pixels; None: that of the first.
     Raises ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
     if len(views) < least:
-        raise Code.TOO_FEW.unexpected(f"{what}: expected {least} views or more", least, len(views))
+        raise Code.TOO_FEW.unexpected(
+            f"{called}: expected {least} views or more", least, len(views)
+        )
     for number, view in enumerate(views):
         if view.target != views[0].target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"{what}: expected views of one target, {views[0].target}, got {view.target} in "
+                f"{called}: expected views of one target, {views[0].target}, got {view.target} in "
                 f"{label(view, number)}",
                 views[0].target,
                 view.target,
@@ -400,17 +402,17 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         )
 
 
-def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
+def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
     """Refuse views of parallel planes, and a focal length that is not determined.
 
-    Raises ``INSUFFICIENT_ROTATION``; ``what`` is for messages.
+    Raises ``INSUFFICIENT_ROTATION``; ``label`` is for messages.
     """
     normals = adjusted.bundle.poses.rotation[:, :, 2]
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
     tilt = math.asin(min(1.0, float(sines.max())))
     if tilt < MIN_TILT_RADIANS:
         raise Code.INSUFFICIENT_ROTATION.refusal(
-            f"{what}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
+            f"{label}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
             f"or more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
             "focal length open",
             MIN_TILT_RADIANS,
@@ -422,7 +424,7 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
     relative = math.sqrt(max(float(spread[0, 0]), 0.0)) / length
     if relative > MAX_FOCAL_SIGMA_RATIO:
         raise Code.INSUFFICIENT_ROTATION.refusal(
-            f"{what}: expected views that tell the focal length to "
+            f"{label}: expected views that tell the focal length to "
             f"{MAX_FOCAL_SIGMA_RATIO:.0%}, got {length:.5g} pixels with a standard deviation of "
             f"{relative:.2g} of it: tilt the "
             "target more, and show it nearer",

@@ -373,10 +373,10 @@ def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
         yield np.abs(wish) > 3 * np.median(np.abs(wish))
 
 
-def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[Remark]:
+def lens_remarks(fitted: Sequence[Fitted], label: str, more: float) -> Iterator[Remark]:
     """Yield a remark if a known lens is not the camera's (``WRONG_LENS``).
 
-    ``fitted``: views through that lens; ``what``: name of the lens, for messages; ``more``:
+    ``fitted``: views through that lens; ``label``: name of the lens, for messages; ``more``:
     variance in addition to the points' own, pixels^2.
     """
     if len(fitted) < MIN_VIEWS_FOR_LENS:
@@ -386,6 +386,6 @@ def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[R
     before, after = float(reduced.squares.sum()), reduced.best(LENSES)[1]
     if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(
-            f"the {what} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
+            f"the {label} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
             "the residuals of one that is fitted to its views: is it this camera's, at this focus?"
         )

@@ -92,12 +92,12 @@ def _squares(left_out: Sequence[LeftOut]) -> Array:
     )
 
 
-def _remark(distances: Array, what: str) -> Remark:
+def _remark(distances: Array, label: str) -> Remark:
     rms = 1e3 * math.sqrt(float((distances**2).sum(axis=1).mean()))
     most = 1e3 * float(np.linalg.norm(distances, axis=1).max())
     return Code.SHEET_NOT_EXACT.remark(
         f"the sheet's points are {rms:.2g} mm rms from their nominal places, {most:.2g} mm "
-        f"at most: {what}"
+        f"at most: {label}"
     )
 
 

@@ -301,12 +301,12 @@ def _remarks_on_middle(calibration: IntrinsicCalibration) -> Iterator[Remark]:
         )
 
 
-def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
+def check_rms(label: str, rms: float, views: Sequence[TargetView]) -> None:
     """Raise ``POOR_FIT`` if the residuals are so large that the points cannot be the target's."""
     most = most_rms(views)
     if rms > most:
         raise Code.POOR_FIT.refusal(
-            f"{what}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
+            f"{label}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
             f"{most:.3g} at most expected: are columns and rows those of the sheet, and are the "
             "points those that their numbers say?",
             most,

@@ -140,11 +140,11 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     return RotationCentre(_plane(centre), _plane(arm), _plane(places - centre - arm * turns))
 
 
-def _check_same(frames: Sequence[str], what: str) -> None:
+def _check_same(frames: Sequence[str], label: str) -> None:
     others = [frame for frame in frames if frame != frames[0]]
     if others:
         raise Code.WRONG_FRAME.refusal(
-            f"{what} of one and the same frame, got {frames[0]} and {others[0]}",
+            f"{label} of one and the same frame, got {frames[0]} and {others[0]}",
             frames[0],
             others[0],
         )

@@ -219,22 +219,22 @@ def _extents(points: Array) -> Array:
     return singular / math.sqrt(len(points))
 
 
-def _check_distinct(points: Array, what: str, least: int) -> None:
+def _check_distinct(points: Array, label: str, least: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
     grain = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
         raise Code.COINCIDENT.unexpected(
-            f"{what}: expected at least {least} different ones", least, distinct
+            f"{label}: expected at least {least} different ones", least, distinct
         )
 
 
-def _check_width(points: Array, what: str) -> None:
+def _check_width(points: Array, label: str) -> None:
     along, across = _extents(points)[:2]
     if across < MIN_WIDTH_RATIO * along:
         raise Code.COLLINEAR.refusal(
-            f"{what}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
+            f"{label}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
             f"got {across / along:.2g}: they lie nearly in a line",
             MIN_WIDTH_RATIO,
             float(across / along),

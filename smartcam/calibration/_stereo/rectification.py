@@ -156,8 +156,8 @@ def _checked(
     return int(width), int(height)
 
 
-def _shape(what: str, expected: str, actual: object) -> CalibrationError:
-    return Code.SHAPE.unexpected(f"rectify: {what}: expected {expected}", expected, actual)
+def _shape(label: str, expected: str, actual: object) -> CalibrationError:
+    return Code.SHAPE.unexpected(f"rectify: {label}: expected {expected}", expected, actual)
 
 
 def _parallel(

@@ -55,10 +55,10 @@ _MAX_EXACT_DEVIATION = 1e-6
 same bound."""
 
 
-def malformed(what: str, expected: str, actual: object = None) -> CalibrationError:
+def malformed(label: str, expected: str, actual: object = None) -> CalibrationError:
     """Return the error for a text that does not have its format; ``actual`` is shortened."""
     shown = None if actual is None else _cut(actual)
-    text = f"{what}: expected {expected}" + ("" if shown is None else f", got {shown}")
+    text = f"{label}: expected {expected}" + ("" if shown is None else f", got {shown}")
     return Code.MALFORMED.refusal(text, expected, shown)
 
 
@@ -69,11 +69,11 @@ def within(where: str, error: CalibrationError) -> CalibrationError:
     )
 
 
-def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
+def known(table: Mapping[str, T], name: str, label: str = "format") -> T:
     """Return a table's value for a name; raise ``UNKNOWN_FORMAT`` if there is none."""
     if not isinstance(name, str) or name not in table:
         raise Code.UNKNOWN_FORMAT.refusal(
-            f"no {what} is called {name!r}; expected one of {', '.join(table)}", list(table), name
+            f"no {label} is called {name!r}; expected one of {', '.join(table)}", list(table), name
         )
     return table[name]
 

@@ -103,14 +103,14 @@ class MarkCamera:
             )
         return rows
 
-    def check_y_down(self, before: bool | None, what: str) -> None:
+    def check_y_down(self, before: bool | None, label: str) -> None:
         """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
 
-        ``what``: name, for people, of the earlier picture or calibration.
+        ``label``: name, for people, of the earlier picture or calibration.
         """
         if None not in {before, self.y_down} and before != self.y_down:
             raise Code.MIRRORED.refusal(
-                f"{what} with y_down={before}, now it is {self.y_down}, and everything would be "
+                f"{label} with y_down={before}, now it is {self.y_down}, and everything would be "
                 f"mirrored; expected y_down={before}",
                 before,
                 self.y_down,

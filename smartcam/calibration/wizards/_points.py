@@ -443,11 +443,11 @@ async def ask_to_save(
 
 
 def calibrated_plane(
-    calibration: PlaneCalibration, what: str = "the camera's x axis", along: Array | None = None
+    calibration: PlaneCalibration, label: str = "the camera's x axis", along: Array | None = None
 ) -> Calibrated:
     """Return a plane's calibration with its figures, in mm, and its notes.
 
-    ``what``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
+    ``label``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
     """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
@@ -470,7 +470,7 @@ def calibrated_plane(
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     x, y, z = calibration.rotation[:, 0] if along is None else along
     notes.append(
-        f"{what} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
+        f"{label} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
     )
     notes += [f"{warning.code}: {warning.text}" for warning in calibration.warnings]

@@ -491,16 +491,16 @@ class WizardSession:
             )
         return request
 
-    def _before(self, what: str, token: str) -> _ScriptRun:
-        """Return the coroutine as it was before the last step; ``what`` names the call."""
+    def _before(self, label: str, token: str) -> _ScriptRun:
+        """Return the coroutine as it was before the last step; ``label`` names the call."""
         self._expect(token)
-        if what not in self._can():
-            raise self._impossible(what)
+        if label not in self._can():
+            raise self._impossible(label)
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
-    def _impossible(self, what: str) -> CalibrationError:
+    def _impossible(self, label: str) -> CalibrationError:
         return Code.NOT_POSSIBLE.refusal(
-            f"{what}: not possible here; expected one of {', '.join(self._can())}", got=what
+            f"{label}: not possible here; expected one of {', '.join(self._can())}", got=label
         )
 
     async def _act(self, request: PendingStep, values: Answers) -> Any:
@@ -579,12 +579,12 @@ def _named(header: Mapping[str, Any]) -> str:
     return f"{header['wizard']!r} version {header['version']} ({header['schema']})"
 
 
-def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
+def _stored(value: dict[str, Any], label: str) -> dict[str, Any]:
     """Return a value as it will be read, so that a resumed sequence has the same one."""
     try:
         read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:
-        raise Code.NOT_STORABLE.refusal(f"{what} cannot be stored: {exc}") from exc
+        raise Code.NOT_STORABLE.refusal(f"{label} cannot be stored: {exc}") from exc
     return read
 
 

@@ -315,11 +315,11 @@ class ThesisCalibration:
         return self._reply(sequence, errors)
 
     @contextlib.contextmanager
-    def _alone(self, what: str) -> Iterator[None]:
+    def _alone(self, label: str) -> Iterator[None]:
         """Refuse a call while another call is running."""
         if self._busy:
             raise Code.NOT_POSSIBLE.refusal(
-                f"{self._name}: another call is under way; {what} was not done. Expected its "
+                f"{self._name}: another call is under way; {label} was not done. Expected its "
                 "answer to come first, or abort"
             )
         self._busy = True

@@ -48,11 +48,11 @@ class Bundled(NamedTuple):
     parts: list[tuple[str, bytes]]
 
 
-def decode_bundle(payload: bytes, what: str) -> Bundled:
+def decode_bundle(payload: bytes, label: str) -> Bundled:
     """Return the bundle in ``payload``.
 
     Raises:
-        RemoteProtocolError: the payload is not valid; the text names ``what``.
+        RemoteProtocolError: the payload is not valid; the text names ``label``.
     """
     try:
         magic, epoch, number, following, count = _HEAD.unpack_from(payload)
@@ -69,7 +69,7 @@ def decode_bundle(payload: bytes, what: str) -> Bundled:
         if place != len(payload):
             raise ValueError(f"{len(payload) - place} bytes are left over")
     except (ValueError, struct.error) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     return Bundled(epoch, number, following, parts)
 
 

@@ -33,30 +33,32 @@ _WORD = re.compile(CHUNK)
 _PARAMETERS = ("fleet", "certificates", "program")
 
 
-def check_name(name: str, what: str = "camera") -> str:
+def check_name(name: str, label: str = "camera") -> str:
     """Return a camera's name.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    name = check_text(name, what)
+    name = check_text(name, label)
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name):
         raise ConfigurationError(
-            f"{what} {name!r:.120}: expected a name such as line1/cam3: one to {MAX_CHUNKS} parts "
+            f"{label} {name!r:.120}: expected a name such as line1/cam3: one to {MAX_CHUNKS} parts "
             f"of a-z, 0-9, _ and -, with / between them, {MAX_NAME_CHARACTERS} characters at most"
         )
     return name
 
 
-def check_word(word: str, what: str) -> str:
+def check_word(word: str, label: str) -> str:
     """Return the name of a fleet or an agent.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    word = check_text(word, what)
+    word = check_text(word, label)
     if len(word) > MAX_NAME_CHARACTERS or not _WORD.fullmatch(word):
-        raise ConfigurationError(f"{what} {word!r:.120}: expected a-z, 0-9, _ and -, such as plant")
+        raise ConfigurationError(
+            f"{label} {word!r:.120}: expected a-z, 0-9, _ and -, such as plant"
+        )
     return word
 
 

@@ -131,12 +131,12 @@ def _interface(address: str) -> ipaddress.IPv4Interface:
     return interface
 
 
-def _ip(text: str, what: str) -> ipaddress.IPv4Address:
-    given = check_text(text, what, "force_address", most=100)
+def _ip(text: str, label: str) -> ipaddress.IPv4Address:
+    given = check_text(text, label, "force_address", most=100)
     try:
         return ipaddress.IPv4Address(given.strip())
     except ValueError as exc:
-        raise ConfigurationError(f"{what}: expected an IPv4 address, got {given[:60]!r}") from exc
+        raise ConfigurationError(f"{label}: expected an IPv4 address, got {given[:60]!r}") from exc
 
 
 def _of_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:

@@ -24,9 +24,9 @@ class Proxied(ABC):
         self.log: LinkLog = relay.log
         self._loop = asyncio.get_running_loop()
 
-    def note(self, what: str, direction: str = "", at: int | None = None) -> None:
+    def note(self, label: str, direction: str = "", at: int | None = None) -> None:
         """Log an event."""
-        self.log.note(what, self.number, direction, at)
+        self.log.note(label, self.number, direction, at)
 
     @abstractmethod
     def add(self, rules: Sequence[Rule]) -> None:

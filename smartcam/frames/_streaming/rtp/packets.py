@@ -371,5 +371,5 @@ def _unpadded(body: bytes, last: bool, place: int, data: bytes) -> bytes:
     return body[:-padding]
 
 
-def _cut_off(what: str, expected: int, data: bytes | memoryview) -> MessageError:
-    return MessageError(f"{what}: expected {expected} bytes or more, got {len(data)}", data=data)
+def _cut_off(label: str, expected: int, data: bytes | memoryview) -> MessageError:
+    return MessageError(f"{label}: expected {expected} bytes or more, got {len(data)}", data=data)

@@ -99,8 +99,8 @@ class RtspLink(asyncio.Protocol):
         """End the link with a reason for :attr:`on_end`."""
         self._end(why)
 
-    def _of_socket(self, what: str) -> Any:
-        value = None if self._transport is None else self._transport.get_extra_info(what)
+    def _of_socket(self, label: str) -> Any:
+        value = None if self._transport is None else self._transport.get_extra_info(label)
         if not value:
             raise self._error(self.ended or "the connection is lost")
         return value

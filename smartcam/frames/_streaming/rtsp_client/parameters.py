@@ -103,8 +103,8 @@ class RtspParameters(DeviceFeatures):
         }.get(answer.status, "it refuses that")
         raise self._wrong(name, f"{why}: {status}")
 
-    def _cannot(self, what: str) -> NoReturn:
-        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {what}")
+    def _cannot(self, label: str) -> NoReturn:
+        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {label}")
 
     def _wrong(self, name: str, text: str) -> FrameFeatureError:
         shown = name[:MAX_SHOWN_CHARACTERS]
