@@ -298,3 +298,26 @@ def test_explained_arguments_exist() -> None:
         and not explained <= names
     ]
     assert not found, "\n".join(found)
+
+
+UNNAMED = {"one", "found", "came", "it", "said", "told", "heard", "mine", "theirs"}
+"""Names of loop variables that do not name the thing that they hold."""
+
+
+def loop_variables(tree: ast.AST) -> Iterator[ast.Name]:
+    """Yield the variables of loops and comprehensions, pairs such as ``one, other`` left out."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.For | ast.AsyncFor | ast.comprehension):
+            names = [part for part in ast.walk(node.target) if isinstance(part, ast.Name)]
+            if not {"one", "other"} <= {name.id for name in names}:
+                yield from names
+
+
+def test_loop_variables_name_what_they_hold() -> None:
+    found = [
+        f"{module}:{name.lineno}: {name.id}"
+        for module, tree in package().items()
+        for name in loop_variables(tree)
+        if name.id in UNNAMED
+    ]
+    assert not found, "\n".join(found)

@@ -56,14 +56,14 @@ class Collecting:
         self._last = None
 
 
-def _apart(one: TargetView, other: TargetView) -> float:
+def _apart(first: TargetView, other: TargetView) -> float:
     """Return the distance of common points in pixels, root of the mean square."""
     import numpy as np
 
-    _, index, other_index = np.intersect1d(one.ids, other.ids, return_indices=True)
+    _, index, other_index = np.intersect1d(first.ids, other.ids, return_indices=True)
     if not len(index):
         return np.inf
-    distances = one.points[index] - other.points[other_index]
+    distances = first.points[index] - other.points[other_index]
     return float(np.sqrt((distances**2).sum(axis=1).mean()))
 
 

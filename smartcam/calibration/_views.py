@@ -82,10 +82,10 @@ class TargetView(storage.Stored):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def _read(cls, found: dict[str, Any], context: storage.Context) -> TargetView:
+    def _read(cls, fields: dict[str, Any], context: storage.Context) -> TargetView:
         if context.get("target") is None:
             raise storage.refused(context["called"], "target: expected the one that it shows", None)
-        return super()._read({"target": context["target"], **found}, context)
+        return super()._read({"target": context["target"], **fields}, context)
 
     @property
     def object_points(self) -> Array:

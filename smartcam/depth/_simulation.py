@@ -197,8 +197,8 @@ class TowerTable:
         return measured
 
 
-def _apart(one: WoodenBlock, other: WoodenBlock) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)
+def _apart(first: WoodenBlock, other: WoodenBlock) -> float:
+    return math.hypot(first.x - other.x, first.y - other.y)
 
 
 def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:

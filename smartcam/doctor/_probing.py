@@ -184,7 +184,10 @@ def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) 
     if greeted is not None:
         place = (greeted, trial.address.port)
         order = sorted(
-            left, key=lambda one: (one[0].address.protocol, one[0].address.port) != place
+            left,
+            key=lambda way_and_flag: (
+                (way_and_flag[0].address.protocol, way_and_flag[0].address.port) != place
+            ),
         )
         left.clear()
         left.extend(order)

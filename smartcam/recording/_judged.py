@@ -95,12 +95,12 @@ class PictureMatcher:
         """Yield the results whose picture is known, or can no longer arrive."""
         while self.results:
             result = self.results[0]
-            found = self._reported_picture(result)
-            reported = found is not None
+            recorded = self._reported_picture(result)
+            reported = recorded is not None
             if not (reported or over or self._is_late(result)):
                 return
             self.results.popleft()
-            picture = self._by_time(result) if found is None else found.frame
+            picture = self._by_time(result) if recorded is None else recorded.frame
             yield JudgedResult(result, picture, reported)
 
     def settled_by_time(self) -> Iterator[JudgedResult]:

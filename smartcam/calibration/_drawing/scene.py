@@ -167,7 +167,7 @@ def _frustum(camera: DrawnCamera, length: float) -> Array:
     """Return a camera's centre, and the corners of its field of view at a depth, (5, 3)."""
     x, y = 0.5, 0.375  # coordinates of a corner at depth 1
     if camera.model is not None:
-        x, y = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
+        x, y = (math.tan(min(view_angle, 2.0) / 2) for view_angle in camera.model.field_of_view)
     rim = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
     return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *rim]))
 

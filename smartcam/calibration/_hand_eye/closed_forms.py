@@ -247,11 +247,11 @@ def _lists(motions: Rigid) -> tuple[list[Array], list[Array]]:
     return list(np.ascontiguousarray(motions.rotation)), list(motions.translation)
 
 
-def _sound(found: tuple[Rigid, Rigid]) -> bool:
-    for motion in found:
+def _sound(motions: tuple[Rigid, Rigid]) -> bool:
+    for motion in motions:
         if not all(np.isfinite(part).all() for part in motion):
             return False
-        off = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
-        if off > 1e-6 or np.linalg.det(motion.rotation) < 0:
+        error = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
+        if error > 1e-6 or np.linalg.det(motion.rotation) < 0:
             return False
     return True

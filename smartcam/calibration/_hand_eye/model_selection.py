@@ -311,13 +311,13 @@ def _robots(
     problem: Problem, free: Mapping[str, tuple[int, ...]], begin: Solution
 ) -> list[Candidate]:
     """Return candidates that correct the robot's poses, one for each choice of free values."""
-    found: list[Candidate] = []
+    tried: list[Candidate] = []
     elsewhere = (
         _begin_of_another_size(problem) if any(0 in freed for freed in free.values()) else None
     )
     for besides, numbers in free.items():
         freed = _freed(problem, numbers)
-        start = found[0].solution if found and found[0].besides == NOTHING else begin
+        start = tried[0].solution if tried and tried[0].besides == NOTHING else begin
         if elsewhere is not None and 0 in numbers:
             change = np.concatenate([elsewhere.change, np.zeros(len(numbers) - 1)])
             start = dataclasses.replace(elsewhere, change=change)
@@ -326,8 +326,8 @@ def _robots(
         else:
             solution = adjust(freed.robot, freed.seen, start, RobotNoise(problem.sigmas))
         if (candidate := _candidate(ROBOT, besides, freed, solution)) is not None:
-            found.append(candidate)
-    return found
+            tried.append(candidate)
+    return tried
 
 
 def _best_candidate(judges: Sequence[Candidate]) -> Candidate | None:

@@ -141,11 +141,11 @@ class HandEyeCalibration(storage.SavedCalibration):
         for array in (self.errors, self.leave_one_out, self.covariance):
             array.flags.writeable = False
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = len(self.robot_poses)
         names = ("errors", "leave_one_out", "used", "target_poses")
-        storage.check_counts(found, names, count, called)
-        if self.views and (found["target"] is None or len(self.views) != count):
+        storage.check_counts(fields, names, count, called)
+        if self.views and (fields["target"] is None or len(self.views) != count):
             raise storage.refused(
                 called, f"views: expected {count}, and their target", len(self.views)
             )

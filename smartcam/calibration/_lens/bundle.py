@@ -391,11 +391,14 @@ class BundleEquations:
                 normal.mixed[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and self._prior is not None:
             # minimise also |p - nominal|^2 / loose^2, and the same of the whole sheet: see _prior
-            rows_of_pose, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
-            pull = self._prior @ off.ravel()
+            rows_of_pose, misses = (
+                slice(bundle.of_cameras, bundle.shared),
+                bundle.points - self._meant,
+            )
+            pull = self._prior @ misses.ravel()
             matrix[rows_of_pose, rows_of_pose] += self._prior
             right[rows_of_pose] -= pull
-            cost += float(off.ravel() @ pull)
+            cost += float(misses.ravel() @ pull)
         return normal._replace(cost=cost if math.isfinite(cost) else math.inf)
 
     def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:

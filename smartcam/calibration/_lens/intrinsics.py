@@ -227,13 +227,13 @@ class IntrinsicCalibration(storage.SavedCalibration):
         bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
         storage.check_shape(self.covariance, (count, count), called, "covariance")
         for view in self.views:
             storage.check_shape(view.residuals, view.view.points.shape, called, "residuals")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
 @takes(

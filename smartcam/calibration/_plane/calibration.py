@@ -481,9 +481,9 @@ class PlaneCalibration(storage.SavedCalibration):
         )
         return dataclasses.replace(self, matrix=matrix, place=place, height=self.height + height)
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         names = ("robot_points", "weights", "residuals", "leave_one_out")
-        storage.check_counts(found, names, len(self.camera_points), called)
+        storage.check_counts(fields, names, len(self.camera_points), called)
         if np.count_nonzero(self.weights) < 3:
             raise storage.refused(
                 called, "weights: expected 3 that are not 0", self.weights.tolist()

@@ -180,18 +180,18 @@ def extent(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(_turned(points)[:, :2], axis=0)))
 
 
-def check_lever(found: float, touch_sigma: float) -> None:
+def check_lever(extent_found: float, touch_sigma: float) -> None:
     """Raise SHORT_LEVER if points lie too close together for the error of the touches.
 
-    ``found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
+    ``extent_found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
     """
-    if found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
+    if extent_found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
         raise Code.SHORT_LEVER.refusal(
             f"robot points: expected at least {MIN_EXTENT_IN_SIGMAS:g} sigmas of a touch "
             f"({1e3 * MIN_EXTENT_IN_SIGMAS * touch_sigma:.3g} mm) in each direction, "
-            f"got {1e3 * found:.3g} mm: they lie too close together, or are in another unit",
+            f"got {1e3 * extent_found:.3g} mm: they lie too close together, or are in another unit",
             MIN_EXTENT_IN_SIGMAS * touch_sigma,
-            found,
+            extent_found,
         )
 
 

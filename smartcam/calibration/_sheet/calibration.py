@@ -106,8 +106,8 @@ class SheetCalibration(storage.SavedCalibration):
     remarks: storage.Remarks = ()
 
     @classmethod
-    def _read(cls, found: dict[str, Any], context: storage.Context) -> SheetCalibration:
-        matrix, covariance = found["matrix"], found["covariance"]
+    def _read(cls, fields: dict[str, Any], context: storage.Context) -> SheetCalibration:
+        matrix, covariance = fields["matrix"], fields["covariance"]
         if covariance.shape != (9, 9):
             raise storage.refused(
                 context["called"], "covariance: expected 9 rows of 9", len(covariance)
@@ -115,10 +115,10 @@ class SheetCalibration(storage.SavedCalibration):
         if abs(np.linalg.det(matrix)) == 0.0:
             text = "matrix: expected one that can be inverted"
             raise storage.refused(context["called"], text, matrix.tolist())
-        found["sheet"] = SheetPlane(found["view"].size, matrix, covariance, found["camera"])
-        return super()._read(found, context)
+        fields["sheet"] = SheetPlane(fields["view"].size, matrix, covariance, fields["camera"])
+        return super()._read(fields, context)
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         if self.lens_covariance is not None:
             _check_lens(self.lens_covariance, self.camera, called)
 

@@ -284,10 +284,10 @@ class StereoCalibration(storage.SavedCalibration):
             )
         return first, second
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         storage.check_shape(self.covariance, (6, 6), called, "covariance")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
 def _target(calibration: StereoCalibration) -> Target:

@@ -93,11 +93,11 @@ def _step(
     # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
     # points are solved at once, which no solver of single problems does; a thousand take a few
     # milliseconds.
-    one = linearize(points, pair.left)
+    left_part = linearize(points, pair.left)
     two = linearize(pair.transform.apply(points), pair.right)
-    rows = [white[0] @ one.by_point, white[1] @ two.by_point @ pair.transform.rotation]
+    rows = [white[0] @ left_part.by_point, white[1] @ two.by_point @ pair.transform.rotation]
     misses = [
-        white[0] @ (pixels[0] - one.pixels)[..., None],
+        white[0] @ (pixels[0] - left_part.pixels)[..., None],
         white[1] @ (pixels[1] - two.pixels)[..., None],
     ]
     jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(misses, axis=1)

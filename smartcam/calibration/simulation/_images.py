@@ -119,8 +119,8 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
             "its z away from the camera",
         )
     along = np.linspace(0.0, 1.0, 50)
-    zero, one = np.zeros(50), np.ones(50)
-    parts = np.column_stack([np.r_[along, one, along, zero], np.r_[zero, along, one, along]])
+    zero, ones = np.zeros(50), np.ones(50)
+    parts = np.column_stack([np.r_[along, ones, along, zero], np.r_[zero, along, ones, along]])
     rim = (paper[0] + parts * (paper[1] - paper[0])) @ pose.rotation[:, :2].T + pose.translation
     nearest = float(rim[:, 2].min())
     if not nearest > 0:

@@ -273,9 +273,9 @@ def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
         bitrate=call.argument("bitrate", check_integer, MIN_BITRATE, MAX_BITRATE),
         stream=stream,
     )
-    rest = min(MAX_FRAME_INTERVAL, call.argument("rest", check_age) or 0.0)
+    min_interval = min(MAX_FRAME_INTERVAL, call.argument("rest", check_age) or 0.0)
     have = call.argument("have", check_integer, 0) or 0
-    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, rest, have)
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, min_interval, have)
 
 
 async def _frame(call: ProgramCall) -> Answer:

@@ -196,9 +196,9 @@ class FleetCamera(Camera[ValueT]):
 
     def _abandoned(self) -> bool:
         # the bus refers to the camera until it is closed; its own bus is dropped with it
-        own = vars(self)
-        opened = own.get("_opened", False) and own.get("_closed") is None
-        return opened and not own.get("_shared", True)
+        attributes = vars(self)
+        opened = attributes.get("_opened", False) and attributes.get("_closed") is None
+        return opened and not attributes.get("_shared", True)
 
     async def open(self) -> Self:
         if self._opened or self._closed is not None:
@@ -661,7 +661,7 @@ class FleetCamera(Camera[ValueT]):
             await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
-        own = receiver.own_calls[number] = Own(request.interpretation, expected)
+        own_call = receiver.own_calls[number] = Own(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(
                 request, application, expected, number, deadline, timeout
@@ -669,7 +669,7 @@ class FleetCamera(Camera[ValueT]):
             receiver.take_states(reply)
             if not receiver.has(reply.states, reply.batch.following):
                 await self._reach(reply.states, reply.batch.following, deadline)
-            return receiver.outcomes(own, reply.batch)
+            return receiver.outcomes(own_call, reply.batch)
         finally:
             del receiver.own_calls[number]
 

@@ -99,9 +99,9 @@ class Exchange(Bus):
         for places in [*self._places.get(kind, {}).values()]:
             # a message that arrives twice now is taken once, by its number
             for place in places:
-                own, place.cover = place.cover, None
-                if own is not None:
-                    own.close()
+                own_handle, place.cover = place.cover, None
+                if own_handle is not None:
+                    own_handle.close()
 
     def _uncover(self, kind: str) -> None:
         self._covers.pop(kind).close()
@@ -110,8 +110,8 @@ class Exchange(Bus):
 
     def _kind(self, key: str) -> str:
         tail = key.removeprefix(f"{self._keys().root}/")
-        first, _, rest = tail.partition("/")
-        return f"{first}/{rest.partition('/')[0]}" if first == "presence" else first
+        first, _, tail_rest = tail.partition("/")
+        return f"{first}/{tail_rest.partition('/')[0]}" if first == "presence" else first
 
     def _enter(
         self, key: str, call: Callable[..., None], declare: Callable[[], Handle]

@@ -612,10 +612,10 @@ class GenicamFeatures:
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
-            found = await self._noted(self._target(node, depth), problems)
-            if found is None:
+            unit_text = await self._noted(self._target(node, depth), problems)
+            if unit_text is None:
                 return ""
-            node = found
+            node = unit_text
         return ""
 
     def _selected_by(self, name: str) -> tuple[str, ...]:

@@ -420,11 +420,11 @@ class Framer:
             )
 
 
-def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[bytes]) -> int:
+def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, pieces: list[bytes]) -> int:
     """Cut frames of ``length`` bytes that begin with ``head``, which includes that length.
 
     Sixteen are cut at a time, or none of them: the first that differs may have another length, so
-    bytes after it would be no frame. The bytes after the heads are added to ``found``.
+    bytes after it would be no frame. The bytes after the heads are added to ``pieces``.
 
     Returns:
         The place of the next frame.
@@ -435,7 +435,7 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[
         parts = cut(buffer, start)
         if parts[::2].count(head) < MAX_ALIKE_FRAMES:
             break
-        found += parts[1::2]
+        pieces += parts[1::2]
         start += MAX_ALIKE_FRAMES * length
     return start
 
