@@ -39,7 +39,7 @@ if hasattr(os, "register_at_fork"):
 
 
 if TYPE_CHECKING:
-    from functools import cached_property as cached_property  # for modules that import it from here
+    from functools import cached_property as cached_property  # other modules import it from here
 elif sys.version_info >= (3, 12):
     from functools import cached_property
 else:

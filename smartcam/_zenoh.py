@@ -213,7 +213,7 @@ def _end_lingering(ports: frozenset[int]) -> None:
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
     except OSError:
-        return  # Windows, where nothing waits
+        return  # Windows, on which nothing has to wait
     for number in numbers:
         try:
             sock = socket.socket(fileno=number)

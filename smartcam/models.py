@@ -144,7 +144,7 @@ def _cut(value: object) -> str:
 
 
 def _html() -> Any:
-    return importlib.import_module("smartcam._html")  # for notebooks only
+    return importlib.import_module("smartcam._html")  # used only by notebooks
 
 
 class Position(NamedTuple):

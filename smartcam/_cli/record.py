@@ -258,7 +258,7 @@ def _jobs(
 
 
 def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
-    """Record facts that a shared camera's frames would show, as far as the agent knows them."""
+    """Record the agent's facts that a recording of frames would contain."""
     from smartcam._client._inside import in_pixels, own_interpreter
 
     dialect = camera.capabilities.dialect

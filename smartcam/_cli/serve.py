@@ -282,7 +282,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
     """Return the recorder of the cameras, which prints a line when it cannot record."""
     from smartcam.recording import FleetRecorder
 
-    def say(trouble: RecordingError | None) -> None:
+    def show_trouble(trouble: RecordingError | None) -> None:
         lost = {name: account.lost for name, account in recorder.accounts.items() if account.lost}
         value = {
             "recordings": str(recorder.path),
@@ -302,7 +302,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
         elif not as_lines:
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} {text}", err=True)
 
-    recorder = FleetRecorder(server, on_trouble=say)
+    recorder = FleetRecorder(server, on_trouble=show_trouble)
     return recorder
 
 

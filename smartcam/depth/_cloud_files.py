@@ -71,7 +71,7 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     ``mm`` or ``inch``.
 
     PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
-    with a coordinate that is not finite, as organised files have them, are left out. Colours are
+    with a coordinate that is not finite, as in organised files, are left out. Colours are
     ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``, or PCL's
     ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the same unit.
     Properties of other names are skipped, and so is a PCD's viewpoint. Large files take seconds: do

@@ -60,7 +60,7 @@ class Code(enum.StrEnum):
     WRONG_FRAME = "WRONG_FRAME"
     """A pose is given in another frame than the calibration's."""
     PLANE_MOVED = "PLANE_MOVED"
-    """The camera moved in a way that moves the plane it sees."""
+    """The camera's motion changed the plane in its view."""
     INSUFFICIENT_ROTATION = "INSUFFICIENT_ROTATION"
     """The poses are turned too little against each other."""
     POSES_TOO_SIMILAR = "POSES_TOO_SIMILAR"

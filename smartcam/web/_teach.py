@@ -285,7 +285,7 @@ def _calls(_site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/state")
 def _state(site: TeachSite, _call: CallRequest) -> object:
-    """The application as the file has it, the kinds of tools, and the pictures."""
+    """The application's entry in the file, the kinds of tools, and the pictures."""
     return site.state()
 
 

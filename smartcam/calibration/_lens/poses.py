@@ -236,7 +236,7 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     """
     rays = camera.directions(view.points)
     poses = _ippe(view.object_points, rays)
-    if not poses:  # for exact rays OpenCV would take the root of a negative rounding error
+    if not poses:  # OpenCV takes the root of a difference, which may be negative for exact rays
         poses = _ippe(
             view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
         )

@@ -448,7 +448,7 @@ def _foreign(
     parse: Callable[[str], foreign.Found],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    """Return a format for a parser that returns lenses as the file has them."""
+    """Return a format for a parser that returns lenses in the units of the file."""
 
     def read(
         text: str, given: tuple[int, int] | None = None

@@ -507,7 +507,7 @@ class FiredFault(NamedTuple):
     Attributes:
         time: seconds of the emulator's clock.
         fault: the fault, as it was given.
-        message: the message that the fault applied to, as its sender meant it; None if the fault
+        message: the message that the fault applied to, before the fault; None if the fault
             waited for none.
     """
 

@@ -93,7 +93,7 @@ class WireCodec(Protocol):
 class WireMessage(Transmission):
     """A message on its way, or an insertion."""
 
-    what: Frame | bytes  # the frame as its sender meant it; bytes that make no frame
+    what: Frame | bytes  # the frame before faults, or bytes that make no frame
     original: bytes  # original bytes of the message
     changeable: bool = True  # whether later faults act on the message
     passed: bytearray = field(default_factory=bytearray)  # bytes that have passed

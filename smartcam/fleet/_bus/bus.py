@@ -78,7 +78,7 @@ class Bus(abc.ABC):
     @property
     @abc.abstractmethod
     def reached(self) -> bool:
-        """True if this end is on the bus now, as far as it knows: open, and not cut off."""
+        """True if this end is open, and no loss of the bus is known."""
 
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:

@@ -143,7 +143,7 @@ def find_circle(
     strips = Sectors(centre, radius, angles, search, width)
     first = _collected(image, strips, settings, which)
     circle = fit_circle(first.edges).shape
-    radial = strips.middles - circle.centre  # the same places, relative to the better centre
+    radial = strips.middles - circle.centre  # places relative to the better centre
     angles = np.arctan2(radial[:, 1], radial[:, 0])
     width *= min(circle.radius / radius, 1.0)
     strips = Sectors(circle.centre, circle.radius, angles, min(search, _short(first)), width)

@@ -279,7 +279,7 @@ class Machine:
         # of a client: deliveries by their sizes; how many more are stored
         self._deliveries: dict[int, _Delivery] = {}
         self._unknown_deliveries = MAX_KNOWN_DELIVERIES
-        self._volley: _Volley | None = None  # for a client: the last messages sent together
+        self._volley: _Volley | None = None  # last messages that a client sent together
         # of a camera, by chunks seen before in this state: their messages and frames
         self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
         # of a camera, by the id of a message object sent before: the message and its frame

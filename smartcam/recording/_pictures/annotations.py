@@ -88,7 +88,7 @@ _TYPE_OF: Final = {kind: number for number, kind in _KINDS.items()}
 
 @cache
 def schema_data(name: str) -> bytes:
-    """Return the schema of the message as MCAP has it: a FileDescriptorSet."""
+    """Return the message's schema in MCAP's form: a FileDescriptorSet."""
     return file_set(name, _MESSAGES, {"PointsAnnotation": {"Type": _TYPES}})
 
 

@@ -187,7 +187,7 @@ def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
 def file_set(
     name: str, messages: dict[str, Fields], enums: dict[str, dict[str, tuple[str, ...]]]
 ) -> bytes:
-    """Return the schema of a message as MCAP has it: a FileDescriptorSet.
+    """Return a message's schema in MCAP's form: a FileDescriptorSet.
 
     Args:
         name: full name of the message, without a dot in front.
