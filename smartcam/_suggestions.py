@@ -116,7 +116,7 @@ def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
 
 
 def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
-    """Return the known words whose parts explain those of a word, with their scores."""
+    """Return the known words whose parts explain a word's parts, with their scores."""
     parts = _parts(word)
     of_known = {candidate: _parts(candidate)[:MAX_PARTS] for candidate in known}
     every = dict.fromkeys(itertools.chain.from_iterable(of_known.values()))

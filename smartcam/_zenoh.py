@@ -280,7 +280,7 @@ class ZenohSession:
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
-        # bytes received, counted by all threads; and those of them that were handled
+        # bytes received, counted by all threads; and the number of handled bytes
         self._bytes = self._patient_bytes = 0
         self._taken_bytes = self._taken_patient_bytes = 0
         self._woken = False

@@ -102,7 +102,7 @@ class FrameRequest(NamedTuple):
 
     Attributes:
         encoding: name of the encoding.
-        quality: quality of JPEGs; None for that of the agent.
+        quality: quality of JPEGs; None for the agent's default.
     """
 
     encoding: str
@@ -114,7 +114,7 @@ class StreamRequest(NamedTuple):
 
     Attributes:
         encoding: name of the encoding.
-        quality: quality of JPEGs; None for that of the agent.
+        quality: quality of JPEGs; None for the agent's default.
         bitrate: bits per second; None for no limit.
         latency: seconds; None for no limit.
         decode: whether encoded frames are decoded here.

@@ -93,7 +93,7 @@ class SmartCamera(Camera[ValueT]):
         return CameraState(self.settings.name, self.settings.application, self._listeners)
 
     def _use_address(self, address: Address) -> None:
-        """Use another address than that of the settings; only before the client is opened."""
+        """Use another address than the settings' one; only before the client is opened."""
         self.settings: CameraSettings = replace(self.settings, address=address)
         self._supervisor.use_settings(self.settings)
 

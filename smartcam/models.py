@@ -199,8 +199,8 @@ class PoseSigma(NamedTuple):
         y: along the frame's y axis, in the unit of ``x``.
         theta: error of the rotation about the pose's z axis, radians.
         correlation_xy: correlation of the errors of x and y, -1 to 1.
-        correlation_xt: correlation of those of x and theta.
-        correlation_yt: correlation of those of y and theta.
+        correlation_xt: correlation of the errors of x and theta.
+        correlation_yt: correlation of the errors of y and theta.
         z: along the frame's z axis, metres; None if not known: a camera sees no height.
     """
 

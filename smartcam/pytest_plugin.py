@@ -107,7 +107,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
-    """Emulated cameras by name: two, or those of a scenario; otherwise like emulated_camera."""
+    """Emulated cameras by name: two, or a scenario's cameras; otherwise like emulated_camera."""
     from smartcam.testing import ThreadedFleet
 
     given = _given_options(request)

@@ -83,7 +83,7 @@ class Queue(Generic[T]):
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
-        # Bytes are counted when items come; only then are those of taken items subtracted, so that
+        # Bytes are counted, and the bytes of taken items subtracted, when items come, so that
         # taking costs nothing. A parcel came together: number of its last item, items, bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
         self._bytes = 0  # bytes of all parcels, some of which may belong to dropped items

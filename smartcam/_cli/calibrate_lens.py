@@ -196,7 +196,7 @@ async def _from_files(
 
 
 def _files(pictures: Sequence[str]) -> Iterator[Path]:
-    """Yield the named files, and those of folders in the order of their numbers."""
+    """Yield the named files, and the files of folders in the order of their numbers."""
     from smartcam._natural import natural
     from smartcam.calibration._inside import SUFFIXES
 

@@ -30,7 +30,7 @@ def install(shell: str) -> str:
     """Add the missing lines to the shell's file, and return a report.
 
     Args:
-        shell: name of the shell; "": that of the variable SHELL.
+        shell: name of the shell; "": the shell of the variable SHELL.
 
     Raises:
         click.UsageError: the shell is unknown, or its file cannot be written.

@@ -206,7 +206,7 @@ class Options:
         return default if self.timeout is None else self.timeout
 
     def check_y_down(self, calibration: AnyCalibration, label: str) -> None:
-        """Raise ConfigurationError if ``--y-down`` differs from that of a calibration.
+        """Raise ConfigurationError if ``--y-down`` differs from a calibration's direction of y.
 
         ``label``: the option that names the calibration.
         """

@@ -71,7 +71,7 @@ class _Round(NamedTuple):
         ended: status when the camera waits again.
         last: answer to the Query after the trigger.
         application: the application that both answers name.
-        bits: bits of the last status, equal to those of the status before.
+        bits: bits of the last status, equal to the bits of the status before.
         endian: byte order in both statuses.
     """
 

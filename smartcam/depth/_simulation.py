@@ -28,7 +28,8 @@ BASELINE: Final = 0.05
 """Metres between the two cameras that see depth."""
 
 DISPARITY_SIGMA: Final = 0.1
-"""Noise of a disparity, pixels: that of a depth is ``Z^2 / (FOCAL * BASELINE)`` times as much."""
+"""Noise of a disparity, pixels: the noise of a depth is ``Z^2 / (FOCAL * BASELINE)`` times as
+much."""
 
 CAMERA_SIGMA: Final = 2e-4
 """Standard deviation of the camera's place at the hand, metres on each axis."""

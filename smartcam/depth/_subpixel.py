@@ -219,7 +219,7 @@ def _fitted(
     """
     # With the right picture's row taken at u - d_q, L - R_q = b + c R_q - g (D + s (q - p) - d_q)
     # + noise for all q of the window around p: linear in D, b and the gain less 1, c. g is the mean
-    # of both pictures' slopes, whose noise does not go with that of their difference.
+    # of both pictures' slopes, whose noise is not correlated with the noise of their difference.
     e, g, level, mask = linear
     gg, rg, constant = g * g, g * level, e - g * disparity
     n = np.maximum(sums(mask), 1)
@@ -294,7 +294,7 @@ def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
-    # one constant and gain for the whole picture, since those of windows would absorb noise
+    # one constant and gain for the whole picture, since values for each window would absorb noise
     level = (fit.linear.r - (fit.linear.r * mask).sum() / np.maximum(mask.sum(), 1)) * mask
     e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
     e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))

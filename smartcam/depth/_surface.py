@@ -20,7 +20,7 @@ MIN_INFORMATION_FACTOR: Final = 12.0
 """Least ratio of a direction's information to that from noise of the normals alone.
 
 On simulated clouds the ratio is 0.8 to 1.4 for the free directions of planes, edges and corridors,
-up to 11 for those of cylinders and spheres, and 29 or more in a corner.
+up to 11 for the free directions of cylinders and spheres, and 29 or more in a corner.
 """
 
 

@@ -151,9 +151,9 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
-"""The checks in their order, after those of the wire or of the fleet. The limits only matter for an
-internal error, since each step has a bound of its own. Their sum, and a second for the end of the
-session, bounds the whole."""
+"""The checks in their order, after the checks of the wire or of the fleet. The limits only matter
+for an internal error, since each step has a bound of its own. Their sum, and a second for the end
+of the session, bounds the whole."""
 
 
 async def examine(

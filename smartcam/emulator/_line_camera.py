@@ -1,4 +1,4 @@
-"""Emulate cameras that use lines of text: the base for those of plug-ins, and for In-Sight's."""
+"""Emulate cameras that use lines of text: the base for cameras of plug-ins, and for In-Sight's."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ OWN_PARAMETERS = ("fps", "name", "timeout")
 class InSightDriver(FrameDriver):
     """A source that polls the last picture of a smart camera: ``insight://admin@HOST?fps=2``.
 
-    Further parameters are those of the camera's URL in :func:`smartcam.connect`. The session with
+    Further parameters are as in the camera's URL in :func:`smartcam.connect`. The session with
     the camera exists only while there are readers.
 
     - ``fps``: requests per second; by default 2.

@@ -89,7 +89,7 @@ Seconds = Annotated[float, Field(gt=0, le=MAX_SECONDS, allow_inf_nan=False)]
 
 
 class GatewaySettings(BaseModel):
-    """The settings of a gateway; options without a value are those of the robot's make."""
+    """The settings of a gateway; options without a value get the values of the robot's make."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
 

@@ -84,7 +84,7 @@ class Code(enum.StrEnum):
     WRONG_SIZE = "WRONG_SIZE"
     """An image of another size than the camera's, or than the other images."""
     DIFFERENT_TARGETS = "DIFFERENT_TARGETS"
-    """Views of several targets where those of one are expected."""
+    """Views of several targets instead of a single one."""
     BAD_VIEW = "BAD_VIEW"
     """A view that fits far worse than the others and is left out."""
     SWAPPED_SIDES = "SWAPPED_SIDES"

@@ -1,4 +1,4 @@
-"""Patterns of places in rows, columns and layers, such as those of parts on a pallet."""
+"""Patterns of places in rows, columns and layers, such as the places of parts on a pallet."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class PlacePattern(Sequence[Transform]):
     @overload
     def __getitem__(self, index: slice) -> list[Transform]: ...
     def __getitem__(self, index: int | slice) -> Transform | list[Transform]:
-        """Return the pose of a place by its number, from 0, or those of several."""
+        """Return the pose of a place by its number, from 0, or the poses of several places."""
         if isinstance(index, slice):
             return [self._place(number) for number in range(len(self))[index]]
         return self._place(range(len(self))[index])

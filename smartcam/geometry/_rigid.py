@@ -5,7 +5,7 @@ their exponential and logarithm are those of SciPy's ``Rotation``.
 
 A small step ``(w, d)`` is a rotation vector and a shift. The shift is always added to ``t``, along
 the axes of the target frame. The turn is on either side of R: ``exp([w]x) R`` turns about the
-target frame's axes, ``R exp([w]x)`` about those of the source frame.
+target frame's axes, ``R exp([w]x)`` about the source frame's axes.
 """
 
 from __future__ import annotations

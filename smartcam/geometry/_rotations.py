@@ -1,7 +1,8 @@
 """Rotations, frames and lines in space, over arrays.
 
 Right-handed, metres, radians. Quaternions are Hamilton's of unit length with the real part last,
-arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of b into those of a.
+arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of b into coordinates
+of a.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _DEFAULTS: dict[str, Any] = {
 }
 """Defaults of the fields that a layout may leave out, except ``z``.
 
-The order is that of the default layout.
+Their order is as in the default layout.
 """
 
 _QUANTITIES = {

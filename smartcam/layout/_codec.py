@@ -218,7 +218,7 @@ class RecordCodec:
         """Return the values of one record in the order of the fields.
 
         ``value``: mapping, record, or sequence of the values in order. ``label`` names a record in
-        errors. ``forced``: values of some fields that override those of ``value``. Raises
+        errors. ``forced``: values of some fields that override values of ``value``. Raises
         ConfigurationError if a field is missing or unknown, or if there are too few or too many
         values.
         """
@@ -300,7 +300,7 @@ def _offsets(fields: tuple[Field, ...]) -> list[int]:
 
 
 def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | None:
-    """Return the converter of a single wire value, and that of a column of values.
+    """Return the converter of a single wire value, and the converter of a column of values.
 
     A converter is None if values stay as they are. For columns, a comprehension takes a third of
     the time of a function call per value.

@@ -55,7 +55,7 @@ class Outlets(Server):
 
     Args:
         section: settings by the outlet's name.
-        folder: folder to which relative paths refer, those of spools, secrets and stores.
+        folder: folder to which relative paths refer, such as paths of spools, secrets and stores.
         columns: function that returns names, types and units of an application's values, by its
             layout.
         command: function that carries out a command from an outlet.

@@ -131,7 +131,7 @@ class LineDialect(Dialect):
     """A dialect of lines.
 
     Args:
-        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
+        name, about, source, quirks: as for :class:`~smartcam.protocols.Dialect`.
         rows: requests and answers; ``Connect`` and ``Query`` are needed.
         ids: the ids that applications may have.
         line_end: end of each line, one or two bytes.

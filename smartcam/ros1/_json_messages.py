@@ -1,6 +1,6 @@
 """Messages for a rosbridge: JSON with the fields of each type in ROS 1.
 
-The types are those of ROS 2. The tables of this module have ROS 1's other names; bytes are base64.
+The types are ROS 2's. The tables of this module have ROS 1's other names; bytes are base64.
 """
 
 from __future__ import annotations

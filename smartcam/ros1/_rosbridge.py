@@ -53,9 +53,10 @@ class RosbridgeNode(NamedNode):
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         bridge: the bridge's URL, ``ws://host:9090``.
-        types: the known messages and services; None for those of Jazzy. Topics and services of
+        types: the known messages and services; None for Jazzy's. Topics and services of
             types that ROS 1 does not have are left out, and logged.
-        backoff: delays between attempts to connect; None: those of :class:`smartcam.Backoff`.
+        backoff: delays between attempts to connect; None: the defaults of
+            :class:`smartcam.Backoff`.
         on_change: function called in the event loop when the bridge was connected or lost.
 
     Raises:
@@ -215,7 +216,7 @@ class RosbridgeNode(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields. The text of an error becomes the response's field ``error``,

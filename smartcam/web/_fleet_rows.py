@@ -380,7 +380,7 @@ def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
 
     Args:
         value: value in its JSON form.
-        units: SI unit of the value, or those of its fields by their names.
+        units: SI unit of the value, or the units of its fields by name.
         shown: units in which the line shows numbers.
     """
     if isinstance(value, dict):

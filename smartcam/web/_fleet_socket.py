@@ -24,7 +24,7 @@ PROTOCOL: Final = "smartcam.fleet"
 """Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
-"""Largest number of rows that may be in sight: three times those of a tall screen."""
+"""Largest number of rows that may be in sight: three times the rows of a tall screen."""
 
 MAX_SEARCH_CHARACTERS: Final = 100
 """Largest number of characters of a search text."""

@@ -303,7 +303,7 @@ def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
 def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
     """Return a value for the page: parts to draw, or JSON, which is cut if it is long.
 
-    ``units`` are those of its fields, and of the fields of its lists. ``layout``: that of a table.
+    ``units``: units of its fields, and of the fields of its lists. ``layout``: layout of a table.
     """
     if isinstance(value, list) and all(isinstance(part, Localization) for part in value):
         localizations: list[Localization] = value

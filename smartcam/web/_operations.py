@@ -176,7 +176,7 @@ def _guarded(names: Collection[str] | None) -> Any:
     """Return the middleware of all handlers: the connection's place, the guard, refusals as text.
 
     Args:
-        names: names of this machine that requests may use; None: only those of loopback.
+        names: names of this machine that requests may use; None: only loopback names.
     """
 
     @web.middleware

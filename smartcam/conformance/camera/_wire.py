@@ -87,7 +87,7 @@ class RawDialect:
 
     @property
     def is_bid(self) -> bool:
-        """True if the dialect is that of BVS ID."""
+        """True if the dialect is BVS ID's."""
         return self.dialect.name == "bid"
 
     # ------------------------------------------------------------------ out

@@ -59,7 +59,7 @@ class Respond(Protocol):
 
 
 class InSightCommands:
-    """A camera's commands; the arguments are those of the emulator.
+    """A camera's commands; the arguments are the emulator's.
 
     Raises:
         ConfigurationError: an argument is wrong.

@@ -546,7 +546,7 @@ class Agent:
     # ------------------------------------------------------------------ calls
 
     def _calls_of(self, role: str | None, camera: str) -> str:
-        """Return the key of the questions of a role; with None that of commands."""
+        """Return the key of the questions of a role; with None the key of commands."""
         keys = self._keys
         return (
             keys.command(self.name, camera) if role is None else keys.ask(role, self.name, camera)

@@ -110,7 +110,7 @@ class AgentBundle:
         return self._out is not None and self._out.has_subscribers
 
     def add(self, camera: str, runs: bytes) -> None:
-        """Add a camera's results, which are sent soon with those of others."""
+        """Add a camera's results, which are sent soon with results of other cameras."""
         name = camera.encode()
         self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
         self._count += 1

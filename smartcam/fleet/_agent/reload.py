@@ -336,7 +336,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
 
 
 def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
-    """Refuse cameras whose names are those of cameras that programs have added.
+    """Refuse cameras with the name of a camera that a program has added.
 
     Raises:
         ConfigurationError: a program has added a camera of the same name.

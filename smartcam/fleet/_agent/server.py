@@ -557,7 +557,7 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    # with roles each program needs a certificate of its own: that of the agent may not command
+    # with roles each program needs a certificate of its own: the agent's own may not command
     own_authority = scheme == "fleet+tls" and file.access == "any-certificate"
     certificates = file.certificates if own_authority else None
     # a router of several agents may have several fleets

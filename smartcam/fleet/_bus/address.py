@@ -94,7 +94,7 @@ class FleetAddress(NamedTuple):
         fleet: name of the fleet; None: the only one.
         camera: name of the camera; empty for the fleet.
         certificates: folder with the certificates of this program, for ``fleet+tls``.
-        program: name of this program for people, such as ``robot1``; None: that of its script.
+        program: name of this program for people, such as ``robot1``; None: the script's name.
     """
 
     scheme: str

@@ -120,7 +120,7 @@ class Bus(abc.ABC):
         Args:
             key: key of the messages.
             on_subscribers: callback for whether the key has subscribers, when that changes.
-            urgent: whether messages wait in one line with those of :meth:`put`; else after them.
+            urgent: whether messages wait in one line with messages of :meth:`put`; else after them.
         """
 
     @abc.abstractmethod

@@ -283,7 +283,7 @@ class Feed(Generic[NumberedT]):
             self._lacks()
 
     def _now_held(self) -> collections.deque[NumberedT]:
-        """Return the messages held for this epoch; those of the next one wait for begin()."""
+        """Return the messages held for this epoch; messages of the next epoch wait for begin()."""
         return self._held if self._held_epoch == self.epoch else collections.deque()
 
     def _hold(self, epoch: int, thing: NumberedT) -> None:

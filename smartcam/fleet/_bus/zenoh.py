@@ -466,7 +466,7 @@ class ZenohEnd(ZenohSession, Bus):
         Args:
             publisher: the engine's publisher; None while its session is not open yet.
             payload: the message.
-            urgent_key: key of the message if it waits in one line with those of :meth:`put`.
+            urgent_key: key of the message if it waits in one line with messages of :meth:`put`.
         """
         session = self._session
         if publisher is None or session is None:

@@ -23,8 +23,8 @@ _NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
 class FleetFrameDriver(SharedFrameDriver):
     """Frames of a fleet's camera: ``fleet://HOST/CAMERA?encoding=jpeg&quality=15``.
 
-    ``bitrate`` and ``latency`` are those of :meth:`smartcam.Camera.frames`. The other parameters
-    are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
+    ``bitrate`` and ``latency`` have the meaning of :meth:`smartcam.Camera.frames`. The other
+    parameters are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
     """
 
     def __init__(self, address: FrameAddress) -> None:

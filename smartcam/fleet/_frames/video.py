@@ -31,7 +31,7 @@ class VideoUnit(NamedTuple):
     """An encoded frame.
 
     Attributes:
-        number: number of the unit, one more than that of the unit before.
+        number: number of the unit, one more than the number of the unit before.
         frame: the encoded frame.
         took: seconds to encode it.
         key: whether the unit can be decoded without the units before it.

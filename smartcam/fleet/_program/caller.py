@@ -556,7 +556,7 @@ class Caller:
         agent: str,
         met: Met | None,
     ) -> Reply:
-        """Send a call, and return the reply; ``deadline`` is that of this side."""
+        """Send a call, and return the reply; ``deadline`` is this side's."""
         self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self, deadline)

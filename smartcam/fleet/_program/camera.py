@@ -101,7 +101,7 @@ class FleetCamera(Camera[ValueT]):
     names it. It is then unknown whether a running call was carried out.
 
     Args:
-        settings: validated options; those of the session with the camera are the agent's.
+        settings: validated options; options of the session with the camera are the agent's.
         camera: name of the camera in the fleet.
         program: program with an end of the bus.
         shared: whether other cameras use that end, too; then it is not closed with this camera.
@@ -414,7 +414,7 @@ class FleetCamera(Camera[ValueT]):
         self._listeners.publish(ReservationLost(camera=self.name, at=at, by=in_words(program)))
 
     def agent_left(self, agent: str) -> None:
-        """End the session, if it is that of an agent that no longer shares the camera."""
+        """End the session of an agent that no longer shares the camera."""
         self._caller.agent_left(agent)
 
     def _on_lost(self, error: LinkError) -> None:

@@ -1,4 +1,4 @@
-"""A fleet at a program: all its cameras, or those of a pattern."""
+"""A fleet at a program: all its cameras, or the cameras of a pattern."""
 
 from __future__ import annotations
 

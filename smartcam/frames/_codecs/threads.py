@@ -107,7 +107,7 @@ class Codecs:
         """Return a frame as a JPEG, format ``MJPEG``.
 
         Grey stays grey. Y, U and V are encoded as they are, only widened to JPEG's full range;
-        those of BT.709 are converted through RGB. A JPEG is encoded again. Four pixels of a
+        U and V of BT.709 are converted through RGB. A JPEG is encoded again. Four pixels of a
         coloured frame share U and V (4:2:0); YUV formats keep their own subsampling.
 
         Args:

@@ -18,7 +18,7 @@ from xml.parsers import expat
 from smartcam.exceptions import MessageError
 
 MAX_PLAIN_BYTES: Final = 16 << 20
-"""Largest size of an unpacked description, bytes; those of large cameras have 2 MB."""
+"""Largest size of an unpacked description, bytes; descriptions of large cameras have 2 MB."""
 
 MAX_PACKED_BYTES: Final = 4 << 20
 """Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. An archive can
@@ -28,7 +28,7 @@ MAX_LEVELS: Final = 32
 """Largest depth of nested elements of a description."""
 
 MAX_ELEMENTS: Final = 400_000
-"""Largest number of elements of a description; those of a ``StructReg`` count for each entry."""
+"""Largest number of elements of a description; elements of a ``StructReg`` count for each entry."""
 
 
 class Location(NamedTuple):

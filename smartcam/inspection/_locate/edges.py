@@ -35,7 +35,8 @@ MAX_LINE_DISTANCE_PX: Final = 1.0
 """Largest distance of a segment's points from a straight line through its middle, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle, radians, between the direction of a segment's point and that of its middle."""
+"""Largest angle, radians, between the direction of a segment's point and the direction of its
+middle."""
 
 MIN_POINTS: Final = 4
 """Least number of points of a segment."""

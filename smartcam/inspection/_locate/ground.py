@@ -144,7 +144,8 @@ def _solved(columns: Array, pixels: BandPixels, known: Array) -> tuple[Array, Ar
     """Return the values (N, K) of bands, and their covariance for noise of one grey level.
 
     Besides, the pixels' variance about them, 0 where a band has too few, and degrees of freedom.
-    ``known`` (N, K): the variance of the noise in parts of that of each value; 0: it is unknown.
+    ``known`` (N, K): the variance of the noise relative to the variance of each value; 0: it is
+    unknown.
     """
     owners, (count, size) = pixels.owners, known.shape
     number = np.bincount(owners, minlength=count).astype(np.float64)

@@ -42,7 +42,7 @@ MAX_FILE_BYTES: Final = 1 << 24
 """Largest number of bytes of an outline's file."""
 
 MAX_POINTS: Final = 200_000
-"""Largest number of corners of an outline, those of curves included."""
+"""Largest number of corners of an outline, including corners of curves."""
 
 MAX_NESTED: Final = 30
 """Largest depth of nested groups in SVG."""

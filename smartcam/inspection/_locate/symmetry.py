@@ -27,7 +27,7 @@ OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle between the direction of a turned edge and that of the edge that it lies on."""
+"""Largest angle between the direction of a turned edge and the direction of the edge below it."""
 
 CENTRE_STEPS: Final = 6
 """Number of iterations that find the centre of a part's turns."""
@@ -91,7 +91,7 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
     ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
     is measured to a fraction of a pixel.
 
-    The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
+    The place (2,) is the centre of a symmetric part; for other parts the reference, (0, 0).
     """
     shares = _shares(points, normals)
     best, most = Symmetry(1, _alike(shares, 1)), MIN_ALIKE_SHARE

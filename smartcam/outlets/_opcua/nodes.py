@@ -355,7 +355,7 @@ class CameraNodes:
                 await self._write(path, value)
 
     async def _make_columns(self, folder: str, columns: Sequence[Column]) -> None:
-        """Make a variable for each value, in place of those of an earlier layout."""
+        """Make a variable for each value, in place of the variables of an earlier layout."""
         node = self._node(f"Plain.{folder}")
         if folder in self._columns:
             await self._server.delete_nodes([node], recursive=True)

@@ -81,7 +81,7 @@ NO_STATUS = Status(0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusBits:
-    """The meaning of the bits in a dialect's status word; by default, those of Status.
+    """The meaning of the bits in a dialect's status word; by default, the meaning of Status.
 
     Attributes:
         named: bit on the wire to the status bit that means the same.

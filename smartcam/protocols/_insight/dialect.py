@@ -85,7 +85,7 @@ class InSightDialect(Dialect):
     """In-Sight native mode.
 
     Args:
-        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
+        name, about, source, quirks: as for :class:`~smartcam.protocols.Dialect`.
         user: name of the user to log in.
         password: password of that user.
         cells: cells that are read after each trigger, in order, as commands name them.

@@ -86,7 +86,7 @@ def write_bag(
 
 @dataclass(eq=False)
 class BagConversion:
-    """Converts a recording to a bag in steps of one item; the fields are those of `write_bag`."""
+    """Converts a recording to a bag item by item; the fields are arguments of `write_bag`."""
 
     recording: Recording
     folder: Path

@@ -1,6 +1,6 @@
 """A rosbag2: a folder with an MCAP file of ROS 2 messages and a ``metadata.yaml`` about it.
 
-The contents of both are those of rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
+The contents of both are as in rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
 (profile ``ros2``, schemas ``ros2msg``, ``offered_qos_profiles`` and ``topic_type_hash`` with each
 channel, a metadata record ``rosbag2``), ``yaml.hpp`` and ``qos.cpp`` of rosbag2_storage (the rest).
 The format is version 8, with the policies as numbers in a text: version 9 has their names in a

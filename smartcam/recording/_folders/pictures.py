@@ -45,7 +45,7 @@ class FleetPictures:
     Args:
         server: agent of the cameras.
         writer: writer of the recordings.
-        all_of_them: whether every picture is recorded, or only those of results.
+        all_of_them: whether every picture is recorded, or only pictures of results.
     """
 
     def __init__(self, server: FleetServer, writer: FolderWriter, *, all_of_them: bool) -> None:

@@ -91,7 +91,7 @@ class RecordedDriver(TaskDriver):
         """Find the first picture.
 
         Raises:
-            FrameFormatError: the recording has no pictures, or those of several cameras.
+            FrameFormatError: the recording has no pictures, or pictures of several cameras.
             FrameSourceError: the path does not exist, or is no recording of smartcam.
         """
         first = await asyncio.to_thread(self._first)
@@ -142,7 +142,7 @@ class RecordedDriver(TaskDriver):
     # ------------------------------------------------------------------ playing
 
     def _pictures(self) -> Iterator[RecordedPicture]:
-        """Yield the camera's pictures; those of a gap count as left out."""
+        """Yield the camera's pictures; pictures of a gap count as left out."""
         gap = 0
         for item in each_item(self._path, lambda text: _log.warning("%s", text)):
             if item.camera != self._camera:

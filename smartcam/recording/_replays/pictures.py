@@ -174,7 +174,7 @@ class _ResultPictures(FrameDriver):
         return StreamFormat(first.format, first.width, first.height)
 
     async def start(self, sink: FrameSink) -> None:
-        """Deliver the picture of the last result, and those of the next ones."""
+        """Deliver the picture of the last result, and the pictures of the next results."""
         self._sink = sink
         self._pictures.sinks.add(sink)
         if self._pictures.shown is not None:

@@ -160,9 +160,9 @@ class _PlayedApplication(Application):
 class ReplayedCamera(EmulatedCamera):
     """An emulated camera that replays a recording.
 
-    Its application is that of the first container, and runs if there are containers. After the end
-    of the recording, triggers get no result and no containers are sent, unless ``loop``. All
-    containers are kept in memory.
+    It begins with the application of the first container, and runs if there are containers. After
+    the end of the recording, triggers get no result and no containers are sent, unless ``loop``.
+    All containers are kept in memory.
 
     Args:
         recording: recording to replay.

@@ -358,7 +358,7 @@ _BY_AGENT = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
     """Return steps with times that fit their order.
 
-    The times of results are on the agent's clock, those of other events on the program's.
+    The times of results are on the agent's clock, the times of other events on the program's.
     """
     least, most = -math.inf, math.inf  # bounds of the difference between the clocks
     by_program, by_agent = -math.inf, -math.inf  # the last times

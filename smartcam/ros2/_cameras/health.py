@@ -1,6 +1,6 @@
 """Convert a camera's health to ROS: its status, and its diagnostics.
 
-A node publishes the health of its camera, a bag that of a recorded camera.
+A node publishes the health of its camera, a bag the health of a recorded camera.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Convert pictures to ROS' messages and back, without a node.
 
-The names of encodings are those of ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
+The names of encodings are from ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
 in millimetres, 0 for no depth, or 32FC1 in metres, NaN for no depth.
 """
 

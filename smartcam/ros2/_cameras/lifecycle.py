@@ -58,7 +58,7 @@ class CameraLifecycle(Lifecycle):
     Args:
         camera: camera of the node.
         node: node of ROS 2, or of ROS 1, which has no services of a life cycle.
-        application: id of the application to load and run; None: that of the settings.
+        application: id of the application to load and run; None: the settings' application.
         autostart: whether the node goes to Active by itself.
     """
 

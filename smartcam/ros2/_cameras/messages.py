@@ -50,7 +50,7 @@ class ResultMessages:
 
     Args:
         types: types of the messages, from the node that publishes them.
-        camera: name of the camera, which is also its frame: that of poses without a calibration.
+        camera: name of the camera, which is also the frame of poses without a calibration.
         frame_id: name of the camera's frame in ROS.
         calibration: calibration of the camera's settings, which names the robot's frame.
         robot_frame: name of the robot's frame in ROS; empty: the calibration's own.

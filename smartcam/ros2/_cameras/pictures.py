@@ -53,7 +53,7 @@ class CameraPictures:
         frame_id: the optical frame, z ahead and y down (REP-103); "": the node's name with
             ``_optical``.
         camera_info_url: the file of the lens, ``file:///PATH`` or a path, which need not exist
-            yet; "": no file, and the lens is that of the frames.
+            yet; "": no file, and the frames' lens is used.
         quality: quality of JPEGs, 1 to 100.
 
     Raises:

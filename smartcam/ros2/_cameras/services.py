@@ -1,4 +1,4 @@
-"""The services of a camera's node: the thesis' eleven, those of std_srvs, and a typed trigger.
+"""The services of a camera's node: the thesis' eleven, services of std_srvs, and a typed trigger.
 
 If the reply has a field for an error, a call with an error gets a reply.
 """
@@ -41,10 +41,10 @@ CLOSE_TIMEOUT: Final = 5.0
 
 
 class CameraServices:
-    """Serves a camera to other nodes, whose calls are like those of any program.
+    """Serves a camera to other nodes, whose calls are handled like any program's.
 
-    Simultaneous calls are like those of two programs: one trigger after the other, each within its
-    own timeout. A call ends when its caller is lost, and the camera stays usable.
+    Simultaneous calls are handled like calls of two programs: one trigger after the other, each
+    within its own timeout. A call ends when its caller is lost, and the camera stays usable.
 
     Args:
         camera: the camera.

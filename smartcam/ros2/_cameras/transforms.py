@@ -32,7 +32,7 @@ class CameraFrames:
     """The names of a camera's frames, for its messages and ``/tf_static``.
 
     Args:
-        frame_id: name of the camera's frame, that of its results without a calibration.
+        frame_id: name of the camera's frame, the frame of its results without a calibration.
         calibration: calibration of the camera's settings, or one for each application; None
             without.
         place: hand-eye calibration of the camera; None without.

@@ -52,7 +52,7 @@ class NativeNode(NamedNode):
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         context: context shared with other nodes of this process; None for its own.
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``.
         managed: whether the node has a life cycle, which :meth:`manage` then has to follow.
 
     Attributes:
@@ -274,7 +274,7 @@ class NativeNode(NamedNode):
         Args:
             topic: name of the topic, absolute, relative to the namespace, or private (``~/it``).
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service; its depth is that of the queue.
+            qos: quality of service; its depth is the queue's length.
 
         Raises:
             ConfigurationError: the topic is not valid, or the type is not built for this ROS.
@@ -296,7 +296,7 @@ class NativeNode(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields.
@@ -317,7 +317,7 @@ class NativeNode(NamedNode):
         """Return a client that calls a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             qos: quality of service; ROS' own for services is used.
 

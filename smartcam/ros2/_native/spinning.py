@@ -45,7 +45,7 @@ class NativeContext:
     """The context of rclpy that nodes share, opened by the first node.
 
     Args:
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the distribution whose messages are used; "": that of the installed
             ROS, as far as it is known.
         args: arguments for ROS, such as ``--ros-args -p use_sim_time:=true``.

@@ -77,7 +77,7 @@ class RosContext:
         session: open session of Zenoh, which stays open; None for an own session.
         connect: endpoints that an own session connects to.
         listen: endpoints that an own session listens on, which makes it the router.
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the ROS distribution whose messages and type hashes are used.
 
     Raises:

@@ -177,7 +177,7 @@ class Node(NamedNode):
         Args:
             topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service; its depth is that of the queue.
+            qos: quality of service; its depth is the queue's length.
 
         Raises:
             ConfigurationError: the topic is not valid, or there is no such type.
@@ -199,7 +199,7 @@ class Node(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields; its error is logged, and is in the response if that has
@@ -221,7 +221,7 @@ class Node(NamedNode):
         """Return a client that calls a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             qos: quality of service.
 

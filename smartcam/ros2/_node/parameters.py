@@ -83,7 +83,7 @@ class _ParameterChange(NamedTuple):
 class RosParameters:
     """The parameters of a node; other nodes list, get, describe and set them while it is open.
 
-    The type of a parameter is that of its first value: ``bool``, ``int``, ``float``, ``str``,
+    The first value gives the type of a parameter: ``bool``, ``int``, ``float``, ``str``,
     ``bytes``, or a list of one of the first four; an ``int`` is not accepted for a ``float``.
 
     Args:

@@ -98,7 +98,7 @@ class MessageType:
 
     @cached_property
     def text(self) -> str:
-        """The definition and those of all nested types, in recordings' form (``ros2msg``)."""
+        """The definitions of the type and all nested ones, in recordings' form (``ros2msg``)."""
         within = description(self._definition, self._types.definition)
         parts = [self._definition.text()]
         for referenced in within["referenced_type_descriptions"]:

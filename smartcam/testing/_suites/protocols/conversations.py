@@ -31,7 +31,7 @@ class Sent(NamedTuple):
 
     Attributes:
         message: the message.
-        wire: the bytes written for it; those of several datagrams one after the other.
+        wire: the bytes written for it; bytes of several datagrams one after the other.
     """
 
     message: Message
