@@ -43,7 +43,7 @@ class Registry:
 
     Args:
         group: entry-point group, as in ``[project.entry-points."smartcam.interpreters"]``.
-        builtins: name to ``module:attribute`` of those that smartcam brings.
+        builtins: name to ``module:attribute`` of the plug-ins in smartcam.
         aliases: other accepted names of built-ins.
 
     Attributes:

@@ -287,7 +287,7 @@ def known_protocols() -> Iterator[Protocol]:
             if info.origin == "built-in":
                 raise
             continue  # a broken plug-in is only left out
-        if hasattr(protocol, "schemes"):  # so is one that provides something else
+        if hasattr(protocol, "schemes"):  # so is a plug-in that provides something else
             yield protocol
 
 
@@ -409,7 +409,7 @@ def _as_usual(option: str, value: Any) -> Any:
 
 
 def _validated(given: dict[str, Any]) -> dict[str, Any]:
-    """Return options as pydantic's model reads them, which judges all that is unusual.
+    """Return options as pydantic's model reads them, which judges unusual values.
 
     Raises:
         ConfigurationError: names the option, the given value and the expected one.

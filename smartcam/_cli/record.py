@@ -550,7 +550,7 @@ async def bag(
     with contextlib.closing(conversion.steps()) as steps:
         for place, _ in enumerate(steps):
             if not place % 32:
-                await asyncio.sleep(0)  # a place where it can be cancelled
+                await asyncio.sleep(0)  # a place at which the task can be cancelled
     counts = conversion.counts
     if counts.unread:
         click.echo(

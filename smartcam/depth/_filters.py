@@ -69,7 +69,7 @@ def _as_float32(ends: ArrayLike) -> NDArray[np.float32]:
 
 @takes(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
-    """Return the points without those that are unusually far from their neighbours.
+    """Return the points without points that are unusually far from their neighbours.
 
     A point stays if its mean distance to its ``neighbours`` nearest points is at most ``ratio``
     standard deviations above the mean of these distances. An empty cloud is returned as it is.

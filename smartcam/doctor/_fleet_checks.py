@@ -195,7 +195,7 @@ async def find(exam: Examination) -> None:
 
 
 async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
-    """Return fleet, agent and name of all cameras, including those that have just appeared."""
+    """Return fleet, agent and name of all cameras, including cameras that have just appeared."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
         raise LookupError("there is no bus; checks that use it run after the check that reaches it")

@@ -75,7 +75,7 @@ class FoundPort:
 
 
 def tcp_protocols() -> dict[str, Protocol]:
-    """Return the protocols over TCP, by name; those that cannot be loaded are left out."""
+    """Return the protocols over TCP, by name; protocols that cannot be loaded are left out."""
     protocols: dict[str, Protocol] = {}
     for info in PROTOCOLS.available():
         try:

@@ -139,7 +139,7 @@ class ClientLink(ABC):
         self._faulty: FaultyLink | None = None  # set while faults act
 
     def send(self, message: m.Message) -> None:
-        """Add a message to those that :meth:`flush` will write."""
+        """Add a message to the messages that :meth:`flush` will write."""
         if self._owner.queue.on_camera and self._faulty is None:
             self._enter_faulty()
         try:

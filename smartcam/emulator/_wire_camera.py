@@ -411,7 +411,7 @@ class WireCamera(Server):
     # ------------------------------------------------------------------ faults
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
-        """Add faults after those that wait; faults that wait for no message happen now.
+        """Add faults after the waiting ones; faults that wait for no message happen now.
 
         Call it in the event loop's thread. Before the emulator's start they wait for it.
 
@@ -438,7 +438,7 @@ class WireCamera(Server):
         self._timeline.command(check_text(name, "name", "command", most=200))
 
     def clear_faults(self) -> None:
-        """Forget the faults that wait, and end those that last.
+        """Forget waiting faults, and end lasting ones.
 
         BUSY is cleared, the port opens, the second client leaves, connections that are half open or
         stalled are reset. Delayed messages come at their time, and a reboot takes its time.
@@ -476,7 +476,7 @@ class WireCamera(Server):
         self._act(self.queue.at_once(), None)
 
     def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
-        """Run the device faults that come before a message; return all that it triggers."""
+        """Run the device faults that come before a message; return all triggered faults."""
         if not waiting:
             return ()
         faults = self.queue.by_message(waiting, message)

@@ -176,7 +176,7 @@ class RobotRequests:
         self._has_given = False
 
     def failed(self, words: str) -> RobotAnswer:
-        """Return the answer that replaces one that cannot be written; the result is forgotten."""
+        """Return the answer instead of one that cannot be written; the result is forgotten."""
         self.forget()
         self._last = RobotAnswer(AnswerCode.UNREADABLE, words=words)
         return self._last

@@ -109,7 +109,7 @@ class ResultStore(Outlet[StoreSettings]):
         await _done(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, all or none; before an unfit entry, write those that precede it."""
+        """Write entries, all or none; before an unfit entry, write the preceding ones."""
         file = self._file
         if file is None:
             raise sqlite3.OperationalError("the store is closed")
@@ -312,7 +312,7 @@ class _StoreFile:
         known: dict[str, str],
         wanted: Column,
     ) -> None:
-        """Add the column of a value to those that are known, created if needed."""
+        """Add the column of a value to the known columns, created if needed."""
         name, kind, unit = wanted
         rows = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)

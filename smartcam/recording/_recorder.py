@@ -429,7 +429,7 @@ class Recorder(Observer):
             on_start: function that is called when the first picture was added.
 
         Returns:
-            Counts of delivered and lost pictures; ``skipped`` counts those that were left out.
+            Counts of delivered and lost pictures; ``skipped`` counts pictures that were left out.
 
         Raises:
             ConfigurationError: an argument is wrong.

@@ -235,7 +235,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.inject, *faults)
 
     def clear_faults(self) -> None:
-        """Remove the faults that wait, and end those that go on."""
+        """Remove waiting faults, and end lasting ones."""
         self._thread.run(self._emulator.clear_faults)
 
     def command(self, name: str) -> None:

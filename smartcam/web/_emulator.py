@@ -303,7 +303,7 @@ def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", f"{_CAMERA}/faults")
 def _faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Faults that wait, and the last ones that have happened."""
+    """Waiting faults, and the last past ones."""
     return serialize.faults_state(_emulator(site, call))
 
 
@@ -318,7 +318,7 @@ def _inject(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("DELETE", f"{_CAMERA}/faults")
 def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Forget the faults that wait, end those that last."""
+    """Forget waiting faults, and end lasting ones."""
     _emulator(site, call).clear_faults()
     return _faults(site, call)
 

@@ -137,7 +137,7 @@ class FleetRow:
     # ------------------------------------------------------------------ following a camera
 
     def follow(self, camera: FleetCamera[Any]) -> None:
-        """Follow a camera object, which may replace one that was given up."""
+        """Follow a camera object, which may replace a camera that was given up."""
         if self.camera is camera:
             return
         self.leave()

@@ -225,7 +225,7 @@ def _byte_order(device: Device) -> ByteOrder:
 
 
 def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
-    """Return the faults that wait and the last ones that have happened."""
+    """Return the waiting faults and the last past ones."""
     waiting, fired = emulator.faults, list(emulator.fired)
     last = (fault.fault for fault in reversed(fired))
     return {

@@ -97,7 +97,7 @@ class DelayLine(Generic[T]):
     clock: Clock
     _: KW_ONLY
     # with an order (TCP), nothing passes a waiting transmission unless it may be overtaken, and
-    # all that pass at one time are carried together; without it (UDP) each part goes by itself
+    # all transmissions of one time are carried together; without it (UDP) each part goes by itself
     ordered: bool
     wake: Callable[[], None]  # called when run() is due
     # gets passing transmissions and the bytes of each, for one write; it may stop() the line

@@ -24,7 +24,7 @@ class Stage:
     device: Any
     refuse: Callable[[float], None]  # closes the port for a number of seconds
     let_second_client_in: Callable[[], None]  # lets another client connect
-    clear: Callable[[], None]  # forgets the faults that wait, and ends those that last
+    clear: Callable[[], None]  # forgets waiting faults, and ends lasting ones
 
 
 def _condition(stage: Stage, fault: f.Condition) -> None:

@@ -105,7 +105,7 @@ class WireMessage(Transmission):
 
     @property
     def wire(self) -> bytes | None:
-        """The bytes that passed, None if they are those that were meant."""
+        """The bytes that passed, None if no fault changed them."""
         return None if self.passed == self.original else bytes(self.passed)
 
     def place(self, offset: int) -> tuple[int, int]:

@@ -442,7 +442,7 @@ class Host:
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
-        """Keep results that came together, and send them soon, with those that come meanwhile."""
+        """Keep results that arrived together, and send them soon with later ones."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)

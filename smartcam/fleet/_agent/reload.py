@@ -33,7 +33,7 @@ REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet
 """Reasons why a reload ends a camera, for the camera's programs."""
 
 READ_TIMEOUT = 10.0
-"""Seconds for reading a file and those that it names; they may be on a network drive."""
+"""Seconds for reading a file and the files that it names; they may be on a network drive."""
 
 LIVE = frozenset({"cameras"})
 """Fields of a fleet file that are changed while the agent runs; the others need a restart."""

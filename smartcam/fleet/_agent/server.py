@@ -66,7 +66,7 @@ class FleetServer(Server):
 
     Args:
         file: path of a fleet file, or the contents of one.
-        bus: end of a bus to use instead of the one that the file describes.
+        bus: end of a bus to use instead of the bus in the file.
         folder: folder of the file's relative paths, if ``file`` is not a path itself.
         restore: whether application and run state of a camera are restored after a reconnect, if
             its entry does not set that; None: if ``ros2`` in the file has nodes that become active
@@ -120,7 +120,7 @@ class FleetServer(Server):
         section = self.file.ros2
         self._restore = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # settings of cameras for ROS, also of those that a reload adds
+        # settings of cameras for ROS, also of cameras that a reload adds
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}

@@ -166,7 +166,7 @@ class Bus(abc.ABC):
 
     @abc.abstractmethod
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
-        """Call ``on_presence(key, present)`` for present ends, and for those that come and go."""
+        """Call ``on_presence(key, present)`` for present ends, and for later changes."""
 
 
 class BusQuestion(abc.ABC):

@@ -233,7 +233,7 @@ class Feed(Generic[NumberedT]):
                 self._hold(epoch, thing)
 
     def fill(self, epoch: int, first: int, following: int, things: list[NumberedT]) -> None:
-        """Take messages that were requested: all that the agent has from ``first`` on, or some."""
+        """Take requested messages: all messages of the agent from ``first`` on, or some."""
         if epoch != self.epoch or not self.expected:
             return  # a newer epoch starts with begin(), or the feed is stopped
         held = self._now_held()

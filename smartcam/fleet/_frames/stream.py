@@ -137,7 +137,7 @@ class PictureStream(FrameStream):
 
 @dataclass(eq=False)
 class VideoStream(FrameStream):
-    """A stream of H.264: all encoded frames after those that the program has.
+    """A stream of H.264: all encoded frames after the frames that the program has.
 
     Args:
         video: the encoder's stream, shared with other viewers.

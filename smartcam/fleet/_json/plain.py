@@ -485,7 +485,7 @@ class Plain:
     # ------------------------------------------------------------------ cameras that Setup adds
 
     async def _host(self, order: _Order, request: PlainRequest) -> Host:
-        """Return the camera; Setup adds one that no agent has."""
+        """Return the camera; Setup adds a camera that no agent has."""
         host = self._agent.hosts.get(order.camera)
         if host is not None:
             if isinstance(request, SetupRequest):

@@ -502,7 +502,7 @@ class Fleet:
         """Return the accounts of all agents' outlets, by agent and name.
 
         Args:
-            timeout: seconds for the answers of all agents; those that do not answer are left out.
+            timeout: seconds for the answers of all agents; agents that do not answer are left out.
 
         Raises:
             ConfigurationError: the timeout is not valid.
@@ -530,7 +530,7 @@ class Fleet:
             since: time of the oldest rows to return, with its zone; None: all rows.
             failed: whether rows are only errors, gaps, and results that did not pass.
             most: largest number of rows of each store, which are the newest.
-            timeout: seconds for the answers of all agents; those that do not answer are left out.
+            timeout: seconds for the answers of all agents; agents that do not answer are left out.
 
         Raises:
             ConfigurationError: an argument is not valid.

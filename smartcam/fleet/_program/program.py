@@ -70,7 +70,7 @@ class Program:
 
     Args:
         bus: the program's own end of the bus.
-        fleet: name of the fleet; None for the only one that has the camera.
+        fleet: name of the fleet; None for the only fleet with the camera.
         camera: camera to look for: a name, or a pattern.
         guest: whether another object opens and closes the end.
         called: name of the program for people; None: its script's.

@@ -74,7 +74,7 @@ def make_certificates(
     hosts: Iterable[str] = (),
     lifetime: timedelta = LIFETIME,
 ) -> list[MadeCertificate]:
-    """Make a plant's missing certificates, and renew those that end soon; blocks.
+    """Make a plant's missing certificates, and renew certificates that end soon; blocks.
 
     Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text on its use.
     The authority is made the first time, in ``authority``, and never again. A renewed certificate

@@ -41,7 +41,7 @@ class CertificateWatch:
         end: the agent's end of the bus, open.
         listens: whether the end listens.
         busy: function that returns whether a command runs.
-        away: context around a new session: on entry all that cannot stay is closed.
+        away: context around a new session: on entry everything that cannot stay is closed.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ class Codecs:
 
     The result is a frame of the compressed format with all other attributes of the given one: time
     of capture, number, source, lens. A frame is encoded as its camera sent it. A format that the
-    codec does not support is refused; :meth:`converted` converts it to one that it does.
+    codec does not support is refused; :meth:`converted` converts it to a supported format.
 
     At most one picture per thread is processed at a time; further calls wait in the order in which
     they came. So a loop that reads a source and encodes its frames skips frames when the machine is

@@ -91,7 +91,7 @@ class LocatedPart:
         missing: places of edges that are not visible, (M, 2), pixels.
         noise: standard deviation of the picture's noise, grey levels.
         blur: standard deviation of the edges' blur, pixels.
-        chi_square: ratio of the edges' squared residuals to those that the noise explains.
+        chi_square: ratio of the edges' squared residuals to the squares that noise explains.
         refusal: why the part counts as not found; "" for a found part.
         doubt: why the rotation may be another one; mostly "".
         hull: convex hull of the part, (K, 2), pixels of the picture.

@@ -318,7 +318,7 @@ class VisionSystem:
 
         Args:
             ids: ids of measurement, part and product.
-            recipe: name or number of the recipe; "" for the one that is ready.
+            recipe: name or number of the recipe; "" for the ready one.
             single: True for one trigger, False for continuous execution.
 
         Raises:

@@ -46,8 +46,8 @@ def write_bag(
     """Convert a recording to a rosbag2, in its order and with its times.
 
     Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
-    each result's bytes are interpreted again; those that do not fit are written with the error, and
-    counted.
+    each result's bytes are interpreted again; results that do not fit are written with the error,
+    and counted.
 
     Args:
         recording: recording to read.

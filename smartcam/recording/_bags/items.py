@@ -70,7 +70,7 @@ class BagCounts(NamedTuple):
 
     Attributes:
         messages: all messages.
-        results: results, each on the topic ``results``, also those that could not be interpreted.
+        results: results, each on the topic ``results``, also results that could not be interpreted.
         unread: results that could not be interpreted; their messages have the error.
         localizations: results that are localizations, which are on two more topics.
         errors: other errors, on ``/diagnostics``.

@@ -245,7 +245,7 @@ def topic_of(camera: str, kind: str) -> str:
 
 
 def _object(value: object) -> dict[str, Any]:
-    """Return an item's fields as JSON, without those that are None."""
+    """Return an item's fields as JSON, without fields that are None."""
     fields: dict[str, Any] = jsonable(value)
     return {name: field for name, field in fields.items() if field is not None}
 

@@ -191,7 +191,7 @@ def file_set(
 
     Args:
         name: full name of the message, without a dot in front.
-        messages: the message, and all that it needs of its package, by their short names.
+        messages: the message, and all messages of its package that it needs, by their short names.
         enums: enumerations that a message has within itself, and their names from 0 on.
     """
     package, _, short = name.partition(".")

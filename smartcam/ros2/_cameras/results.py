@@ -55,7 +55,7 @@ class CameraResults:
 
     Attributes:
         active: whether results are published; otherwise they are discarded as they come.
-        taken: number of results that came, including those that could not be interpreted.
+        taken: number of results that came, including results that could not be interpreted.
         failed: number of results that could not be interpreted.
         refused: number of messages that could not be made from a result.
     """

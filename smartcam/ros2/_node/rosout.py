@@ -143,7 +143,7 @@ class RosOut:
 
 
 class _Handler(logging.Handler):
-    """Passes records on, except those that are logged by this in the same thread."""
+    """Passes records on, except records that this logs in the same thread."""
 
     def __init__(self, take: Callable[[logging.LogRecord], None], level: int) -> None:
         super().__init__(level)

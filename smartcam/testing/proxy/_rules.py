@@ -349,7 +349,7 @@ class Late(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(DatagramRule):
-    """Send the datagram after those that follow it.
+    """Send the datagram after the datagrams that follow it.
 
     Args:
         behind: number of datagrams of the same direction and connection that overtake it.

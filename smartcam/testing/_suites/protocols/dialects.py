@@ -88,7 +88,7 @@ class DialectChecks(Parameters):
         assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
 
     def test_every_dialect_is_tried(self) -> None:
-        """Check that a client tries each dialect, and gets the one that is pinned."""
+        """Check that a client tries each dialect, and gets the pinned one."""
         protocol = self.protocol
         used = set(protocol.schemes.values())
         surplus = set(protocol.detection) - used
