@@ -112,7 +112,7 @@ async def _agent(
         if outlets is not None:
             await stack.enter_async_context(FleetOutlets(server))
         await stack.enter_async_context(server)
-        await server.wait_tried()
+        await server.wait_first_attempts()
         yield server
 
 

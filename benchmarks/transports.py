@@ -180,7 +180,7 @@ async def _shared() -> AsyncIterator[Any]:
             }
         )
         async with smartcam.fleet.serve(file) as server:
-            await server.wait_tried()
+            await server.wait_first_attempts()
             url = f"fleet://127.0.0.1:{server.address.port}/one"
             async with smartcam.connect(url) as camera:
                 yield camera

@@ -725,6 +725,25 @@ def modules() -> str:
     return _table(("in", "module", "holds"), rows)
 
 
+def public_names() -> str:
+    """Return the number of public names of each module; a name of two modules counts once."""
+    modules: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "smartcam").rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        found = re.search(
+            r"^__all__ = (\[.*?\])", path.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        )
+        if found and "._" not in name:
+            modules[name] = ast.literal_eval(found[1])
+    modules["smartcam"] = modules.pop("smartcam")  # last: most of its names are those of others
+    seen: set[str] = set()
+    rows: list[tuple[str, int]] = []
+    for module, names in modules.items():
+        rows.append((f"`{module}`", len(set(names) - seen)))
+        seen.update(names)
+    return _table(("module", "names"), [*rows, ("together", len(seen))])
+
+
 def limits() -> str:
     """Return the constants of :data:`LIMITS` with their values and the reasons in the source."""
     rows: list[tuple[object, ...]] = []
@@ -760,7 +779,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, quirks_insight, settings, transitions, policies, layers, limits),
-        modules,
+        *(modules, public_names),
         *(application, scenario, cue, faults_which, faults_wire, faults_device),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
@@ -833,32 +852,76 @@ def _which_frame(
     return named(signature), named(gives)
 
 
+class _Returned(typing.NamedTuple):
+    """A class that functions return and no module exports.
+
+    Attributes:
+        lines: its docstring, and what its methods do.
+        gives: words in the types that its methods return.
+    """
+
+    lines: list[str]
+    gives: frozenset[str]
+
+
 @functools.cache
-def _returned_classes() -> dict[str, list[str]]:
-    """Return the docstrings of classes that functions return and no module exports, in lines."""
+def _returned_classes() -> dict[str, _Returned]:
+    """Return the classes that no module exports and that have attributes or methods to tell."""
     exported: set[str] = set()
-    found: dict[str, list[str]] = {}
+    found: dict[str, _Returned] = {}
     for path in sorted((ROOT / "smartcam").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                text = ast.get_docstring(node) or ""
-                if "\nAttributes:\n" in text:
-                    found[node.name] = text.splitlines()
+                text, (methods, gives) = ast.get_docstring(node) or "", _methods(node)
+                if "\nAttributes:\n" in text or methods:
+                    found[node.name] = _Returned([*text.splitlines(), *methods], gives)
             elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
                 exported.update(ast.literal_eval(node.value) if path.stem != "_inside" else ())
-    return {name: lines for name, lines in found.items() if name not in exported}
+    return {name: one for name, one in found.items() if name not in exported}
+
+
+def _methods(node: ast.ClassDef) -> tuple[list[str], frozenset[str]]:
+    """Return a list of a class' public methods and properties, and words of what they return."""
+    lines: list[str] = []
+    gives: set[str] = set()
+    for one in node.body:
+        if not isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if one.name[0] != "_" or one.name in {"__getitem__", "__aiter__", "__anext__"}:
+            gives.update(re.findall(r"\w+", ast.unparse(one.returns) if one.returns else ""))
+        text = (ast.get_docstring(one) or "").partition("\n\n")[0]
+        if text and one.name[0] != "_":
+            is_property = any(getattr(mark, "id", "") == "property" for mark in one.decorator_list)
+            taken = ast.unparse(one.args).removeprefix("self").removeprefix(", ")
+            given = "" if is_property else f"({taken})"
+            lines.append(f"- ``{one.name}{given}``: {' '.join(text.split())}")
+    return (["", *lines] if lines else []), frozenset(gives)
 
 
 def _tell_returned(
     _app: Any, _what: str, _name: str, member: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Add what a function returns, where that class has no place of its own in the reference."""
-    gives = getattr(getattr(member, "fget", member), "__annotations__", {}).get("return")
-    for name in re.findall(r"\w+", str(gives or "")):
-        if name in _returned_classes():
-            first, *rest = _returned_classes()[name]
-            lines += ["", f"``{name}``: {first}", *rest]
+    """Add what a function returns, or a field holds, if its class is not in the reference."""
+    types = getattr(getattr(member, "fget", member), "__annotations__", {})
+    if inspect.isclass(member) and hasattr(member, "model_fields"):
+        return  # what pydantic reads is described by its fields
+    gives = types.values() if inspect.isclass(member) else [types.get("return")]
+    waiting = re.findall(r"\w+", " ".join(map(str, gives)))
+    told: set[str] = set()
+    while waiting:
+        name = waiting.pop(0)
+        one = _returned_classes().get(name)
+        if (
+            one is None
+            or name in told
+            or (inspect.isclass(member) and "Attributes:" not in one.lines)
+        ):
+            continue
+        told.add(name)
+        first, *rest = one.lines
+        lines += ["", f"``{name}``: {first}", *rest]
+        waiting += [] if inspect.isclass(member) else sorted(one.gives)
 
 
 def _skip(_app: Any, _what: str, _name: str, member: object, skip: bool, _options: Any) -> bool:

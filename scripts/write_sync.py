@@ -101,7 +101,8 @@ if TYPE_CHECKING:
     from smartcam.camera import FrameEncoding, StreamEncoding
     from smartcam.exceptions import SmartCamError
     from smartcam.fleet import FleetFrame
-    from smartcam.frames import Frame, ReaderStatistics
+    from smartcam.frames import Frame
+    from smartcam.frames._inside import ReaderStatistics
     from smartcam.interpreters._inside import AnySpec, TypedSpec
     from smartcam.models import (
         CameraEvent,

@@ -72,7 +72,6 @@ if TYPE_CHECKING:
         Connected,
         Disconnected,
         Header,
-        Histogram,
         Localization,
         NoticeReceived,
         Pose,
@@ -113,7 +112,6 @@ __all__ = [
     "FrameSourceError",
     "FrameTimeoutError",
     "Header",
-    "Histogram",
     "InputContainerError",
     "InspectionError",
     "InterpretationError",
@@ -180,7 +178,7 @@ if not TYPE_CHECKING:
             "exceptions": " ".join(name for name in __all__ if name.endswith("Error")),
             "layout": "Layout",
             "models": "ApplicationChanged CameraEvent Capabilities Connected Disconnected Header "
-            "Histogram Localization NoticeReceived Pose Position Quaternion Reconnected Result "
+            "Localization NoticeReceived Pose Position Quaternion Reconnected Result "
             "Statistics Status StatusChanged",
             "observers": "Observer",
         },

@@ -30,14 +30,12 @@ else:
 
 __all__ = [
     "ApplicationChanged",
-    "ByteOrder",
     "Calibration",
     "CameraEvent",
     "Capabilities",
     "Connected",
     "Disconnected",
     "Header",
-    "Histogram",
     "Localization",
     "NoticeReceived",
     "Pose",
@@ -49,7 +47,6 @@ __all__ = [
     "Statistics",
     "Status",
     "StatusChanged",
-    "SubscriberStatistics",
     "jsonable",
 ]
 

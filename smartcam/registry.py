@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["FRAMES", "GENERATORS", "INTERPRETERS", "OUTLETS", "PROTOCOLS", "TOOLS"]
+__all__ = ["FRAMES", "INTERPRETERS", "OUTLETS", "PROTOCOLS"]
 
 _log = logging.getLogger(__name__)
 

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
     from pydantic_core import ErrorDetails
 
-    from smartcam.interpreters import Spec
+    from smartcam.interpreters._inside import Spec
     from smartcam.models import Calibration
     from smartcam.protocols import Protocol
 
-__all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address"]
+__all__ = ["CameraOptions", "CameraSettings"]
 
 FLEET_SCHEMES = ("fleet", "fleet+tls")
 """URL schemes of cameras that an agent shares."""

@@ -25,7 +25,6 @@ import smartcam.sync
 from smartcam import Backoff, ConfigurationError
 from smartcam._arguments import shown_time
 from smartcam.conformance.camera import ConformanceOptions
-from smartcam.conformance.client import CommandClient, FunctionClient
 from smartcam.emulator import (
     EmulatedCamera,
     EmulatedFleet,
@@ -34,22 +33,12 @@ from smartcam.emulator import (
     Scenario,
     TableScene,
     load_scenario,
-    load_scenarios,
 )
+from smartcam.emulator._inside import load_scenarios
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
-from smartcam.inspection import (
-    PartModel,
-    Picture,
-    Software,
-    SoftwareDevice,
-    Teaching,
-    Tool,
-    load_cell,
-    make_camera,
-    register_tool,
-    software_mistakes,
-)
+from smartcam.inspection import PartModel, Picture, SoftwareDevice, Tool, load_cell, register_tool
+from smartcam.inspection._inside import Software, Teaching, make_camera, software_mistakes
 from smartcam.models import Result
 from smartcam.outlets import Outlets
 from smartcam.recording import (
@@ -334,8 +323,6 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "Codecs.jpeg": (codecs.jpeg, {"frame": frame}),
             "Codecs.jpegxl": (codecs.jpegxl, {}),
             "Codecs.png": (codecs.png, {}),
-            "CommandClient.__init__": (CommandClient, {"command": "x {task} {url}"}),
-            "FunctionClient.__init__": (FunctionClient, {}),
             "Layout.__init__": (smartcam.Layout, {"text": "n: int32"}),
             "load_fleet": (smartcam.fleet.load_fleet, {}),
             "load_scenario": (load_scenario, {"path": "none.yaml"}),
@@ -421,13 +408,6 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "RtspServer.url": (rtsp.url, {}),
             "ConformanceOptions.__init__": (ConformanceOptions, {"url": "bvs://127.0.0.1"}),
             "judge": (smartcam.conformance.camera.judge, {}),
-            "perform": (
-                smartcam.conformance.client.perform,
-                {
-                    "client": smartcam.conformance.client.FunctionClient(lambda _: []),
-                    "scene": smartcam.conformance.client.Scene(name="a", about="b"),
-                },
-            ),
             "Device.change_run": (device.change_run, {}),
             "Device.drop_triggers": (device.drop_triggers, {}),
             "Device.hold_busy": (device.hold_busy, {}),

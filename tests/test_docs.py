@@ -27,7 +27,8 @@ from smartcam import exceptions
 from smartcam.camera import Camera
 from smartcam.depth import region_depth
 from smartcam.emulator import InSightQuirks, Quirks, faults
-from smartcam.models import Status
+from smartcam.frames import FrameSource
+from smartcam.models import Statistics, Status
 from smartcam.protocols import BVS, FramedDialect, State
 from smartcam.protocols._inside import HANDBOOK
 from smartcam.settings import CameraSettings, known_protocols
@@ -297,6 +298,20 @@ def test_reference_tells_the_fields_of_a_returned_class_that_no_module_exports()
     module_of("conf")._tell_returned(None, "function", "", region_depth, None, lines)
     assert "``RegionDepth``: The depth of a region, and its standard deviations." in lines
     assert any(line.startswith("    sigma: standard deviation of ``median``") for line in lines)
+
+
+def test_reference_tells_the_methods_of_a_returned_class_that_no_module_exports() -> None:
+    lines = ["The features."]
+    module_of("conf")._tell_returned(None, "property", "", FrameSource.features, None, lines)
+    assert any(line.startswith("- ``names(*, timeout: float") for line in lines)
+    assert "``FrameFeature``: One feature of a source's device. Made by" in " ".join(lines)
+    assert any(line.startswith("- ``set(value: FeatureValue, *, timeout:") for line in lines)
+
+
+def test_reference_tells_a_field_s_class_that_no_module_exports() -> None:
+    lines = ["The account."]
+    module_of("conf")._tell_returned(None, "class", "", Statistics, None, lines)
+    assert "``Histogram``: The number of times in each of a row of bins." in lines
 
 
 # ---------------------------------------------------------------------- promises, troubleshooting

@@ -38,7 +38,7 @@ async def main() -> None:
     cameras = [one.split("=") for one in sys.argv[1:]]
     file = fleet_file({name: int(port) for name, port in cameras})
     async with smartcam.fleet.serve(file) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await serve_control([server.address.port], before)
 
 

@@ -39,7 +39,7 @@ async def main() -> None:
     if how == "ros":
         file["ros2"] = {"domain": DOMAIN}
     async with smartcam.fleet.serve(FleetFile.model_validate(file)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await serve_control([server.address.port], before)
 
 

@@ -365,7 +365,7 @@ class _Sources:
 
     def _taking(self) -> dict[str, Any]:
         """Return the wizard's arguments for the source of its pictures."""
-        from smartcam.calibration.wizards import PictureFolder
+        from smartcam.calibration._inside import PictureFolder
 
         if self.source is not None:
             return {"take_picture": self.source}

@@ -18,8 +18,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._inside import LensComparison, MapFigures, StoredLenses
-    from smartcam.calibration.formats import LengthUnit
+    from smartcam.calibration._inside import LengthUnit, LensComparison, MapFigures, StoredLenses
 
 DIFFERENT = 7
 """Exit code after a comparison of calibrations that differ by more than noise explains."""

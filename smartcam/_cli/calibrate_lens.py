@@ -256,7 +256,7 @@ async def _from_source(source: FrameSource, target: Target, options: Options) ->
 
 def _report_once(error: CalibrationError, reported: set[str]) -> None:
     """Report once why a frame gives no view; raise an error that no frame can cure."""
-    from smartcam.geometry import Code
+    from smartcam.geometry._inside import Code
 
     if error.code == Code.SHAPE:
         raise error

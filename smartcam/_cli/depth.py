@@ -17,7 +17,7 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration.formats import LengthUnit
+    from smartcam.calibration._inside import LengthUnit
     from smartcam.depth import Cloud
     from smartcam.web._inside import Up
 

@@ -13,7 +13,7 @@ from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import table_text
 
 if TYPE_CHECKING:
-    from smartcam.doctor import Finding
+    from smartcam.doctor._inside import Finding
 
 MAX_BROKEN = 4
 """Largest number of lines of broken bytes below a finding."""

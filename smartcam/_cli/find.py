@@ -19,8 +19,7 @@ from smartcam._extras import from_part
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
-    from smartcam.doctor import FoundPort
-    from smartcam.doctor._inside import CameraSearch
+    from smartcam.doctor._inside import CameraSearch, FoundPort
 
 DEFAULT_ADDRESSES, MAX_ADDRESSES = 65_536, 1 << 24
 MAX_OPEN_CONNECTIONS, MAX_OPENINGS_PER_SECOND, MAX_SECONDS = 1_000, 10_000.0, 60.0
@@ -183,6 +182,7 @@ def _show(
     if options.as_json:
         for port in ports:
             value = {name: getattr(port, name) for name in port.__dataclass_fields__}
+            value["said"] = value.pop("received")
             options.show({**value, "greeting": port.greeting, "urls": port.urls}, "")
         for host, cameras in alone.items():
             for name, url in cameras.items():
@@ -208,7 +208,7 @@ def evidence(port: FoundPort) -> str:
     if port.answer is not None:
         return f"a camera answers: {port.answer.url}"
     if port.evidence == "other":
-        greeting = f"it says {port.greeting!r:.60}" if port.said else "it does not greet"
+        greeting = f"it says {port.greeting!r:.60}" if port.received else "it does not greet"
         return f"another service: {greeting}"
     protocols = " or ".join(port.protocols)
     text = _EVIDENCE[port.evidence].format(protocols=protocols, greeting=port.greeting[:60])

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from smartcam.camera import Camera
-    from smartcam.gateway import Gateway, GatewayFile, GatewaySettings
+    from smartcam.gateway import Gateway, GatewaySettings
+    from smartcam.gateway._inside import GatewayFile
 
 DEMO_APPLICATION = 7
 """The application of the emulated camera that localizes parts."""
@@ -126,7 +127,7 @@ async def _ensure_open(
 
 
 def _file(camera: str | None, demo: bool) -> GatewayFile:
-    from smartcam.gateway import GatewayFile
+    from smartcam.gateway._inside import GatewayFile
 
     if demo == (camera is not None):
         raise click.UsageError(

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 async def outlet(url: str, file: str, options: Options) -> None:
     """Deliver results."""
     from smartcam._cli.live import have_open
-    from smartcam.outlets import Outlets, OutletsFile
+    from smartcam.outlets import Outlets
+    from smartcam.outlets._inside import OutletsFile
 
     outlets_file = OutletsFile.load(file)
     source = _OutletSource(options)
@@ -48,7 +49,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
         Path(file).parent,
         columns=source.columns,
         command=source.command,
-        tell=source.tell,
+        on_trouble=source.tell,
         cameras=source.cameras,
         names=source.names,
     )

@@ -54,8 +54,7 @@ async def results(
     if "://" in place:
         await _ask(place, since, failed, camera or "**", most, options)
         return
-    from smartcam.outlets import StoreQuestion
-    from smartcam.outlets._inside import read_store
+    from smartcam.outlets._inside import StoreQuestion, read_store
 
     stored = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
     _show(stored.rows, stored.summary, "", options)

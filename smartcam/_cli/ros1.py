@@ -52,7 +52,7 @@ async def ros1(place: str, bridge: str, namespace: str | None, options: Options)
 
     has = _of_fleet if is_fleet(place) else _served
     async with has(place, bridge, namespace, tell) as ros:
-        await ros.wait_tried()
+        await ros.wait_first_attempts()
         for node in ros.bridged:
             why = "" if node.connected else f"  no rosbridge: {node.failure}"
             options.show(_node(node, bridge), f"{node.full_name}{why}")
@@ -74,7 +74,7 @@ async def _served(
     hand_eyes = {name: section.load_hand_eye(folder) for name, section in sections.items()}
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         async with bridged(
             bridge,
             report,

@@ -54,10 +54,10 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
 async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
     """Share cameras."""
     import smartcam.fleet
-    from smartcam.fleet._inside import raise_descriptor_limit
+    from smartcam.fleet._inside import fleet_schema, raise_descriptor_limit
 
     if schema:
-        click.echo(json.dumps(smartcam.fleet.fleet_schema(), indent=2))
+        click.echo(json.dumps(fleet_schema(), indent=2))
         return
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
@@ -132,7 +132,7 @@ class Serving:
             server.reloads.on_reload = self._on_reload
             stack.enter_context(notifier.telling(self._status))
             await stack.enter_async_context(_while_here(self._reload_when(wanted)))
-            await server.wait_tried()
+            await server.wait_first_attempts()
             self._ready = True
             notifier.ready(self._status())
             if server.warning:
@@ -308,7 +308,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
 
 async def share(server: FleetServer, options: Options) -> None:
     """Print the URLs of a started agent's cameras, and then each event, until cancelled."""
-    await server.wait_tried()
+    await server.wait_first_attempts()
     events = server.events()
     for name in server.hosts:
         value = _camera(server, name)

@@ -121,7 +121,7 @@ async def command(
     if schema:
         import json
 
-        from smartcam.emulator import scenario_schema
+        from smartcam.emulator._inside import scenario_schema
 
         click.echo(json.dumps(scenario_schema(), indent=2))
         return
@@ -233,7 +233,7 @@ def _scenarios(
     Raises ConfigurationError: the file is wrong, or ``copies`` is given for several cameras;
     MissingExtraError: PyYAML is not installed.
     """
-    from smartcam.emulator import load_scenarios
+    from smartcam.emulator._inside import load_scenarios
 
     plain = _plain(protocol or PROTOCOL, shown=shown)
     loaded = (plain,) if path is None else load_scenarios(path, dialect=dialect)

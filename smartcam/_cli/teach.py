@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.frames import FrameSource
-    from smartcam.inspection import Inspection, Teaching
-    from smartcam.web import TeachSite
+    from smartcam.inspection import Inspection
+    from smartcam.inspection._inside import Teaching
+    from smartcam.web._inside import TeachSite
 
 LINGER: Final = 3.0
 """Seconds that the device continues streaming after a picture."""
@@ -72,14 +73,14 @@ async def teach(
 ) -> None:
     """Serve the page, or carry out the options."""
     with from_part("inspection", "smartcam teach needs"):
-        from smartcam.inspection import Teaching
+        from smartcam.inspection._inside import Teaching
 
     teaching = Teaching(cell, camera, which)
     files = [file for picture in pictures for file in picture_files(Path(picture))]
     if changes or learn or save:
         await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
         return
-    from smartcam.web import TeachSite
+    from smartcam.web._inside import TeachSite
 
     async with contextlib.AsyncExitStack() as stack:
         source: FrameSource | None = None

@@ -8,7 +8,7 @@ import operator
 from typing import TYPE_CHECKING
 
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, Statistics
-from smartcam.protocols import Counters
+from smartcam.protocols._inside import Counters
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,7 +22,7 @@ _read = operator.attrgetter(*_WIRE)
 
 
 class Times:
-    """Collects times for a :class:`~smartcam.Histogram`."""
+    """Collects times for a ``Histogram``."""
 
     __slots__ = ("_counts", "_longest", "_shortest", "_total")
 

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.guide import suggest_views
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
     from smartcam.calibration._lens.poses import locate
-    from smartcam.calibration._plane.calibration import Drift, PlaneCalibration, fit_plane
+    from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
     from smartcam.calibration._plane.moving_camera import MovingCamera
     from smartcam.calibration._plane.tool import fit_tool_tip
     from smartcam.calibration._plane.touches import fit_touches
-    from smartcam.calibration._printing.sheets import Sheet, make_sheet, scaled
+    from smartcam.calibration._printing.sheets import make_sheet, scaled
     from smartcam.calibration._sheet.calibration import (
         SheetCalibration,
         calibrate_sheet,
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
         target_to_data,
     )
     from smartcam.calibration._views import TargetView
-    from smartcam.geometry import CameraModel, Code, PlacePattern, PoseHistory, Remark, Transform
+    from smartcam.geometry import CameraModel, PlacePattern, PoseHistory, Transform
 
 __all__ = [
     "CameraModel",
@@ -70,8 +70,6 @@ __all__ = [
     "Charuco",
     "Checkerboard",
     "CircleGrid",
-    "Code",
-    "Drift",
     "Folder",
     "HandEyeCalibration",
     "Height",
@@ -82,9 +80,7 @@ __all__ = [
     "PlaneCalibration",
     "PlaneProjection",
     "PoseHistory",
-    "Remark",
     "RobotSigmas",
-    "Sheet",
     "SheetCalibration",
     "StereoCalibration",
     "TargetView",
@@ -131,17 +127,17 @@ if not TYPE_CHECKING:
             "_lens.guide": "suggest_views",
             "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
             "_lens.poses": "locate",
-            "_plane.calibration": "Drift PlaneCalibration fit_plane",
+            "_plane.calibration": "PlaneCalibration fit_plane",
             "_plane.moving_camera": "MovingCamera",
             "_plane.tool": "fit_tool_tip",
             "_plane.touches": "fit_touches",
-            "_printing.sheets": "Sheet make_sheet scaled",
+            "_printing.sheets": "make_sheet scaled",
             "_sheet.calibration": "SheetCalibration calibrate_sheet fit_corners",
             "_solvers": "Chain Height PlaneProjection ToolOffset chain_of",
             "_stereo.calibration": "StereoCalibration calibrate_stereo",
             "_targets": "Charuco Checkerboard CircleGrid MarkerGrid target_from_data "
             "target_to_data",
             "_views": "TargetView",
-            "smartcam.geometry": "CameraModel Code PlacePattern PoseHistory Remark Transform",
+            "smartcam.geometry": "CameraModel PlacePattern PoseHistory Transform",
         },
     )

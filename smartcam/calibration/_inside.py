@@ -21,12 +21,18 @@ if TYPE_CHECKING:
     from smartcam.calibration._printing.sheets import on_paper
     from smartcam.calibration._stereo.rectification import Rectification, rectify
     from smartcam.calibration._targets import Target
-    from smartcam.calibration._units import METRES_PER_UNIT
+    from smartcam.calibration._units import METRES_PER_UNIT, LengthUnit
     from smartcam.calibration._verdict import doubt_of
     from smartcam.calibration.formats._cameras import MAX_FILE_BYTES, CameraInfo, parse_camera_info
     from smartcam.calibration.formats._lenses import StoredLenses, read_lenses
+    from smartcam.calibration.formats._robots import ROBOTS
     from smartcam.calibration.wizards._listing import listing
-    from smartcam.calibration.wizards._pictures import MAX_PICTURE_BYTES, SUFFIXES, decode_picture
+    from smartcam.calibration.wizards._pictures import (
+        MAX_PICTURE_BYTES,
+        SUFFIXES,
+        PictureFolder,
+        decode_picture,
+    )
     from smartcam.calibration.wizards._steps import Input
     from smartcam.calibration.wizards._thesis import (
         CalibrationCamera,
@@ -44,6 +50,7 @@ __all__ = [
     "MAX_FILE_BYTES",
     "MAX_PICTURE_BYTES",
     "METRES_PER_UNIT",
+    "ROBOTS",
     "SUFFIXES",
     "WIZARD",
     "AnyCalibration",
@@ -52,9 +59,11 @@ __all__ = [
     "CalibrationStart",
     "CameraInfo",
     "Input",
+    "LengthUnit",
     "Lens",
     "LensComparison",
     "MapFigures",
+    "PictureFolder",
     "PixelPoseRequest",
     "Rectification",
     "StepRequest",
@@ -80,6 +89,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "formats._robots": "ROBOTS",
             "_drawing.files": "draw_file",
             "_files.load": "AnyCalibration",
             "_least_squares": "independent_parts",
@@ -89,12 +99,12 @@ if not TYPE_CHECKING:
             "_printing.sheets": "on_paper",
             "_stereo.rectification": "Rectification rectify",
             "_targets": "Target",
-            "_units": "METRES_PER_UNIT",
+            "_units": "LengthUnit METRES_PER_UNIT",
             "_verdict": "doubt_of",
             "formats._cameras": "CameraInfo MAX_FILE_BYTES parse_camera_info",
             "formats._lenses": "StoredLenses read_lenses",
             "wizards._listing": "listing",
-            "wizards._pictures": "MAX_PICTURE_BYTES SUFFIXES decode_picture",
+            "wizards._pictures": "PictureFolder MAX_PICTURE_BYTES SUFFIXES decode_picture",
             "wizards._steps": "Input",
             "wizards._thesis": "CalibrationCamera CalibrationDesks CalibrationStart "
             "PixelPoseRequest StepRequest ThesisCalibration",

@@ -20,8 +20,9 @@ import numpy as np
 from smartcam._argument_checks import a_finite_number, a_list, numbers, of_class, takes
 from smartcam.calibration._homography import apply_homography, derivatives, tangent_frames
 from smartcam.calibration._plane.validation import check_positive
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
 from smartcam.geometry._inside import (
+    Code,
     as_points,
     as_vector,
     check_finite,

@@ -16,7 +16,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_target, takes
 from smartcam._arguments import shown
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -91,7 +91,7 @@ class Checkerboard:
         return AREA_DIAMETER_SQUARES * self.square
 
     @property
-    def turned_alike(self) -> bool:
+    def half_turn_symmetric(self) -> bool:
         """True if the sheet looks the same after half a turn."""
         return not self.origin_mark and (self.columns + self.rows) % 2 == 0
 
@@ -119,7 +119,7 @@ class Charuco:
     dictionary: str = "DICT_5X5_250"
     legacy_pattern: bool = False
 
-    turned_alike: ClassVar[bool] = False
+    half_turn_symmetric: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows)
@@ -204,7 +204,7 @@ class CircleGrid:
         return points
 
     @property
-    def turned_alike(self) -> bool:
+    def half_turn_symmetric(self) -> bool:
         """True if the sheet looks the same after half a turn."""
         return self.origin_diameter is None and not (self.asymmetric and self.rows % 2 == 1)
 
@@ -241,7 +241,7 @@ class MarkerGrid:
     first_id: int = 0
     kalibr: bool = False
 
-    turned_alike: ClassVar[bool] = False
+    half_turn_symmetric: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         _check_counts(self.kind, self.columns, self.rows, least=1)

@@ -10,8 +10,7 @@ import numpy as np
 
 from smartcam.calibration._files import storage
 from smartcam.calibration._targets import MAX_POINTS, Target
-from smartcam.geometry import Code
-from smartcam.geometry._inside import Array, as_points, check_size
+from smartcam.geometry._inside import Array, Code, as_points, check_size
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -149,7 +149,7 @@ class Cloud:
         moved = motion.apply(self.points.astype(np.float64))
         return type(self)(_as(moved), self.colours, self.sigma)
 
-    def taken(self, index: NDArray[Any]) -> Self:
+    def select(self, index: NDArray[Any]) -> Self:
         """Return the points of a mask (N,), or of indices in their order."""
         return type(self)(
             self.points[index],

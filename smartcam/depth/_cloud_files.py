@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration.formats import LengthUnit
+    from smartcam.calibration._inside import LengthUnit
 
 MAX_FILE_BYTES: Final = 1 << 30
 """Largest size of a file that is read, bytes."""

@@ -41,7 +41,7 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
         )
     along = cloud.points[:, AXES.index(axis)]
     ends = _as_float32((low, high))
-    return cloud.taken((along >= ends[0]) & (along <= ends[1]))
+    return cloud.select((along >= ends[0]) & (along <= ends[1]))
 
 
 @takes(cloud=of_class("Cloud"), low=numbers, high=numbers)
@@ -58,7 +58,7 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
     ends = _as_float32(corners)
     inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)
-    return cloud.taken(np.asarray(inside))
+    return cloud.select(np.asarray(inside))
 
 
 def _as_float32(ends: ArrayLike) -> NDArray[np.float32]:
@@ -96,7 +96,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
         # The nearest point is the point itself, or another at the same place.
         distances, _ = tree.query(cloud.points[part], k=neighbours + 1)
         means[part] = distances[:, 1:].mean(axis=1)
-    return cloud.taken(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
+    return cloud.select(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
 
 
 @takes(cloud=of_class("Cloud"), radius=a_number)
@@ -110,14 +110,14 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     _check_count(neighbours, "remove_radius_outliers")
     _check_length(radius, "remove_radius_outliers: radius")
     if len(cloud) <= neighbours:
-        return cloud.taken(np.zeros(len(cloud), bool))
+        return cloud.select(np.zeros(len(cloud), bool))
     tree = load("scipy.spatial").cKDTree(cloud.points)
     mask = np.empty(len(cloud), bool)
     for part in _parts(len(cloud)):
         # It is enough to know the distance to the last of the required neighbours.
         distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
         mask[part] = distances[:, 0] <= radius
-    return cloud.taken(mask)
+    return cloud.select(mask)
 
 
 @takes(cloud=of_class("Cloud"), size=a_number)

@@ -185,7 +185,7 @@ class StereoMatcher:
         self._lock = threading.Lock()  # OpenCV's matchers reuse their buffers
 
     @property
-    def nearest(self) -> int:
+    def max_disparity(self) -> int:
         """Largest disparity that is found, pixels."""
         return int(self.parameters["min_disparity"]) + int(self.parameters["num_disparities"]) - 1
 
@@ -242,7 +242,7 @@ class StereoMatcher:
     def _padded(self, left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.int16]:
         """Return disparities in 1/16 pixel, also near borders, where OpenCV leaves them out."""
         cv2 = load("cv2")
-        before = max(0, self.nearest + 1)
+        before = max(0, self.max_disparity + 1)
         after = max(0, -int(self.parameters["min_disparity"]))
         wide = [
             cv2.copyMakeBorder(

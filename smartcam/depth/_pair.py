@@ -13,7 +13,8 @@ from smartcam._extras import load
 from smartcam.calibration._inside import MAX_FILE_BYTES, parse_camera_info, rectify
 from smartcam.calibration.formats import CameraChain
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameFormatError
-from smartcam.geometry import CameraModel, Code, Transform
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

@@ -224,10 +224,10 @@ class StereoDepth:
         return self._opened()[1].baseline
 
     @property
-    def nearest(self) -> float:
+    def min_depth(self) -> float:
         """Least depth that is measured, metres; raises as :attr:`camera_info` does."""
         _, pair, matcher = self._opened()
-        return pair.focal * pair.baseline / max(matcher.nearest, 1)
+        return pair.focal * pair.baseline / max(matcher.max_disparity, 1)
 
     def statistics(self) -> StereoStatistics:
         """Return the current statistics."""

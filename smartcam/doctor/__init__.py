@@ -26,7 +26,7 @@ from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
 from smartcam.doctor._context import DoctorOptions, Examination, Witness
 from smartcam.doctor._findings import Exit, Finding
-from smartcam.doctor._found import FoundPort, serves_one
+from smartcam.doctor._found import serves_one
 from smartcam.doctor._search import find
 from smartcam.exceptions import (
     CameraFaultError,
@@ -44,13 +44,11 @@ from smartcam.settings import is_fleet, parse_address
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from smartcam.interpreters import Spec
+    from smartcam.interpreters._inside import Spec
     from smartcam.observers import TraceEntry
     from smartcam.settings import Address
 
 __all__ = [
-    "Finding",
-    "FoundPort",
     "examine",
     "find",
 ]

@@ -205,7 +205,7 @@ class Examination:
         check: str = "",
         **details: Any,
     ) -> None:
-        """Report a finding of the present check; arguments as :class:`~smartcam.doctor.Finding`."""
+        """Report a finding of the present check; arguments as ``Finding``."""
         self.pending.append(
             Finding(
                 check=check or self.check,

@@ -36,7 +36,7 @@ class FoundPort:
             sent nothing, like cameras of the protocol; ``said``: it sent something, and the
             cameras' greeting is unknown; ``ended``: it closed the connection at once, as a camera
             with a client may; ``other``: no camera of a known protocol.
-        said: bytes that the port sent without a request, up to 512.
+        received: bytes that the port sent without a request, up to 512.
         seconds: time until the connection was open.
         answer: the camera's description of itself, if it was asked and has answered.
         refusal: reason why the camera did not answer, if it was asked.
@@ -46,7 +46,7 @@ class FoundPort:
     port: int
     protocols: tuple[str, ...]
     evidence: Evidence
-    said: bytes
+    received: bytes
     seconds: float
     answer: CameraAnswer | None = None
     refusal: str = ""
@@ -63,7 +63,7 @@ class FoundPort:
     @property
     def greeting(self) -> str:
         """The first line that the port sent without a request, unprintable characters as dots."""
-        lines = self.said.decode("latin-1").strip().splitlines()
+        lines = self.received.decode("latin-1").strip().splitlines()
         return (
             "".join(c if c.isascii() and c.isprintable() else "." for c in lines[0])
             if lines
@@ -182,7 +182,7 @@ def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, 
         port=port,
         protocols=tuple(protocol.name for protocol in possible),
         evidence=evidence,
-        said=opened.received,
+        received=opened.received,
         seconds=opened.seconds,
     )
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from smartcam.doctor._context import Examination, Reading
     from smartcam.exceptions import InterpretationError
     from smartcam.interpreters import Interpreter
-    from smartcam.layout import Field, Layout
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import Field
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40

@@ -15,7 +15,6 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.emulator import faults
     from smartcam.emulator._application import Application
-    from smartcam.emulator._bvs.device import Device
     from smartcam.emulator._bvs.quirks import Quirks
     from smartcam.emulator._camera import EmulatedCamera
     from smartcam.emulator._clock import ManualClock
@@ -25,18 +24,16 @@ if TYPE_CHECKING:
     from smartcam.emulator._insight.commands import InSightQuirks
     from smartcam.emulator._insight.job import Job
     from smartcam.emulator._line_camera import LineCamera, LineClient
-    from smartcam.emulator._scenario.file import load_scenario, load_scenarios, scenario_schema
+    from smartcam.emulator._scenario.file import load_scenario
     from smartcam.emulator._scenario.scenario import Scenario
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._scene import TablePose, TableScene
     from smartcam.emulator._ticketed_camera import TicketedCamera, TicketedClient
-    from smartcam.emulator._traffic import LogEntry
     from smartcam.emulator._wire_camera import WireCamera
 
 __all__ = [
     "Application",
     "Cue",
-    "Device",
     "EmulatedCamera",
     "EmulatedFleet",
     "EmulatedInSight",
@@ -44,7 +41,6 @@ __all__ = [
     "Job",
     "LineCamera",
     "LineClient",
-    "LogEntry",
     "ManualClock",
     "Quirks",
     "Run",
@@ -56,9 +52,7 @@ __all__ = [
     "WireCamera",
     "faults",
     "load_scenario",
-    "load_scenarios",
     "register_generator",
-    "scenario_schema",
 ]
 
 if not TYPE_CHECKING:
@@ -67,7 +61,6 @@ if not TYPE_CHECKING:
         {
             "": "faults",
             "_application": "Application",
-            "_bvs.device": "Device",
             "_bvs.quirks": "Quirks",
             "_camera": "EmulatedCamera",
             "_clock": "ManualClock",
@@ -77,12 +70,11 @@ if not TYPE_CHECKING:
             "_line_camera": "LineCamera LineClient",
             "_insight.commands": "InSightQuirks",
             "_insight.job": "Job",
-            "_scenario.file": "load_scenario load_scenarios scenario_schema",
+            "_scenario.file": "load_scenario",
             "_scenario.scenario": "Scenario",
             "_scenario.timeline": "Cue",
             "_scene": "TablePose TableScene",
             "_ticketed_camera": "TicketedCamera TicketedClient",
-            "_traffic": "LogEntry",
             "_wire_camera": "WireCamera",
         },
     )

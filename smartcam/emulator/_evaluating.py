@@ -179,13 +179,15 @@ class EvaluatingCamera(LineCamera):
         if run != self._run:
             return
         call, self._asking_client, self.busy = self._asking_client, None, False
-        self.evaluated(None if call is None or call.gone else call, next(self.parts[self.active]))
+        self.evaluated(
+            None if call is None or call.is_closed else call, next(self.parts[self.active])
+        )
         self.activated()
 
     def activate(self, application: int) -> None:
         """Make another application the active one; the running evaluation gives no result."""
         call, self._asking_client, self.busy = self._asking_client, None, False
         self.active, self._run = application, self._run + 1
-        if call is not None and not call.gone:
+        if call is not None and not call.is_closed:
             self.voided(call)
         self.activated()

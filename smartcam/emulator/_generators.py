@@ -17,7 +17,8 @@ from smartcam.registry import GENERATORS
 
 if TYPE_CHECKING:
     from smartcam.emulator._scene import Observation, TableScene
-    from smartcam.layout import Field, Layout
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import Field
 
 Values: TypeAlias = Mapping[str, Any] | Sequence[Any]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.emulator._bvs.device import LastReport
+    from smartcam.emulator._bvs.device import Device, LastReport
     from smartcam.emulator._camera import CONDITIONS
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._clock import Clock, RealClock, TimerHandle
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from smartcam.emulator._inspected import InspectedApplication, InspectionOrder, Inspector
     from smartcam.emulator._line_codec import HeardLine, LineCodec, LineServer
     from smartcam.emulator._makes import check_options, emulated_class, options_of
+    from smartcam.emulator._scenario.file import load_scenarios, scenario_schema
     from smartcam.emulator._scene import PIECES, TABLE_SIZE, Observation
     from smartcam.emulator._tally import Tally
-    from smartcam.emulator._traffic import Visit
+    from smartcam.emulator._traffic import LogEntry, Visit
     from smartcam.emulator.faults import FiredFault
     from smartcam.emulator.faults._base import MESSAGE_NAMES, BaseFault, DeviceFault, known_name
     from smartcam.emulator.faults._delay_line import DelayLine, Ending, Transmission
@@ -34,6 +35,7 @@ __all__ = [
     "ClientLink",
     "Clock",
     "DelayLine",
+    "Device",
     "DeviceFault",
     "Ending",
     "EvaluatingCamera",
@@ -46,6 +48,7 @@ __all__ = [
     "LastReport",
     "LineCodec",
     "LineServer",
+    "LogEntry",
     "Observation",
     "RealClock",
     "Tally",
@@ -59,8 +62,10 @@ __all__ = [
     "emulated_class",
     "find_generator",
     "known_name",
+    "load_scenarios",
     "options_of",
     "request",
+    "scenario_schema",
     "wrap_number",
 ]
 
@@ -68,9 +73,10 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_scenario.file": "scenario_schema load_scenarios",
             "faults": "FiredFault",
-            "_traffic": "Visit",
-            "_bvs.device": "LastReport",
+            "_traffic": "LogEntry Visit",
+            "_bvs.device": "Device LastReport",
             "_camera": "CONDITIONS",
             "_client_link": "ClientLink",
             "_clock": "Clock RealClock TimerHandle",

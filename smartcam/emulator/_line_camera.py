@@ -56,29 +56,29 @@ class LineClient:
 
     Attributes:
         peer: address and port of the client.
-        has_begun: True once the client has sent the line that begins a session; if the dialect has
-            none, any line of the dialect.
+        has_session: True once the client has sent the line that begins a session; if the dialect
+            has none, any line of the dialect.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
         self.peer: str = link.peer
-        self.has_begun: bool = False
+        self.has_session: bool = False
         self._camera = camera
         self._link = link
         self._server = server
         self._row = 0  # state of the current line
         self._kept = False
 
-    def keep(self) -> Self:
+    def answer_later(self) -> Self:
         """Return a client that answers the current line later; the next line is read now."""
         self._kept = True
         copied = copy.copy(self)
         self._kept = False
-        self.go_on()
+        self.end_line()
         return copied
 
     @property
-    def gone(self) -> bool:
+    def is_closed(self) -> bool:
         """True once the connection has ended."""
         return self._link.closed
 
@@ -95,7 +95,7 @@ class LineClient:
         if text is not None:
             self.say_bytes(self.pack(text))
         if not self._kept:
-            self.go_on()
+            self.end_line()
 
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
         """Send bytes unchanged: a part of an answer, or a prompt."""
@@ -103,18 +103,18 @@ class LineClient:
             message = SaidLine(row=self._row if row is None else row, data=data)
             self._camera.say(self._link, message)
 
-    def say_again(self, data: bytes) -> None:
+    def say_recorded(self, data: bytes) -> None:
         """Send recorded bytes of a camera as the answer to the current line."""
         self.say_bytes(data)
 
-    def go_on(self) -> None:
+    def end_line(self) -> None:
         """End the current line, and read the next."""
         self._server.busy = False
         if not self._server.going and not self._link.closed:
             with self._camera.step():
                 self._link.feed(b"")
 
-    def hide_next(self) -> None:
+    def hide_next_line(self) -> None:
         """Keep the next line, a password, out of the log."""
         self._server.secret = True
 
@@ -129,7 +129,7 @@ class LineClient:
 
     def begin(self, message: HeardLine) -> None:
         """Begin a line."""
-        self.has_begun = self.has_begun or self._camera.begins_session(message)
+        self.has_session = self.has_session or self._camera.begins_session(message)
         self._row, self._server.busy = message.row, True
 
 
@@ -397,7 +397,7 @@ class LineCamera(WireCamera):
     def serves(self, link: ClientLink) -> bool:
         """Return True if the client of the link has begun a session."""
         client = self._clients.get(link)
-        return client is not None and client.has_begun
+        return client is not None and client.has_session
 
     def lost(self, link: ClientLink) -> None:
         """Forget a lost link; a second call does nothing."""

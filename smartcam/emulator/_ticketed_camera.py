@@ -58,7 +58,7 @@ class TicketedClient(LineClient):
         """Return an answer to the current request, with its ticket."""
         return self.frame(text, self.ticket)
 
-    def say_again(self, data: bytes) -> None:
+    def say_recorded(self, data: bytes) -> None:
         """Send a frame again, with the ticket of the current request unless it has its own."""
         codec = self._camera.lines
         ticket = codec.answer_key(data)

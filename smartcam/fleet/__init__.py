@@ -18,7 +18,7 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.fleet._agent.server import FleetServer
     from smartcam.fleet._bus.bus import MemoryBus
-    from smartcam.fleet._file.fleet_file import FleetFile, fleet_schema, load_fleet
+    from smartcam.fleet._file.fleet_file import FleetFile, load_fleet
     from smartcam.fleet._frames.wire import FleetFrame
     from smartcam.fleet._opening import open, serve
     from smartcam.fleet._program.camera import FleetCamera, ReservationLost
@@ -44,7 +44,6 @@ __all__ = [
     "FleetServer",
     "MemoryBus",
     "ReservationLost",
-    "fleet_schema",
     "load_fleet",
     "open",
     "serve",
@@ -56,7 +55,7 @@ if not TYPE_CHECKING:
         {
             "_agent.server": "FleetServer",
             "_bus.bus": "MemoryBus",
-            "_file.fleet_file": "FleetFile fleet_schema load_fleet",
+            "_file.fleet_file": "FleetFile load_fleet",
             "_frames.wire": "FleetFrame",
             "_opening": "open serve",
             "_program.camera": "FleetCamera ReservationLost",

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus
     from smartcam.fleet._bus.keys import Keys, meets
     from smartcam.fleet._bus.zenoh import ZenohEnd
+    from smartcam.fleet._file.fleet_file import fleet_schema
     from smartcam.fleet._file.operations import OperationsSection
     from smartcam.fleet._file.recording import RecordSection
     from smartcam.fleet._file.ros import RosSection
@@ -51,6 +52,7 @@ __all__ = [
     "ends_soon",
     "exposition",
     "fleet_camera",
+    "fleet_schema",
     "make_certificates",
     "may_command",
     "meets",
@@ -66,6 +68,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_file.fleet_file": "fleet_schema",
             "_agent.outlet_service": "ReportedStore ReportedOutlet",
             "_program.fleet": "FleetResults",
             "_agent.reload": "FleetChanges",

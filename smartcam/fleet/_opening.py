@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from smartcam.backoff import Backoff
-    from smartcam.interpreters import Spec
+    from smartcam.interpreters._inside import Spec
     from smartcam.models import Calibration
     from smartcam.observers import Observer
 

@@ -53,8 +53,8 @@ class FleetOutlets(Server):
         self, server: FleetServer, report: Callable[[str, str], None] = lambda _name, _why: None
     ) -> None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
-            from smartcam.outlets import Outlets, StoreQuestion
-            from smartcam.outlets._inside import columns_of, do_command
+            from smartcam.outlets import Outlets
+            from smartcam.outlets._inside import StoreQuestion, columns_of, do_command
         if server.file.outlets is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: outlets: is not in its file")
         self._server, self._do, self._columns_of = server, do_command, columns_of
@@ -64,7 +64,7 @@ class FleetOutlets(Server):
             server.folder,
             columns=self._columns,
             command=self._command,
-            tell=report,
+            on_trouble=report,
             cameras=self._cameras,
             names=self._names,
         )

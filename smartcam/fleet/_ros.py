@@ -15,8 +15,8 @@ from smartcam.fleet._bus.zenoh import ZenohEnd
 from smartcam.fleet._file.ros import RosCamera, RosSection, node_names
 from smartcam.fleet._program.camera import FleetCamera
 from smartcam.fleet._program.fleet import CameraJoined, Fleet
-from smartcam.ros2 import CameraNode, CameraNodeOptions, Node, RosContext
-from smartcam.ros2._inside import SETTINGS, NativeContext, NativeNode
+from smartcam.ros2 import CameraNode, CameraNodeOptions, Node
+from smartcam.ros2._inside import SETTINGS, NativeContext, NativeNode, RosContext
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ class RosFleet(Server):
             calibrated_at=options.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
-            agent_alive=lambda: camera.met,
+            is_agent_alive=lambda: camera.met,
             frames=self._frames.get(name, {}),
             controls=self._controls.get(name),
             calibrations=None if self._desks is None else self._desks.of(name),

@@ -80,7 +80,7 @@ class FrameSink(ABC):
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
         """Note that the picture of the pending trigger will not come."""
 
-    async def taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
+    async def wait_taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
         """Return once every reader has taken the last frame, for a recording that must lose none.
 
         Cancellation: safe.

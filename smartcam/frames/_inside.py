@@ -9,11 +9,11 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.frames._clocks import MAX_DRIFT, MIN_DRIFT_DURATION, ClockStatistics
     from smartcam.frames._codecs.bitmap import read_bitmap
-    from smartcam.frames._codecs.h264 import entry_point
+    from smartcam.frames._codecs.h264 import H264Encoder, entry_point
     from smartcam.frames._codecs.jpeg import jpeg_header
     from smartcam.frames._codecs.pictures import converted, decoded, to_jpeg, with_pixels
     from smartcam.frames._driver import TaskDriver
-    from smartcam.frames._features import FEATURE_TIMEOUT
+    from smartcam.frames._features import FEATURE_TIMEOUT, FeatureValue
     from smartcam.frames._frame import changed
     from smartcam.frames._gige import discovery, places
     from smartcam.frames._gige.assembler import PacketCounts
@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.session import GigESession
     from smartcam.frames._group import GroupStatistics
     from smartcam.frames._marks import COLOURS, Drawing, Kind, Role, stroke_width
+    from smartcam.frames._pixels.formats import PixelFormat
     from smartcam.frames._pixels.layouts import Planes, YuvPairs
-    from smartcam.frames._reader import FRAME_TIMEOUT, FrameTap
+    from smartcam.frames._reader import FRAME_TIMEOUT, FrameTap, ReaderStatistics
+    from smartcam.frames._source import SourceStatistics
     from smartcam.frames._streaming.rate import RateStatistics
     from smartcam.frames._synthetic import read_stamp
     from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_video
@@ -40,17 +42,22 @@ __all__ = [
     "ClockStatistics",
     "ControlChannel",
     "Drawing",
+    "FeatureValue",
     "FrameTap",
     "GenicamFeatures",
     "GigEDriver",
     "GigESession",
     "GroupStatistics",
+    "H264Encoder",
     "Kind",
     "PacketCounts",
+    "PixelFormat",
     "Planes",
     "RateStatistics",
+    "ReaderStatistics",
     "Register",
     "Role",
+    "SourceStatistics",
     "TaskDriver",
     "YuvPairs",
     "changed",
@@ -76,15 +83,17 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_pixels.formats": "PixelFormat",
+            "_source": "SourceStatistics",
             "_streaming.rate": "RateStatistics",
             "_group": "GroupStatistics",
             "_clocks": "ClockStatistics MIN_DRIFT_DURATION MAX_DRIFT",
             "_codecs.bitmap": "read_bitmap",
-            "_codecs.h264": "entry_point",
+            "_codecs.h264": "H264Encoder entry_point",
             "_codecs.jpeg": "jpeg_header",
             "_codecs.pictures": "converted decoded to_jpeg with_pixels",
             "_driver": "TaskDriver",
-            "_features": "FEATURE_TIMEOUT",
+            "_features": "FeatureValue FEATURE_TIMEOUT",
             "_frame": "changed",
             "_gige.force_address": "checked_mac force_address",
             "_gige.": "discovery places",
@@ -96,7 +105,7 @@ if not TYPE_CHECKING:
             "_gige.session": "GigESession",
             "_marks": "COLOURS Drawing Kind Role stroke_width",
             "_pixels.layouts": "Planes YuvPairs",
-            "_reader": "FRAME_TIMEOUT FrameTap",
+            "_reader": "ReaderStatistics FRAME_TIMEOUT FrameTap",
             "_synthetic": "read_stamp",
             "_video.frames": "colour_properties format_of to_lossless_video",
         },

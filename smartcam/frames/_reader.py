@@ -163,12 +163,12 @@ class FrameReader:
         check_moment(until, "until")
         loop = asyncio.get_running_loop()
         while not self._ended and loop.time() < until:
-            if self._next is not None and self.came >= since:
+            if self._next is not None and self.last_arrival >= since:
                 return
             await self._woken(until)
 
     @property
-    def came(self) -> float:
+    def last_arrival(self) -> float:
         """Time of the newest frame's arrival on the loop's clock; 0.0 before the first."""
         return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
 

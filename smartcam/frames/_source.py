@@ -466,7 +466,7 @@ class FrameSource(FrameSink):
         self._over = (error,)
         self._changed.set()
 
-    async def taken(self) -> None:
+    async def wait_taken(self) -> None:
         """Wait until every reader has taken the last frame; this time does not count as a stall."""
         self._held_up = True
         try:

@@ -13,15 +13,15 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.gateway._gateway import Gateway
-    from smartcam.gateway._settings import GatewayFile, GatewaySettings
+    from smartcam.gateway._settings import GatewaySettings
 
-__all__ = ["Gateway", "GatewayFile", "GatewaySettings"]
+__all__ = ["Gateway", "GatewaySettings"]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
             "_gateway": "Gateway",
-            "_settings": "GatewayFile GatewaySettings",
+            "_settings": "GatewaySettings",
         },
     )

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from smartcam.calibration.formats import ROBOTS, pose_to
+from smartcam.calibration._inside import ROBOTS
+from smartcam.calibration.formats import pose_to
 from smartcam.exceptions import InterpretationError
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import matrix_from_quaternion
@@ -18,7 +19,8 @@ from smartcam.models import Localization
 
 if TYPE_CHECKING:
     from smartcam.gateway._settings import GatewaySettings
-    from smartcam.layout import Field, Layout
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import Field
 
 Row = list[float | str]
 

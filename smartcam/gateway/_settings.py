@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from smartcam.calibration.formats import ROBOTS
+from smartcam.calibration._inside import ROBOTS
 from smartcam.layout._inside import read_model
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Style(NamedTuple):
 
     Attributes:
         form: form of an answer: ``text``, ``brackets`` or ``xml``.
-        pose: convention of poses, a key of ``smartcam.calibration.formats.ROBOTS``.
+        pose: convention of poses, as for ``pose_to``, such as ``kuka``.
         length: unit of lengths, ``m`` or ``mm``.
         angle: unit of angles, ``rad`` or ``deg``.
         decimals: digits after the decimal point.

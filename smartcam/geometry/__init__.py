@@ -13,18 +13,16 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.geometry._camera_model import CameraModel
-    from smartcam.geometry._codes import Code, Remark
     from smartcam.geometry._places import PlacePattern
     from smartcam.geometry._transforms import PoseHistory, Transform
 
-__all__ = ["CameraModel", "Code", "PlacePattern", "PoseHistory", "Remark", "Transform"]
+__all__ = ["CameraModel", "PlacePattern", "PoseHistory", "Transform"]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
             "_camera_model": "CameraModel",
-            "_codes": "Code Remark",
             "_places": "PlacePattern",
             "_transforms": "PoseHistory Transform",
         },

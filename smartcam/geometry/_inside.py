@@ -9,6 +9,7 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.geometry._camera_model import COEFFICIENTS, DistortionModel, coefficient_names
     from smartcam.geometry._checks import check_choice, check_size
+    from smartcam.geometry._codes import Code, Remark
     from smartcam.geometry._rigid import (
         IDENTITY,
         Rigid,
@@ -74,6 +75,7 @@ __all__ = [
     "MAX_COORDINATE",
     "Array",
     "AsList",
+    "Code",
     "Context",
     "Count",
     "DistortionModel",
@@ -89,6 +91,7 @@ __all__ = [
     "Others",
     "Pair",
     "Positive",
+    "Remark",
     "Remarks",
     "Rigid",
     "SheetOffsets",
@@ -132,6 +135,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_codes": "Remark Code",
             "_camera_model": "COEFFICIENTS DistortionModel coefficient_names",
             "_checks": "check_choice check_size",
             "_rigid": "IDENTITY Rigid cross_matrix exp_rotation log_rotation right_jacobian",

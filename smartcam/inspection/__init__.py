@@ -28,25 +28,17 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import Drawing
     from smartcam.inspection._camera.client import SoftwareCamera
     from smartcam.inspection._camera.device import SoftwareDevice
-    from smartcam.inspection._cell import (
-        CellCamera,
-        Software,
-        load_cell,
-        make_camera,
-        software_mistakes,
-    )
+    from smartcam.inspection._cell import load_cell
     from smartcam.inspection._finding import Finding, Inspection
     from smartcam.inspection._locate.find import LocatedPart
     from smartcam.inspection._locate.model import PartModel
-    from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
+    from smartcam.inspection._locate.troubles import TeachingError
     from smartcam.inspection._picture import Picture
     from smartcam.inspection._places import PixelPose, Region
     from smartcam.inspection._program import Program, register_tool
-    from smartcam.inspection._teaching import Teaching
     from smartcam.inspection._tool import Tool, ToolSettings, ToolSetup, View
 
 __all__ = [
-    "CellCamera",
     "Drawing",
     "Finding",
     "Inspection",
@@ -56,20 +48,15 @@ __all__ = [
     "PixelPose",
     "Program",
     "Region",
-    "Software",
     "SoftwareCamera",
     "SoftwareDevice",
-    "Teaching",
     "TeachingError",
-    "TeachingTrouble",
     "Tool",
     "ToolSettings",
     "ToolSetup",
     "View",
     "load_cell",
-    "make_camera",
     "register_tool",
-    "software_mistakes",
 ]
 
 if not TYPE_CHECKING:
@@ -78,15 +65,14 @@ if not TYPE_CHECKING:
         {
             "_camera.client": "SoftwareCamera",
             "_camera.device": "SoftwareDevice",
-            "_cell": "CellCamera Software load_cell make_camera software_mistakes",
+            "_cell": "load_cell",
             "_finding": "Finding Inspection",
             "_locate.find": "LocatedPart",
             "_locate.model": "PartModel",
-            "_locate.troubles": "TeachingError TeachingTrouble",
+            "_locate.troubles": "TeachingError",
             "_picture": "Picture",
             "_places": "PixelPose Region",
             "_program": "Program register_tool",
-            "_teaching": "Teaching",
             "_tool": "Tool ToolSettings ToolSetup View",
             "smartcam.frames._inside": "Drawing",
         },

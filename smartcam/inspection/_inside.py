@@ -9,15 +9,21 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
     from smartcam.inspection._camera.pairing import JudgedResults
+    from smartcam.inspection._cell import CellCamera, Software, make_camera, software_mistakes
     from smartcam.inspection._learning import learned
-    from smartcam.inspection._teaching import read_settings, setting_text, tool_settings
+    from smartcam.inspection._teaching import Teaching, read_settings, setting_text, tool_settings
 
 __all__ = [
+    "CellCamera",
     "JudgedResults",
+    "Software",
+    "Teaching",
     "judged_source",
     "learned",
+    "make_camera",
     "read_settings",
     "setting_text",
+    "software_mistakes",
     "tool_settings",
 ]
 
@@ -25,9 +31,10 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_cell": "software_mistakes make_camera Software CellCamera",
             "_camera.judged_frames": "judged_source",
             "_camera.pairing": "JudgedResults",
             "_learning": "learned",
-            "_teaching": "read_settings setting_text tool_settings",
+            "_teaching": "Teaching read_settings setting_text tool_settings",
         },
     )

@@ -16,7 +16,8 @@ from smartcam.inspection._finding import Finding, Inspection
 from smartcam.inspection._picture import Picture
 from smartcam.inspection._places import IDENTITY, place
 from smartcam.inspection._tool import Tool, ToolSettings, View
-from smartcam.layout import Field, Layout
+from smartcam.layout import Layout
+from smartcam.layout._inside import Field
 from smartcam.registry import TOOLS
 
 if TYPE_CHECKING:

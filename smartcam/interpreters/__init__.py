@@ -6,22 +6,13 @@ entry points of the group ``smartcam.interpreters``.
 
 from __future__ import annotations
 
-from smartcam.interpreters._base import (
-    Context,
-    Interpreter,
-    PlainInterpreter,
-    Reader,
-    Spec,
-    resolve,
-    run,
-)
+from smartcam.interpreters._base import Context, Interpreter, PlainInterpreter, Reader, resolve, run
 
 __all__ = [
     "Context",
     "Interpreter",
     "PlainInterpreter",
     "Reader",
-    "Spec",
     "resolve",
     "run",
 ]

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.interpreters._base import AnySpec, TypedSpec, plain, run_plain, run_sequence
+    from smartcam.interpreters._base import AnySpec, Spec, TypedSpec, plain, run_plain, run_sequence
     from smartcam.interpreters._localizations import LocalizationsInterpreter
 
 __all__ = [
     "AnySpec",
     "LocalizationsInterpreter",
+    "Spec",
     "TypedSpec",
     "plain",
     "run_plain",
@@ -23,7 +24,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_base": "AnySpec TypedSpec plain run_plain run_sequence",
+            "_base": "Spec AnySpec TypedSpec plain run_plain run_sequence",
             "_localizations": "LocalizationsInterpreter",
         },
     )

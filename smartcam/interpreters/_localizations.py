@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from smartcam.interpreters._base import Context
-    from smartcam.layout import Field, Layout
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import Field
 
 _DEFAULTS: dict[str, Any] = {
     "feature_id": b"",

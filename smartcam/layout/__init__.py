@@ -25,7 +25,7 @@ from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.layout._classes import read_class
 from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
 from smartcam.layout._compiled import compile_text
-from smartcam.layout._text import Field, misfit
+from smartcam.layout._text import misfit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 
     from smartcam.layout._codec import Rows
     from smartcam.layout._tables import TableCodec
+    from smartcam.layout._text import Field
     from smartcam.models import ByteOrder
 
-__all__ = ["Field", "Layout", "Record"]
+__all__ = ["Layout", "Record"]
 
 
 class Layout:

@@ -8,10 +8,10 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.layout._classes import describes_layout, read_class
-    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, misfit
+    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit
     from smartcam.layout._texts import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
-    from smartcam.layout._yaml_files import read_model
+    from smartcam.layout._yaml_files import file_schema, read_model
     from smartcam.layout._yamls import BadYamlError, compose, load
 
 __all__ = [
@@ -19,9 +19,11 @@ __all__ = [
     "TYPES",
     "UNITS",
     "BadYamlError",
+    "Field",
     "ShownUnits",
     "compose",
     "describes_layout",
+    "file_schema",
     "load",
     "misfit",
     "pack_texts",
@@ -35,10 +37,10 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_classes": "describes_layout read_class",
-            "_text": "SI_SYMBOLS TYPES UNITS misfit",
+            "_text": "Field SI_SYMBOLS TYPES UNITS misfit",
             "_texts": "pack_texts",
             "_units": "ShownUnits units_of",
-            "_yaml_files": "read_model",
+            "_yaml_files": "file_schema read_model",
             "_yamls": "BadYamlError compose load",
         },
     )

@@ -28,6 +28,15 @@ MAX_FILES_BESIDE = 1000
 """Largest number of files of a folder that are compared with a wrong file name."""
 
 
+def file_schema(kind: type[BaseModel], what: str) -> dict[str, Any]:
+    """Return the JSON Schema of a kind of files, such as ``scenario``."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **kind.model_json_schema(),
+        "title": f"smartcam {what}",
+    }
+
+
 def read_model(
     path: str | Path,
     label: str,

@@ -14,20 +14,16 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.outlets._entry import OutletEntry
-    from smartcam.outlets._outlet import Column, Outlet, OutletDesk
+    from smartcam.outlets._outlet import Outlet, OutletContext
     from smartcam.outlets._outlets import Outlets
-    from smartcam.outlets._settings import OutletSettings, OutletsFile
-    from smartcam.outlets._stored import StoreQuestion
+    from smartcam.outlets._settings import OutletSettings
 
 __all__ = [
-    "Column",
     "Outlet",
-    "OutletDesk",
+    "OutletContext",
     "OutletEntry",
     "OutletSettings",
     "Outlets",
-    "OutletsFile",
-    "StoreQuestion",
 ]
 
 if not TYPE_CHECKING:
@@ -35,9 +31,8 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_entry": "OutletEntry",
-            "_outlet": "Column OutletDesk Outlet",
+            "_outlet": "OutletContext Outlet",
             "_outlets": "Outlets",
-            "_settings": "OutletSettings OutletsFile",
-            "_stored": "StoreQuestion",
+            "_settings": "OutletSettings",
         },
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from smartcam.outlets._commands import do_command
 from smartcam.outlets._outlets import OutletState, columns_of, stored_accounts
-from smartcam.outlets._settings import mistakes_of
-from smartcam.outlets._stored import read_store
+from smartcam.outlets._settings import OutletsFile, mistakes_of
+from smartcam.outlets._stored import StoreQuestion, read_store
 
 __all__ = [
     "OutletState",
+    "OutletsFile",
+    "StoreQuestion",
     "columns_of",
     "do_command",
     "mistakes_of",

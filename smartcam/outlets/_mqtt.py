@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.outlets._entry import OutletEntry
-    from smartcam.outlets._outlet import OutletDesk
+    from smartcam.outlets._outlet import OutletContext
 
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
@@ -149,8 +149,10 @@ class MqttOutlet(Outlet[MqttSettings]):
     settings_class = MqttSettings
     max_batch: ClassVar[int] = 100
 
-    def __init__(self, name: str, settings: MqttSettings, folder: Path, desk: OutletDesk) -> None:
-        super().__init__(name, settings, folder, desk)
+    def __init__(
+        self, name: str, settings: MqttSettings, folder: Path, context: OutletContext
+    ) -> None:
+        super().__init__(name, settings, folder, context)
         self._stack = contextlib.AsyncExitStack()
         self._client: Any = None
         self._hearing: asyncio.Task[None] | None = None
@@ -194,7 +196,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         stack = contextlib.AsyncExitStack()
         self._stack = stack
         await stack.enter_async_context(client)
-        if settings.commands and self.desk.command is not None:
+        if settings.commands and self.context.command is not None:
             for verb in _VERBS:
                 await client.subscribe(f"{settings.topic}/command/{verb}/#", qos=1)
         await client.publish(online, '{"online":true}', qos=1, retain=True)
@@ -384,9 +386,9 @@ class MqttOutlet(Outlet[MqttSettings]):
                 fields["id"] = given.pop("id")
             if len(self._commands) > MAX_COMMANDS:
                 raise OutletError(f"{MAX_COMMANDS} commands are under way already")
-            if self.desk.command is None or not self.settings.chooses(camera):
+            if self.context.command is None or not self.settings.chooses(camera):
                 raise ConfigurationError(f"there is no camera {camera!r:.120} here")
-            done = await self.desk.command(camera, verb, given)
+            done = await self.context.command(camera, verb, given)
         except SmartCamError as exc:
             return {**fields, "ok": False, "error": str(exc), "kind": type(exc).__name__}
         return {**fields, "ok": True, **done}

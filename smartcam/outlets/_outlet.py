@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 SettingsT = TypeVar("SettingsT", bound="OutletSettings")
 
 
-class OutletDesk:
+class OutletContext:
     """Functions of the process that has the cameras, which an outlet may call.
 
     Args:
@@ -59,7 +59,7 @@ class Outlet(ABC, Generic[SettingsT]):
         name: name of the outlet.
         settings: settings of the outlet.
         folder: folder to which relative paths refer.
-        desk: functions of the process that has the cameras.
+        context: functions of the process that has the cameras.
 
     Attributes:
         settings_class: model of the settings, a class of ``OutletSettings``.
@@ -69,11 +69,13 @@ class Outlet(ABC, Generic[SettingsT]):
     settings_class: ClassVar[type[Any]]
     max_batch: ClassVar[int] = 200
 
-    def __init__(self, name: str, settings: SettingsT, folder: Path, desk: OutletDesk) -> None:
+    def __init__(
+        self, name: str, settings: SettingsT, folder: Path, context: OutletContext
+    ) -> None:
         self.name = name
         self.settings = settings
         self.folder = folder
-        self.desk = desk
+        self.context = context
 
     async def open(self) -> None:
         """Connect to the far end."""

@@ -13,7 +13,7 @@ from smartcam._short_turns import leave_turns, shorten_turns
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.interpreters._inside import LocalizationsInterpreter
-from smartcam.outlets._outlet import Column, OutletDesk
+from smartcam.outlets._outlet import Column, OutletContext
 from smartcam.outlets._pump import Pump
 from smartcam.outlets._settings import mistakes_of, outlet_class
 from smartcam.outlets._spool import Spool, read_account
@@ -59,8 +59,8 @@ class Outlets(Server):
         columns: function that returns names, types and units of an application's values, by its
             layout.
         command: function that carries out a command from an outlet.
-        tell: function that is called with an outlet's name and its trouble, and with "" when that
-            is over.
+        on_trouble: function that is called with an outlet's name and its trouble, and with "" when
+            that is over.
         cameras: function that returns the cameras' names, and whether each is emulated; None if
             that is not known.
         names: function that returns the names of a camera's applications, with their numbers.
@@ -76,7 +76,7 @@ class Outlets(Server):
         *,
         columns: Callable[[str, int], Sequence[Column]] = lambda _camera, _application: (),
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
-        tell: Callable[[str, str], None] = lambda _name, _why: None,
+        on_trouble: Callable[[str, str], None] = lambda _name, _why: None,
         cameras: Callable[[], Mapping[str, bool | None]] = dict,
         names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
     ) -> None:
@@ -85,14 +85,14 @@ class Outlets(Server):
         )
         folder = check_path(folder, "folder", "Outlets")
         check_callable(columns, "columns", "Outlets")
-        check_callable(tell, "tell", "Outlets")
+        check_callable(on_trouble, "on_trouble", "Outlets")
         check_callable(cameras, "cameras", "Outlets")
         check_callable(names, "names", "Outlets")
         if command is not None:
             check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
-        desk = OutletDesk(columns, command, cameras, names)
+        context = OutletContext(columns, command, cameras, names)
         self._pumps: dict[str, Pump] = {}
         for name, given in section.items():
             kind = outlet_class(name, given)
@@ -103,7 +103,7 @@ class Outlets(Server):
                 settings.full,
                 durable=settings.durable,
             )
-            self._pumps[name] = Pump(kind(name, settings, folder, desk), spool, tell)
+            self._pumps[name] = Pump(kind(name, settings, folder, context), spool, on_trouble)
         self._chosen: dict[str, list[Pump]] = {}
         self._started: list[Pump] = []
 

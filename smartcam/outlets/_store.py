@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.outlets._entry import OutletEntry
-    from smartcam.outlets._outlet import Column, OutletDesk
+    from smartcam.outlets._outlet import Column, OutletContext
     from smartcam.outlets._stored import StoredResults, StoreQuestion
 
 VERSION = 2
@@ -90,8 +90,10 @@ class ResultStore(Outlet[StoreSettings]):
 
     settings_class = StoreSettings
 
-    def __init__(self, name: str, settings: StoreSettings, folder: Path, desk: OutletDesk) -> None:
-        super().__init__(name, settings, folder, desk)
+    def __init__(
+        self, name: str, settings: StoreSettings, folder: Path, context: OutletContext
+    ) -> None:
+        super().__init__(name, settings, folder, context)
         self.path = folder / settings.file
         self._file: _StoreFile | None = None
         self._closing: Future[None] | None = None  # closing of the earlier file
@@ -105,7 +107,7 @@ class ResultStore(Outlet[StoreSettings]):
         """
         if self._closing is not None:  # a slow disk may still be closing it
             await asyncio.wait({asyncio.wrap_future(self._closing)})
-        self._file = _StoreFile(self.name, self.path, self.settings, self.desk)
+        self._file = _StoreFile(self.name, self.path, self.settings, self.context)
         await _done(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
@@ -146,11 +148,13 @@ class _StoreFile:
         name: name of the outlet.
         path: path of the file.
         settings: settings of the store.
-        desk: functions of the process that has the cameras.
+        context: functions of the process that has the cameras.
     """
 
-    def __init__(self, name: str, path: Path, settings: StoreSettings, desk: OutletDesk) -> None:
-        self.path, self.settings, self.desk = path, settings, desk
+    def __init__(
+        self, name: str, path: Path, settings: StoreSettings, context: OutletContext
+    ) -> None:
+        self.path, self.settings, self.context = path, settings, context
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{name}.store")
         self._database: sqlite3.Connection | None = None
         self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns of one batch
@@ -297,7 +301,7 @@ class _StoreFile:
                 "REFERENCES results(id), record INTEGER NOT NULL, PRIMARY KEY (id, record))"
             )
             known = self._columns[camera, application] = {}
-            for name, kind, unit in self.desk.columns(camera, application):
+            for name, kind, unit in self.context.columns(camera, application):
                 self._column(database, application, known, (name, kind, unit))
         for record in records:
             for name, value in record.items():

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         Protocol,
         RawRequest,
         Role,
-        Spelled,
         Transport,
         Verdict,
     )
@@ -24,30 +23,13 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
     from smartcam.protocols._framed.framing import HeaderLayout
     from smartcam.protocols._framed.machine import Machine
-    from smartcam.protocols._insight.dialect import INSIGHT
-    from smartcam.protocols._lines import (
-        LineCommand,
-        LineDialect,
-        LineMachine,
-        LineReply,
-        LineRow,
-        unread,
-    )
-    from smartcam.protocols._machine import (
-        Counters,
-        Frame,
-        LinkEnded,
-        LinkFailed,
-        LinkMachine,
-        State,
-    )
+    from smartcam.protocols._lines import LineCommand, LineDialect, LineMachine, LineReply, LineRow
+    from smartcam.protocols._machine import Frame, LinkEnded, LinkFailed, LinkMachine, State
     from smartcam.protocols._ticketed import TicketedDialect
 
 __all__ = [
     "BVS",
-    "INSIGHT",
     "CodeMeaning",
-    "Counters",
     "Dialect",
     "Frame",
     "FramedDialect",
@@ -65,28 +47,25 @@ __all__ = [
     "Protocol",
     "RawRequest",
     "Role",
-    "Spelled",
     "State",
     "StatusBits",
     "TicketedDialect",
     "Transport",
     "Verdict",
     "WireQuirk",
-    "unread",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_base": "CodeMeaning Dialect Protocol RawRequest Role Spelled Transport Verdict",
+            "_base": "CodeMeaning Dialect Protocol RawRequest Role Transport Verdict",
             "_bvs": "BVS",
             "_framed.dialect": "FramedDialect MessageRow StatusBits WireQuirk",
             "_framed.framing": "HeaderLayout",
             "_framed.machine": "Machine",
-            "_insight.dialect": "INSIGHT",
-            "_lines": "LineCommand LineDialect LineMachine LineReply LineRow unread",
-            "_machine": "Counters Frame LinkEnded LinkFailed LinkMachine State",
+            "_lines": "LineCommand LineDialect LineMachine LineReply LineRow",
+            "_machine": "Frame LinkEnded LinkFailed LinkMachine State",
             "_ticketed": "TicketedDialect",
         },
     )

@@ -7,32 +7,38 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.protocols._base import POLICIES, Policy, load_protocol
+    from smartcam.protocols._base import POLICIES, Policy, Spelled, load_protocol
     from smartcam.protocols._bvs import DEFAULT_PORT, HANDBOOK, MessageId, ResultCode
     from smartcam.protocols._framed.constructs import view_fields
     from smartcam.protocols._framed.dialect import SHOWS_TRIGGERS
     from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Framer
     from smartcam.protocols._insight import words
+    from smartcam.protocols._insight.dialect import INSIGHT
     from smartcam.protocols._insight.machine import ONLINE
     from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
-    from smartcam.protocols._machine import Event, ResultBurst, send_each
+    from smartcam.protocols._lines import refuse_line
+    from smartcam.protocols._machine import Counters, Event, ResultBurst, send_each
 
 __all__ = [
     "DEFAULT_MAX_LENGTH",
     "DEFAULT_PORT",
     "HANDBOOK",
+    "INSIGHT",
     "ONLINE",
     "POLICIES",
     "SHOWS_TRIGGERS",
     "TRIGGER_EVENT",
+    "Counters",
     "Event",
     "Framer",
     "MessageId",
     "Policy",
     "ResultBurst",
     "ResultCode",
+    "Spelled",
     "StatusCode",
     "load_protocol",
+    "refuse_line",
     "send_each",
     "view_fields",
     "words",
@@ -42,7 +48,9 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_base": "POLICIES Policy load_protocol",
+            "_lines": "refuse_line",
+            "_insight.dialect": "INSIGHT",
+            "_base": "Spelled POLICIES Policy load_protocol",
             "_bvs": "DEFAULT_PORT HANDBOOK MessageId ResultCode",
             "_framed.constructs": "view_fields",
             "_framed.dialect": "SHOWS_TRIGGERS",
@@ -50,6 +58,6 @@ if not TYPE_CHECKING:
             "_insight.": "words",
             "_insight.machine": "ONLINE",
             "_insight.words": "TRIGGER_EVENT StatusCode",
-            "_machine": "Event ResultBurst send_each",
+            "_machine": "Counters Event ResultBurst send_each",
         },
     )

@@ -117,7 +117,7 @@ class LineCommand(m.Request):
     line: str
 
 
-def unread(line: str) -> m.Message:
+def refuse_line(line: str) -> m.Message:
     """Refuse every line: the ``read`` of a row without an answer, or with a script.
 
     Raises:

@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, get_type
 from smartcam.models import Status
 
 __all__ = [
-    "Acknowledgement",
     "CellValue",
     "ClockAnswer",
     "Connect",
     "ConnectAnswer",
-    "Data",
     "Disconnect",
     "DisconnectAnswer",
     "EndTrigger",
@@ -30,19 +28,16 @@ __all__ = [
     "GetStatus",
     "Image",
     "LoadFile",
-    "MalformedMessage",
     "Message",
     "Notice",
     "Query",
     "QueryAnswer",
     "ReadImage",
     "Reboot",
-    "Report",
     "Request",
     "ResetErrors",
     "ResetErrorsAnswer",
     "ResultContainer",
-    "Sender",
     "SetClock",
     "SetClockAnswer",
     "SetInput",
@@ -57,9 +52,7 @@ __all__ = [
     "SwitchApplication",
     "Trigger",
     "TriggerAnswer",
-    "UInt32",
     "UnknownMessage",
-    "Word",
 ]
 
 

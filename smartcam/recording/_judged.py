@@ -32,14 +32,14 @@ class JudgedResult(NamedTuple):
     Attributes:
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
-        told: True if the picture was recorded with the result's number, as after ``read_image()``;
-            False if it was found by its time. That needs a trigger of this client: without one,
-            the picture is None.
+        linked: True if the picture was recorded with the result's number, as after
+            ``read_image()``; False if it was found by its time. That needs a trigger of this
+            client: without one, the picture is None.
     """
 
     result: Result[Any]
     picture: Frame | None
-    told: bool
+    linked: bool
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:

@@ -58,7 +58,8 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from smartcam.frames import Frame, FrameSource, ReaderStatistics
+    from smartcam.frames import Frame, FrameSource
+    from smartcam.frames._inside import ReaderStatistics
     from smartcam.recording._mcap.form import Item
 
 INTERVAL = 0.5

@@ -52,12 +52,12 @@ class RosbridgeFleet(RosFleet):
             (node.node for node in self.nodes.values()), key=lambda service: service.full_name
         )
 
-    async def wait_tried(self) -> None:
+    async def wait_first_attempts(self) -> None:
         """Wait, for a bounded time, until every node is connected or has failed to connect."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TIMEOUT):
                 for node in self.bridged:
-                    await node.wait_tried()
+                    await node.wait_first_attempts()
 
 
 @contextlib.asynccontextmanager

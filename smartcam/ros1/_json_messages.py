@@ -16,8 +16,7 @@ from smartcam.exceptions import RosMessageError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.ros2 import MessageType
-    from smartcam.ros2._inside import MessageField
+    from smartcam.ros2._inside import MessageField, MessageType
 
 Part: TypeAlias = "str | Raw"
 

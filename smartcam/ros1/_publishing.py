@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.ros1._rosbridge import RosbridgeNode
-    from smartcam.ros2 import MessageType, QoS
+    from smartcam.ros2 import QoS
+    from smartcam.ros2._inside import MessageType
 
 
 class RosbridgePublisher:

@@ -120,7 +120,7 @@ class RosbridgeNode(NamedNode):
         """
         await self._wait(timeout, lambda: self._link.connected)
 
-    async def wait_tried(self) -> None:
+    async def wait_first_attempts(self) -> None:
         """Wait until the bridge is connected, or an attempt has failed."""
         await self._wait(None, lambda: self._link.connected or bool(self._link.failure))
 

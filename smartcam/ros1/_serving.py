@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from smartcam.ros1._json_messages import Part
     from smartcam.ros1._rosbridge import RosbridgeNode
-    from smartcam.ros2 import MessageType, ServiceType
+    from smartcam.ros2._inside import MessageType, ServiceType
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 

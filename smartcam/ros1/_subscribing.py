@@ -10,7 +10,8 @@ from smartcam.ros2._inside import TopicReader
 
 if TYPE_CHECKING:
     from smartcam.ros1._rosbridge import RosbridgeNode
-    from smartcam.ros2 import MessageType, QoS
+    from smartcam.ros2 import QoS
+    from smartcam.ros2._inside import MessageType
 
 MAX_WAITING_MESSAGES: Final = 1000
 """Largest number of messages that wait for a reader, whatever the quality of service."""

@@ -16,33 +16,17 @@ if TYPE_CHECKING:
     from smartcam.ros2._cameras.image_messages import frame_from, pixels_from
     from smartcam.ros2._cameras.node import CameraNode
     from smartcam.ros2._cameras.options import CameraNodeOptions
-    from smartcam.ros2._node.context import RosContext
-    from smartcam.ros2._node.graph import RosGraph
     from smartcam.ros2._node.node import Node
-    from smartcam.ros2._node.parameter_client import ParameterClient
-    from smartcam.ros2._node.parameters import RosParameters
     from smartcam.ros2._node.qos import QoS
-    from smartcam.ros2._node.services import RosClient, RosService
-    from smartcam.ros2._node.topics import RosPublisher, RosSubscription
-    from smartcam.ros2._types.types import MessageType, RosTypes, ServiceType
+    from smartcam.ros2._types.types import RosTypes
 
 __all__ = [
     "CameraNode",
     "CameraNodeOptions",
     "DepthTopics",
-    "MessageType",
     "Node",
-    "ParameterClient",
     "QoS",
-    "RosClient",
-    "RosContext",
-    "RosGraph",
-    "RosParameters",
-    "RosPublisher",
-    "RosService",
-    "RosSubscription",
     "RosTypes",
-    "ServiceType",
     "cloud_from",
     "frame_from",
     "pixels_from",
@@ -57,14 +41,8 @@ if not TYPE_CHECKING:
             "_cameras.image_messages": "frame_from pixels_from",
             "_cameras.node": "CameraNode",
             "_cameras.options": "CameraNodeOptions",
-            "_node.context": "RosContext",
-            "_node.graph": "RosGraph",
             "_node.node": "Node",
-            "_node.parameter_client": "ParameterClient",
-            "_node.parameters": "RosParameters",
             "_node.qos": "QoS",
-            "_node.services": "RosClient RosService",
-            "_node.topics": "RosPublisher RosSubscription",
-            "_types.types": "MessageType RosTypes ServiceType",
+            "_types.types": "RosTypes",
         },
     )

@@ -2,9 +2,10 @@
 
 ::
 
-    async with LinkProxy("127.0.0.1", emulator.port, rules=[Cut(at=20)]) as proxy:
-        async with smartcam.connect(proxy.url(emulator.url)) as camera:
-            ...
+    with ThreadedCamera() as emulator, smartcam.sync.connect(emulator.url) as camera:
+        ...
+
+:mod:`smartcam.testing.proxy` has a link whose bytes get lost, late or changed.
 
 Names are resolved when they are first used.
 """
@@ -16,28 +17,24 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.testing._logs import CameraLog
     from smartcam.testing._suites.interpreters import ContainerSample, InterpreterSuite
     from smartcam.testing._suites.protocols.cameras_under_test import (
         CameraKind,
         LiveCamera,
     )
-    from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent
+    from smartcam.testing._suites.protocols.conversations import Conversation, Received, Sent
     from smartcam.testing._suites.protocols.suite import CameraSuite, ProtocolSuite, WireSuite
     from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
-    from smartcam.testing.proxy._proxy import LinkProxy
 
 __all__ = [
-    "Came",
     "CameraKind",
-    "CameraLog",
     "CameraSuite",
     "ContainerSample",
     "Conversation",
     "InterpreterSuite",
-    "LinkProxy",
     "LiveCamera",
     "ProtocolSuite",
+    "Received",
     "Sent",
     "ThreadedCamera",
     "ThreadedFleet",
@@ -48,12 +45,10 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_logs": "CameraLog",
             "_suites.interpreters": "ContainerSample InterpreterSuite",
             "_suites.protocols.cameras_under_test": "CameraKind LiveCamera",
-            "_suites.protocols.conversations": "Came Conversation Sent",
+            "_suites.protocols.conversations": "Received Conversation Sent",
             "_suites.protocols.suite": "CameraSuite ProtocolSuite WireSuite",
-            "proxy._proxy": "LinkProxy",
             "_threads": "ThreadedCamera ThreadedFleet",
         },
     )

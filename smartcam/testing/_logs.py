@@ -31,8 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.emulator import LogEntry
-    from smartcam.emulator._inside import Visit
+    from smartcam.emulator._inside import LogEntry, Visit
 
 Expected: TypeAlias = "type[m.Message] | m.Message | str | int"
 """A message type or its name, a message with all its fields, or a message id."""
@@ -104,7 +103,7 @@ class CameraLog(Sequence["LogEntry"]):
         return _messages(self._read(), "in")
 
     @property
-    def said(self) -> list[m.Message]:
+    def sent(self) -> list[m.Message]:
         """Messages that the camera has sent."""
         return _messages(self._read(), "out")
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from smartcam.emulator import Device, Scenario, TableScene, WireCamera
-    from smartcam.emulator._inside import BaseFault, FiredFault, Visit
+    from smartcam.emulator import Scenario, TableScene, WireCamera
+    from smartcam.emulator._inside import BaseFault, Device, FiredFault, Visit
     from smartcam.emulator.faults import Fault
     from smartcam.protocols.messages import Message
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._operations import OperationsSite
-    from smartcam.web._teach import TeachSite
     from smartcam.web._wizard import WizardSite
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "FramesSite",
     "LiveSite",
     "OperationsSite",
-    "TeachSite",
     "WizardSite",
 ]
 
@@ -49,7 +47,6 @@ _resolve = lazy(
         "_frames": "FramesSite",
         "_live": "LiveSite",
         "_operations": "OperationsSite",
-        "_teach": "TeachSite",
         "_wizard": "WizardSite",
     },
 )

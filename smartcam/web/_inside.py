@@ -10,8 +10,10 @@ if TYPE_CHECKING:
     from smartcam.web._clouds import Up
     from smartcam.web._guard import new_token
     from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
+    from smartcam.web._teach import TeachSite
 
 __all__ = [
+    "TeachSite",
     "Up",
     "encoded",
     "is_whole_jpeg",
@@ -23,6 +25,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_teach": "TeachSite",
             "_clouds": "Up",
             "_guard": "new_token",
             "_jpeg": "encoded is_whole_jpeg picture",

@@ -18,8 +18,8 @@ from smartcam.web._shapes import OUTLINES
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.emulator import Application, Device, LogEntry, TableScene, WireCamera
-    from smartcam.emulator._inside import BaseFault, FiredFault, WireCodec
+    from smartcam.emulator import Application, TableScene, WireCamera
+    from smartcam.emulator._inside import BaseFault, Device, FiredFault, LogEntry, WireCodec
     from smartcam.models import ByteOrder
 
 SENSOR = (1280, 1024)

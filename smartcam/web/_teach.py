@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from smartcam.frames import FrameSource
-    from smartcam.inspection import Drawing, Inspection, Teaching
+    from smartcam.inspection import Drawing, Inspection
+    from smartcam.inspection._inside import Teaching
 
 MAX_PICTURES: Final = 200
 """Largest number of pictures on the page; the oldest picture of a source makes room."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.web._errors import RefusedError
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site

@@ -12,11 +12,11 @@ from smartcam.calibration import (
     Charuco,
     Checkerboard,
     CircleGrid,
-    Code,
     RobotSigmas,
     Transform,
 )
 from smartcam.calibration.simulation import around, render, view
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Setup, charuco_board
 from tests.calibration.scenes import BENT, CAMERA, FACING, SHEET, STRAIGHT, facing, refused, scene
 

@@ -23,9 +23,9 @@ from smartcam.calibration import (
     fit_corners,
     target_to_data,
 )
+from smartcam.calibration._inside import PictureFolder
 from smartcam.calibration.formats import write_camera_info
 from smartcam.calibration.simulation import render
-from smartcam.calibration.wizards import PictureFolder
 from smartcam.emulator import EmulatedInSight
 from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameSink, StreamFormat, find_format

@@ -15,8 +15,7 @@ import pytest
 
 from smartcam._cli import find as command
 from smartcam._cli.find import fleet_lines, telling
-from smartcam.doctor import FoundPort
-from smartcam.doctor._inside import CameraSearch
+from smartcam.doctor._inside import CameraSearch, FoundPort
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run
@@ -137,6 +136,7 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
     assert [line.get("fleet_camera") for line in lines] == [None, "line1/cam3", "line1/cam4"]
     assert lines[0]["urls"] == [f"bvs://{NETWORK}4:{port}"]
     assert lines[0]["evidence"] == "silent"
+    assert (lines[0]["said"], "received" in lines[0]) == ("", False)
     only = search(f"{NETWORK}2", "--may-disturb", "--fleet", str(fleet))
     assert "it is line1/cam3 of the fleet" in only.out
     assert only.err.startswith("0 of 0 ports tried")
@@ -154,7 +154,7 @@ def found(host: str = "10.0.0.7", **said: object) -> FoundPort:
         "port": 36701,
         "protocols": ("bvs",),
         "evidence": "silent",
-        "said": b"",
+        "received": b"",
         "seconds": 0.1,
     }
     return FoundPort(host=host, **{**given, **said})  # type: ignore[arg-type]
@@ -167,13 +167,13 @@ def test_lines_load_whatever_was_said(tmp_path: Path) -> None:
             found(port=36702),
             found("fd00::7"),
             found("10.0.0.8", protocols=("bvs", "insight"), evidence="ended"),
-            found("10.0.0.9", protocols=(), evidence="other", said=b"SSH"),
+            found("10.0.0.9", protocols=(), evidence="other", received=b"SSH"),
             found("10.0.0.10", refusal="silence"),
             found(
                 "10.0.0.11",
                 protocols=("insight",),
                 evidence="greeted",
-                said=b'Welcome to In-Sight "\x1b[2J # {\xff\nrm: x',
+                received=b'Welcome to In-Sight "\x1b[2J # {\xff\nrm: x',
             ),
         ]
     )

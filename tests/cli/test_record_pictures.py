@@ -54,7 +54,7 @@ def test_a_software_camera_is_recorded_with_its_pictures_or_without(
     found = load_recording(file)
     assert (found.counts.results, found.counts.pictures) == (3, count)
     assert sum(one is not None for one in pictures_in(found)) == count
-    assert all(one.told for one in found.judged(NAME)) == (count > 0)
+    assert all(one.linked for one in found.judged(NAME)) == (count > 0)
 
 
 def test_none_goes_with_a_bag(tmp_path: Path) -> None:

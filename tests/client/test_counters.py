@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from smartcam._client._inside import ClientCounters
 from smartcam._client.counters import Times
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, SubscriberStatistics
-from smartcam.protocols import Counters
+from smartcam.protocols._inside import Counters
 
 SECONDS = st.one_of(st.floats(0, 100), st.sampled_from(HISTOGRAM_BOUNDS), st.just(0.0))
 

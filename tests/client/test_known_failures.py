@@ -17,8 +17,7 @@ import pytest
 
 import smartcam
 from smartcam import Camera, ConnectionLostError, FrameError, ResponseTimeoutError, Result
-from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import Rule, SplitBytes
+from smartcam.testing.proxy import LinkProxy, Rule, SplitBytes
 from tests.client.camera_by_hand import (
     HANDBOOK,
     QUERY,

@@ -3,4 +3,12 @@
 from __future__ import annotations
 
 from smartcam.conformance.camera._report import CameraReport
-from smartcam.conformance.client._tasks import Client, read_results
+from smartcam.conformance.client._runs import ClientRun, perform
+from smartcam.conformance.client._scenes import SCENES
+from smartcam.conformance.client._tasks import (
+    Client,
+    CommandClient,
+    FunctionClient,
+    Outcome,
+    read_results,
+)

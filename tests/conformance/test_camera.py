@@ -112,7 +112,7 @@ def judged() -> Iterator[Judged]:
 @at_any_pace
 def test_judge_documented_camera_finds_nothing(world: tuple[str, str], judged: Judged) -> None:
     report = judged[WORLDS.index(world)]
-    assert [(one.item.name, one.expected, one.came) for one in report.differing] == []
+    assert [(one.item.name, one.expected, one.observed) for one in report.differing] == []
     unseen = {one.item.name for one in report.findings if one.outcome is CheckOutcome.NOT_OBSERVED}
     assert unseen <= {"free-run-needs-no-trigger", "waiting_before_result"}
     assert report.camera.left == ""
@@ -169,7 +169,7 @@ def test_judge_b16_with_every_deviation_pins_them_in_the_url() -> None:
         plain = emulator.url.partition("&")[0]
         report = judge(short_options(plain))
     assert report.url == f"{plain}&quirks=big_endian_number,code,no_id"
-    assert [(one.item.name, one.came) for one in report.differing] == []
+    assert [(one.item.name, one.observed) for one in report.differing] == []
     assert report.quirks.items() >= quirks.items()
 
 
@@ -208,7 +208,7 @@ def test_judge_sinful_camera_fails_the_check(number: int, judged: Judged) -> Non
     sin = camera_sins.SINS[number]
     finding = judged[len(WORLDS) + len(SETTINGS) + number][sin.check]
     assert finding.outcome is CheckOutcome.DIFFERS, finding
-    assert sin.came in finding.came
+    assert sin.came in finding.observed
     assert finding.wire
 
 
@@ -232,7 +232,7 @@ def test_judge_camera_that_talks_before_connect_differs() -> None:
         url = f"bvs://127.0.0.1:{server.getsockname()[1]}?dialect=handbook"
         report = judge(short_options(url), ["silent-before-connect"])
         thread.join()
-    assert report["silent-before-connect"].came.startswith("StatusReport(status=")
+    assert report["silent-before-connect"].observed.startswith("StatusReport(status=")
 
 
 # ---------------------------------------------------------------------- what no setting describes
@@ -275,7 +275,7 @@ def test_judge_answer_that_no_setting_describes_is_reported(
     (report,) = judge_all([Case({"dialect": dialect}, (name,), sin, IMPATIENT)])
     finding = report[name]
     assert finding.outcome is CheckOutcome.UNDESCRIBED
-    assert came in finding.came
+    assert came in finding.observed
     assert name not in report.quirks
     if name in Quirks.model_fields:
         assert report.yaml() == f"quirks: {{}}\n  # {name}: no setting fits"
@@ -353,7 +353,7 @@ def test_judge_nothing_there_fails_one_check_and_ends_soon() -> None:
         report = judge(short_options(f"bvs://127.0.0.1:{port}"))
     assert [one.item.name for one in report.differing] == ["connect-is-answered"]
     assert report.differing[0].expected == "an answer to Connect in one of the dialects"
-    assert "Connection refused" in report.differing[0].came
+    assert "Connection refused" in report.differing[0].observed
 
 
 # ---------------------------------------------------------------------- what is asked for
@@ -417,7 +417,7 @@ def test_judge_what_is_no_camera_shows_the_bytes() -> None:
         url = f"bvs://127.0.0.1:{server.getsockname()[1]}?dialect=handbook"
         report = judge(short_options(url), ["connect-is-answered"])
         thread.join()
-    assert report["connect-is-answered"].came == (
+    assert report["connect-is-answered"].observed == (
         "no frame of handbook begins with 32 32 30 20 72 65 61 64 79 0d 0a: expected 50 53 56 42"
     )
 

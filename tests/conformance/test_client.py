@@ -11,12 +11,18 @@ import pytest
 
 import smartcam
 from smartcam.conformance._dialects import EVERY_DIALECT
-from smartcam.conformance.client import CHECKS, SCENES, CommandClient, FunctionClient, Task, perform
+from smartcam.conformance.client import CHECKS, Task
 from smartcam.conformance.client._checks import Grade
 from smartcam.conformance.client._report import ClientFinding, judge
-from smartcam.conformance.client._runs import ClientRun
 from tests.client.clientkit import ask_again_after
-from tests.conformance.inside import Client
+from tests.conformance.inside import (
+    SCENES,
+    Client,
+    ClientRun,
+    CommandClient,
+    FunctionClient,
+    perform,
+)
 from tests.conformance.pace import at_any_pace, is_first, slowed
 from tests.conformance.plain_client import plain_client
 

@@ -8,9 +8,17 @@ import threading
 
 import pytest
 
-from smartcam.conformance.client import CommandClient, FunctionClient, Outcome, Task
+from smartcam.conformance.client import Task
 from smartcam.exceptions import ConfigurationError
-from tests.conformance.inside import read_results
+from tests.argument_table import KINDS, ODD
+from tests.conformance.inside import (
+    SCENES,
+    CommandClient,
+    FunctionClient,
+    Outcome,
+    perform,
+    read_results,
+)
 from tests.conformance.pace import at_any_pace, slowed
 
 pytestmark = pytest.mark.real_time
@@ -67,6 +75,41 @@ def test_command_with_an_open_quotation_is_refused() -> None:
         CommandClient("./mine '{url} {task}")
 
 
+@pytest.mark.parametrize("odd", sorted(ODD.keys() - KINDS["text"] - {"list"}))
+def test_odd_command_is_refused(odd: str) -> None:
+    with pytest.raises(ConfigurationError):
+        CommandClient(ODD[odd])
+    if odd != "None":
+        with pytest.raises(ConfigurationError):
+            CommandClient("x {task} {url}", cwd=ODD[odd])
+
+
+@pytest.mark.parametrize("odd", sorted(ODD))
+def test_odd_function_is_refused(odd: str) -> None:
+    with pytest.raises(ConfigurationError):
+        FunctionClient(ODD[odd])
+
+
+@pytest.mark.parametrize(
+    ("argument", "odd"),
+    [
+        (argument, odd)
+        for argument, kind in [
+            ("client", "object"),
+            ("scene", "object"),
+            ("dialect", "choice or None"),
+            ("transport", "choice or None"),
+            ("timeout", "seconds"),
+        ]
+        for odd in sorted(ODD.keys() - KINDS[kind])
+    ],
+)
+async def test_odd_argument_of_a_run_is_refused(argument: str, odd: str) -> None:
+    given = {"client": FunctionClient(lambda _: []), "scene": SCENES["trigger"]}
+    with pytest.raises(ConfigurationError):
+        await perform(**{**given, argument: ODD[odd]})
+
+
 # ---------------------------------------------------------------------- what it prints
 
 
@@ -88,13 +131,13 @@ def test_line_that_is_no_result_is_reported(line: bytes) -> None:
 async def test_command_that_ends_well_gives_its_results() -> None:
     code = "import sys; print('0102'); print(*sys.argv[2:], file=sys.stderr)"
     outcome = await command(code).perform(TASK, 60)
-    assert without_time(outcome) == Outcome(results=(b"\x01\x02",), said="switch 3")
+    assert without_time(outcome) == Outcome(results=(b"\x01\x02",), output="switch 3")
     assert outcome.seconds > 0
 
 
 async def test_command_that_fails_has_its_exit_code_and_its_words() -> None:
     outcome = await command("import sys; print('01'); sys.exit('no camera')").perform(TASK, 60)
-    assert without_time(outcome) == Outcome((b"\x01",), "exit code 1", said="no camera")
+    assert without_time(outcome) == Outcome((b"\x01",), "exit code 1", output="no camera")
 
 
 async def test_command_with_exit_code_77_cannot_do_such_a_task() -> None:
@@ -157,7 +200,7 @@ async def test_function_that_is_not_implemented_cannot_do_such_a_task() -> None:
         raise NotImplementedError("it only triggers")
 
     outcome = await FunctionClient(perform).perform(TASK, 60)
-    assert without_time(outcome) == Outcome(supported=False, said="it only triggers")
+    assert without_time(outcome) == Outcome(supported=False, output="it only triggers")
 
 
 async def test_function_that_does_not_end_is_left_behind() -> None:

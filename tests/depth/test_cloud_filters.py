@@ -145,7 +145,7 @@ def test_voxels_equal_those_of_small_gicp() -> None:
 
 def test_voxels_do_not_depend_on_the_points_order() -> None:
     cloud = scattered(3000)
-    mixed = cloud.taken(np.random.default_rng(2).permutation(3000))
+    mixed = cloud.select(np.random.default_rng(2).permutation(3000))
     assert np.allclose(voxel_grid(cloud, 0.05).points, voxel_grid(mixed, 0.05).points, atol=1e-6)
     assert np.array_equal(voxel_grid(cloud, 0.05).points, voxel_grid(cloud, 0.05).points)
 

@@ -124,7 +124,7 @@ def test_voxels_thin_both() -> None:
 
 def test_too_little_overlap_is_reported() -> None:
     source, target = pair(room, 3)
-    part = source.taken(source.points[:, 1] < 0.4)
+    part = source.select(source.points[:, 1] < 0.4)
     beside = Cloud.joined([part, Cloud(part.points + np.float32(5)), Cloud(part.points + 9)])
     found = register(beside, target, max_distance=0.1, min_overlap=0.5)
     assert not found.converged

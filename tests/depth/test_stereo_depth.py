@@ -196,7 +196,7 @@ async def test_pair_ends_with_its_cameras_and_opens_once() -> None:
     with pytest.raises(LocalProtocolError, match="not open"):
         _ = cameras.baseline
     async with cameras:
-        assert cameras.nearest == pytest.approx(
+        assert cameras.min_depth == pytest.approx(
             cameras.camera_info.matrix[0, 0] * cameras.baseline / 47
         )
         waiting = await streaming(cameras, left, right)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
-from smartcam.doctor import Finding, examine
+from smartcam.doctor import examine
+from smartcam.doctor._inside import Finding
 from tests.doctor.inside import _state_checks
 from tests.processes import PATIENCE
 

@@ -11,9 +11,9 @@ import pytest
 
 import smartcam
 from smartcam import doctor
-from smartcam.doctor import Finding, examine
+from smartcam.doctor import examine
 from smartcam.doctor._context import Examination
-from smartcam.doctor._inside import summary
+from smartcam.doctor._inside import Finding, summary
 from smartcam.doctor._timing import Figures, figures
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, faults
 from smartcam.emulator._inside import BaseFault

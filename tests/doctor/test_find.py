@@ -11,8 +11,8 @@ import pytest
 
 import smartcam
 from smartcam import Backoff, ConfigurationError
-from smartcam.doctor import FoundPort, _search
-from smartcam.doctor._inside import CameraSearch
+from smartcam.doctor import _search
+from smartcam.doctor._inside import CameraSearch, FoundPort
 from smartcam.doctor._opening import MAX_SAID_BYTES, Opened, is_own
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Protocol, Transport
@@ -97,7 +97,7 @@ async def test_clients_at_work_notice_nothing() -> None:
             "7": ((), "other"),
         }
         assert [one.urls for one in found[2:3]] == [(f"insight://{NETWORK}3:{port}",)]
-        assert len(found[-1].said) == MAX_SAID_BYTES
+        assert len(found[-1].received) == MAX_SAID_BYTES
         for (client, results, one), had, session in zip(works, before, sessions, strict=True):
             assert len(results) > had > 0, "it has worked before and meanwhile"
             assert results == list(range(1, len(results) + 1)), "each trigger has had its result"
@@ -176,7 +176,7 @@ async def test_what_comes_by_itself_tells(
     port = free_port()
     async with listening(f"{NETWORK}1", port, greeting):
         (found,) = await found_on(port, f"{NETWORK}1")
-    assert (found.protocols, found.evidence, found.said) == (protocols, evidence, greeting)
+    assert (found.protocols, found.evidence, found.received) == (protocols, evidence, greeting)
 
 
 async def test_silence_is_no_insight_camera() -> None:
@@ -298,7 +298,7 @@ async def test_talker_that_never_says_a_line_ends_by_its_deadline() -> None:
         (found,) = await found_on(port, f"{NETWORK}1", timeout=2.0)
         assert loop.time() - begun < 2.1
         await asyncio.sleep(99)  # until the talker has noticed
-    assert (found.evidence, found.said) == ("other", b"Welc")
+    assert (found.evidence, found.received) == ("other", b"Welc")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from tests.processes import network_namespace
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.doctor import Finding
+    from smartcam.doctor._inside import Finding
     from tests.frames.gige.camera import Camera
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from smartcam.doctor import Finding
+from smartcam.doctor._inside import Finding
 from smartcam.doctor._result_checks import MAX_ROWS, PLAUSIBLE, DumpRow, aligned
 from smartcam.emulator import Application, EmulatedCamera, faults
 from smartcam.layout import Layout

@@ -13,8 +13,8 @@ import smartcam
 from smartcam.doctor import examine
 from smartcam.emulator import EmulatedCamera, faults
 from smartcam.emulator._inside import BaseFault
-from smartcam.testing import LinkProxy
 from smartcam.testing import proxy as rules
+from smartcam.testing.proxy import LinkProxy
 from tests.doctor.doctorkit import SHORT, errors, examined, of, severities
 from tests.doctor.inside import Exit
 from tests.handmade import (

@@ -10,7 +10,8 @@ import asyncio
 import socket
 from typing import Self
 
-from smartcam.emulator import Device, EmulatedCamera
+from smartcam.emulator import EmulatedCamera
+from smartcam.emulator._inside import Device
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from tests.emulator.stream_client import TIMEOUT, StreamClient

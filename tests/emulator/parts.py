@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam.emulator import Device, ManualClock, Quirks, Scenario
+from smartcam.emulator import ManualClock, Quirks, Scenario
+from smartcam.emulator._inside import Device
 from tests.emulator.inside import (
     NANOSECONDS,
     InSightCommands,

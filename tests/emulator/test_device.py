@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.emulator import Application, Device, Quirks
+from smartcam.emulator import Application, Quirks
+from smartcam.emulator._inside import Device
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m

@@ -112,7 +112,7 @@ def test_fault_from_yaml_with_a_bare_on() -> None:
     drop, insert = faults.make_faults(given)
     assert drop == faults.Drop(on="Query")
     assert isinstance(insert, faults.Insert)
-    assert insert.word == m.ConnectAnswer(version=1)
+    assert insert.inserted == m.ConnectAnswer(version=1)
 
 
 def test_message_classes_are_names() -> None:
@@ -121,7 +121,7 @@ def test_message_classes_are_names() -> None:
     insert = faults.Insert(
         message=m.ResultContainer, fields={"application": 3, "data": "ff00"}, where="instead"
     )
-    assert insert.word == m.ResultContainer(application=3, data=b"\xff\x00")
+    assert insert.inserted == m.ResultContainer(application=3, data=b"\xff\x00")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
+from smartcam.emulator import Application, EmulatedCamera, ManualClock, Quirks, faults
+from smartcam.emulator._inside import Device
 from smartcam.models import Status
 from smartcam.protocols import Frame
 from smartcam.protocols import messages as m

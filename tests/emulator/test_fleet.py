@@ -10,15 +10,8 @@ import pytest
 import yaml
 
 import smartcam
-from smartcam.emulator import (
-    EmulatedCamera,
-    EmulatedFleet,
-    ManualClock,
-    Scenario,
-    load_scenario,
-    load_scenarios,
-    scenario_schema,
-)
+from smartcam.emulator import EmulatedCamera, EmulatedFleet, ManualClock, Scenario, load_scenario
+from smartcam.emulator._inside import load_scenarios, scenario_schema
 from smartcam.exceptions import ConfigurationError
 from tests import ROOT
 from tests.schemas import plain

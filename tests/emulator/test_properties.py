@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
+from smartcam.emulator import Application, EmulatedCamera, ManualClock, Quirks, faults
+from smartcam.emulator._inside import Device
 from smartcam.models import Status
 from smartcam.protocols import Frame, Machine, Role
 from smartcam.protocols import Transport as CarriedBy

@@ -6,7 +6,8 @@ import tracemalloc
 
 import pytest
 
-from smartcam.emulator import EmulatedCamera, LogEntry
+from smartcam.emulator import EmulatedCamera
+from smartcam.emulator._inside import LogEntry
 from smartcam.emulator._traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, TrafficLog
 from smartcam.exceptions import FrameError, ResponseTimeoutError
 from smartcam.protocols import Frame

@@ -133,7 +133,7 @@ class Plant:
             frames=frames,
         )
         await self.agent.open(PATIENCE)
-        await self.agent.wait_tried()
+        await self.agent.wait_first_attempts()
 
     def cut_off_agent(self) -> None:
         """Have it gone from the bus without a word."""

@@ -53,9 +53,9 @@ class OwnAgentCamera(FleetCamera[Any]):
             observers=observers,
         )
 
-    async def attend(self, timeout: float, *, session: bool = True) -> None:
+    async def follow(self, timeout: float, *, session: bool = True) -> None:
         await self.agent.open(timeout)
-        await super().attend(timeout, session=session)
+        await super().follow(timeout, session=session)
 
     async def close(self) -> None:
         try:

@@ -62,7 +62,7 @@ async def _agent(place: str, url: str) -> None:
     settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
     agent = Agent("agent", Keys(FLEET), ZenohEnd(BusLink(listen=(place,))), {NAME: settings})
     await agent.open(PATIENCE)
-    await agent.wait_tried()
+    await agent.wait_first_attempts()
     await _ready()
 
 
@@ -71,7 +71,7 @@ async def _standby(place: str, url: str, name: str) -> None:
     end = ZenohEnd(BusLink(connect=(place,)))
     agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=Standby.model_validate({}))
     await agent.open(PATIENCE)
-    await agent.wait_tried()
+    await agent.wait_first_attempts()
     await _ready()
 
 

@@ -235,7 +235,7 @@ async def plant(**more: Any) -> AsyncIterator[Plant]:
         file = fleet_file(camera.url, **more)
         made_server = FleetServer(file, bus=None if memory is None else memory.end())
         server = await stack.enter_async_context(made_server)
-        await server.wait_tried()
+        await server.wait_first_attempts()
         if memory is not None:
             end = await memory.end().open(PATIENCE)
             stack.push_async_callback(end.close)

@@ -16,8 +16,8 @@ from tests.fleet.plantkit import certified, plant_file
 
 pytest.importorskip("rosbags", reason="needs the extra ros2")
 
-from smartcam.ros2 import Node, RosContext
-from smartcam.ros2._inside import SETTINGS
+from smartcam.ros2 import Node
+from smartcam.ros2._inside import SETTINGS, RosContext
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 

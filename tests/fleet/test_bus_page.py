@@ -165,7 +165,7 @@ async def everything(bus: MemoryBus, monkeypatch: pytest.MonkeyPatch) -> AsyncIt
         box = await enter(EmulatedCamera(applications=applications(), active=COUNTER, running=True))
         frames = {"url": "synthetic://?size=256x16&fps=50"}
         server = await enter(FleetServer(fleet_file(box.url, frames=frames), bus=bus.end()))
-        await server.wait_tried()
+        await server.wait_first_attempts()
         plain = InProcess(await bus.end().open(PATIENCE))
         for kind in ("results", "status", "events"):
             await plain.topic(f"topic/{kind}/{NAME}")

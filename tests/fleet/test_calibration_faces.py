@@ -272,7 +272,7 @@ async def plant(
         fields: dict[str, Any] = {"listen": free_place(), "cameras": {NAME: entry}}
         file = FleetFile.model_validate({"calibrations": "calibrations", **fields, **more})
         async with FleetServer(file, folder=folder) as server:
-            await server.wait_tried()
+            await server.wait_first_attempts()
             yield server
 
 
@@ -315,7 +315,7 @@ async def in_ros1(folder: Path, **more: Any) -> AsyncIterator[Face]:
         section = RosSection.model_validate({})
         given = (bridge.url, lambda _: None, address, section)
         async with bridged(*given, desks=server.calibrations) as ros:
-            await ros.wait_tried()
+            await ros.wait_first_attempts()
             face = Ros1Face(server, bridge)
             async with running(face.run_robot()):
                 yield face

@@ -46,7 +46,7 @@ class Plant:
     async def start(self) -> None:
         """Have the camera connected."""
         await self._stack.enter_async_context(self.server)
-        await self.server.wait_tried()
+        await self.server.wait_first_attempts()
         ear = await self.bus.end().open(1.0)
         self._stack.push_async_callback(ear.close)
         for kind in ("command", "ask", "reply", "states"):

@@ -296,7 +296,7 @@ async def test_strangers_at_the_port_of_an_agent_keep_only_their_own_address_out
 
     monkeypatch.setattr(_server, "Door", make)
     async with smartcam.fleet.serve(plant_file(keys)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         port = server.address.port
         place, (door,) = ("127.0.0.1", port), made
         while not door.blocked:

@@ -12,7 +12,8 @@ import yaml
 
 import smartcam.fleet
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet import FleetFile, fleet_schema, load_fleet
+from smartcam.fleet import FleetFile, load_fleet
+from smartcam.fleet._inside import fleet_schema
 from tests import ROOT
 from tests.schemas import plain
 

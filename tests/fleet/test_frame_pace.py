@@ -86,7 +86,7 @@ async def test_reader_waits_past_what_has_waited() -> None:
     async with FrameSource(driver) as source, source.reader(timeout=1.0) as reader:
         await driver.streams()
         driver.give(frame(1))
-        assert reader.came == loop.time()
+        assert reader.last_arrival == loop.time()
         await asyncio.sleep(0.1)
         later = loop.call_later(0.05, driver.give, frame(2))
         await reader.fresh(loop.time() - 0.01, loop.time() + 1.0)

@@ -38,7 +38,7 @@ async def plant(folder: Path, text: str = FLEET) -> AsyncIterator[tuple[FleetSer
     bus = MemoryBus()
     server = FleetServer(path, bus=bus.end())
     async with FleetOutlets(server), server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         fleet = Fleet(bus.end(), None, None, None, 20.0, {})
         async with fleet:
             yield server, fleet

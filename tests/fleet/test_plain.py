@@ -83,7 +83,7 @@ async def test_list_says_why_there_is_no_session() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         file = fleet_file(f"bvs://127.0.0.1:{port}", reconnect=False)
         async with smartcam.fleet.FleetServer(file, bus=memory.end()) as server:
-            await server.wait_tried()
+            await server.wait_first_attempts()
             end = await memory.end().open(PATIENCE)
             ((_, said),) = await InProcess(end).ask("cameras/**")
             assert (said["connected"], said["status"], said["status_names"]) == (False, None, [])
@@ -96,7 +96,7 @@ async def test_list_never_has_a_password() -> None:
     memory = MemoryBus()
     file = fleet_file("insight://admin:secret@127.0.0.1:9", reconnect=False)
     async with smartcam.fleet.FleetServer(file, bus=memory.end()) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         end = await memory.end().open(PATIENCE)
         ((_, said),) = await InProcess(end).ask("cameras/**")
         assert said["url"] == "insight://admin@127.0.0.1:9"
@@ -294,7 +294,7 @@ async def test_each_agent_answers_for_its_own_cameras_and_one_for_those_that_nob
     async with EmulatedCamera() as left, EmulatedCamera() as right:
         first, second = await two_agents(memory, left.url, right.url)
         async with first, second:
-            await asyncio.gather(first.wait_tried(), second.wait_tried())
+            await asyncio.gather(first.wait_first_attempts(), second.wait_first_attempts())
             end = await memory.end().open(PATIENCE)
             client = InProcess(end)
             listed = {key: said["agent"] for key, said in await client.ask("cameras/**")}

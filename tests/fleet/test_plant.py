@@ -34,7 +34,7 @@ async def plant(monkeypatch: pytest.MonkeyPatch, *, met: int = 3) -> AsyncIterat
         for name, cameras in (("north", CAMERAS[:3]), ("south", CAMERAS[3:])):
             said = file(dict.fromkeys(cameras, HELLO), agent=name)
             server = await stack.enter_async_context(FleetServer(said, bus=bus.end()))
-            await server.wait_tried()
+            await server.wait_first_attempts()
         yield await stack.enter_async_context(Fleet(bus.end(), None, "plant", None, 2.0, {}))
 
 
@@ -70,7 +70,7 @@ async def test_status_says_why_there_is_no_session_and_who_has_it_reserved() -> 
         FleetServer(said, bus=bus.end()) as server,
         Fleet(bus.end(), None, "plant", None, 2.0, {}) as fleet,
     ):
-        await server.wait_tried()
+        await server.wait_first_attempts()
         async with fleet["here"].reserve():
             known = await fleet.status()
         assert known["here"].reserved_by == in_words(fleet._program.name)

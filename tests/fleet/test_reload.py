@@ -56,7 +56,7 @@ async def line(folder: Path, *names: str, time: float = 0.001) -> AsyncIterator[
         write(path, {name: boxes[name].url for name in names or ("one", "two")})
         bus = MemoryBus()
         server = await stack.enter_async_context(FleetServer(path, bus=bus.end()))
-        await server.wait_tried()
+        await server.wait_first_attempts()
         fleet = Fleet(bus.end(), None, "plant", None, PATIENCE, {})
         await stack.enter_async_context(fleet)
         yield Line(boxes, path, server, fleet)
@@ -87,7 +87,7 @@ async def test_what_did_not_change_goes_on_and_the_rest_is_as_the_file_says(
         assert not under_way.done()  # nobody waited for it
         assert (await under_way).camera == "one"
         assert one.server.hosts["one"] is kept
-        await one.server.wait_tried()
+        await one.server.wait_first_attempts()
         assert sessions(one) == {"one": 1, "three": 1}
         assert (life(box), life(one.boxes["two"])) == ((1, 0), (1, 1))
         assert not one.boxes["two"].sessions
@@ -104,7 +104,7 @@ async def test_a_camera_that_changed_is_opened_again_and_its_results_are_numbere
         await one.fleet["one"].trigger()
         one.write("one", "two", more={"one": {"request_timeout": 4.0}})
         assert (await one.server.reload()).changed == ("one",)
-        await one.server.wait_tried()
+        await one.server.wait_first_attempts()
         assert life(one.boxes["one"]) == (2, 1)
         assert one.server.hosts["one"].settings.request_timeout == 4.0
         assert life(one.boxes["two"]) == (1, 0)
@@ -120,7 +120,7 @@ async def test_cameras_may_change_names(tmp_path: Path) -> None:
         urls = {"one": one.boxes["two"].url, "two": one.boxes["one"].url}
         write(one.path, urls)
         assert (await one.server.reload()).changed == ("one", "two")
-        await one.server.wait_tried()
+        await one.server.wait_first_attempts()
         for name in urls:
             assert one.server.hosts[name].connected
             assert [one.boxes[name].sessions != []] == [True]
@@ -138,15 +138,15 @@ async def test_an_emulated_camera_stays_where_others_are_added(tmp_path: Path) -
 
     put(2)
     async with FleetServer(path, bus=MemoryBus().end()) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         put(3)
         assert await server.reload() == FleetChanges("a1", ("e/cam3",), (), (), 2)
-        await server.wait_tried()
+        await server.wait_first_attempts()
         urls = {name: host.camera.url for name, host in server.hosts.items()}
         put(1, seed=2)
         changes = await server.reload()
         assert changes == FleetChanges("a1", (), ("e/cam2", "e/cam3"), ("e/cam1",), 0)
-        await server.wait_tried()
+        await server.wait_first_attempts()
         assert server.hosts["e/cam1"].camera.url != urls["e/cam1"]
         for name in ("e/cam2", "e/cam3"):
             place = parse_address(urls[name])
@@ -270,7 +270,7 @@ async def test_a_camera_that_a_program_added_stays_its(tmp_path: Path) -> None:
         agent = one.server.agent
         assert agent is not None
         agent.share("three", CameraSettings.make(one.boxes["three"].url, None, {"name": "three"}))
-        await one.server.wait_tried()
+        await one.server.wait_first_attempts()
         one.write("one", "three")
         with pytest.raises(ConfigurationError, match=r"cameras\.three: a program has added"):
             await one.server.reload()
@@ -285,7 +285,7 @@ async def test_two_at_once_are_done_one_after_the_other(tmp_path: Path) -> None:
         first, second = await asyncio.gather(one.server.reload(), one.server.reload())
         assert (first.added, first.removed) == (("three",), ("one",))
         assert second == FleetChanges("a1", (), (), (), 2)
-        await one.server.wait_tried()
+        await one.server.wait_first_attempts()
         assert sessions(one) == {"two": 1, "three": 1}
 
 

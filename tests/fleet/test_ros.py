@@ -158,7 +158,7 @@ async def test_an_application_runs_again_after_its_camera_restarts(
             smartcam.fleet.serve(plant(place, {"cam": camera}, ros2=section)) as server,
             Node("viewer", connect=place) as viewer,
         ):
-            await server.wait_tried()
+            await server.wait_first_attempts()
             heard = viewer.subscribe("/cam/status", STATUS, qos=LATCHED)
             await wait_for(heard, lambda one: one.running)
             assert (await soon(viewer.client("/cam/reboot", TRIGGER).call())).success

@@ -71,7 +71,7 @@ class Pair:
         agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=standby)
         await agent.open(PATIENCE)
         self.agents[name] = agent
-        await agent.wait_tried()
+        await agent.wait_first_attempts()
         return agent
 
     def having(self) -> list[str]:
@@ -212,7 +212,7 @@ async def test_camera_is_not_taken_over_while_another_name_has_it() -> None:
         try:
             await north.close()
             third.share("thief", settings)  # as a Setup that was faster
-            await third.wait_tried()
+            await third.wait_first_attempts()
             await asyncio.sleep(SOON)
             assert third.hosts["thief"].connected
             assert pair.sharing() == ["north"]  # which is closed

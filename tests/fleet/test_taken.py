@@ -45,7 +45,7 @@ async def shop() -> AsyncIterator[Shop]:
         agent = Agent("north", Keys(FLEET), bus.end(), {NAME: settings})
         await agent.open(PATIENCE)
         stack.push_async_callback(agent.close)
-        await agent.wait_tried()
+        await agent.wait_first_attempts()
         address = Address("fleet", "fleet", "127.0.0.1", 7447, path=NAME)
         own = {"name": NAME, "interpret_as": LAYOUT, "reconnect": QUICK}
         program = Program(bus.end(), FLEET, NAME)

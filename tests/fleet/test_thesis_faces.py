@@ -271,7 +271,7 @@ async def in_ros1() -> AsyncIterator[tuple[FleetServer, Face]]:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
         async with bridged(bridge.url, lambda _: None, address, section) as ros:
-            await ros.wait_tried()
+            await ros.wait_first_attempts()
             made = Ros1Face(bridge)
             try:
                 yield server, made
@@ -304,6 +304,6 @@ async def run(face: Face, other: smartcam.Camera[Any]) -> None:
 @pytest.mark.parametrize("face", [in_json, in_ros2, in_ros1])
 async def test_a_face_answers_as_the_table_says(face: Any) -> None:
     async with asyncio.timeout(PATIENCE), face() as (server, made):
-        await server.wait_tried()
+        await server.wait_first_attempts()
         async with smartcam.connect(server.urls[NAME]) as other:
             await run(made, other)

@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 async def server(folder: Path) -> AsyncIterator[FleetServer]:
     async with smartcam.fleet.serve(plant_file(folder)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         yield server
 
 
@@ -124,7 +124,7 @@ async def test_two_agents_and_a_router_between(folder: Path) -> None:
             )
         ) as second,
     ):
-        await asyncio.gather(first.wait_tried(), second.wait_tried())
+        await asyncio.gather(first.wait_first_attempts(), second.wait_first_attempts())
         for name in ("line2/cam1", CAMERA):
             async with (
                 program(url(first, folder / "robot", camera=name)) as robot,
@@ -233,7 +233,7 @@ async def test_expired(server: FleetServer, folder: Path, tmp_path: Path) -> Non
 async def test_any_certificate(folder: Path) -> None:
     file = plant_file(folder, access="any-certificate")
     async with smartcam.fleet.serve(file) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         # what the roles of our own programs may is for them to know, whoever lets them in
         async with program(url(server, folder / "dashboard")) as dashboard:
             dashboard._program.bus.identity = None
@@ -247,7 +247,7 @@ async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(_renewal, "CHECK_INTERVAL", 0.02)
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         session = server.hosts[CAMERA].camera
         async with (
             program(url(server, folder / "robot")) as robot,
@@ -285,7 +285,7 @@ async def test_command_under_way_is_not_cut_off(
     monkeypatch.setattr(_renewal, "CHECK_INTERVAL", 0.02)
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         async with program(url(server, folder / "robot")) as robot:
             async with robot.reserve():
                 waiting = asyncio.ensure_future(_trigger_of_another(server, folder))
@@ -327,7 +327,7 @@ async def test_certificates_that_end_while_all_runs(
     """Sessions go on; who comes new is told; with a new certificate it goes on."""
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         with caplog.at_level(logging.WARNING, "smartcam.fleet"):
             async with soon_expired(server, folder, "operator", "robot") as robot:
                 assert "the certificate of operator robot" in caplog.text

@@ -402,7 +402,7 @@ async def test_flood_of_a_viewer_over_tls_has_nothing_of_an_operator_refused(
     folder = await certified(tmp_path)
     file = plant_file(folder)
     async with smartcam.fleet.serve(file) as server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         port = server.address.port
         async with (
             joined(f"tls/localhost:{port}", folder / "dashboard") as viewer,

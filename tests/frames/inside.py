@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from smartcam.frames._codecs import pictures
 from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES
+from smartcam.frames._codecs.h264 import H264Decoder
 from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._codecs.pictures import to_jpegxl, to_png
 from smartcam.frames._gige import assembler, description, expressions, gvcp, setup

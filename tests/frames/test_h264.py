@@ -21,7 +21,8 @@ from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamp
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from smartcam.frames import Frame, H264Encoder
+    from smartcam.frames import Frame
+    from smartcam.frames._inside import H264Encoder
 
 KEYINT = 8
 

@@ -73,7 +73,7 @@ class Link:
             self.control.sent(size, went, took, age=0.001)
             self.now = went + took
             self.sent.append(Sent(self.now, size, took + 0.001, quality, fps))
-            self.due = max(self.due, went - self.control.rest) + self.control.rest
+            self.due = max(self.due, went - self.control.pause) + self.control.pause
 
     def _through(self, size: int, begun: float) -> float:
         """Return the duration of a transfer, over steps of the link."""

@@ -12,7 +12,8 @@ import pickle
 from typing import Any
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, LayoutError
-from smartcam.layout import Field, Layout, Record
+from smartcam.layout import Layout, Record
+from smartcam.layout._inside import Field
 from smartcam.models import ByteOrder, jsonable
 from tests.fuzz.fuzz_input import Choices, text_of
 

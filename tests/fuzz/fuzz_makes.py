@@ -10,16 +10,21 @@ from __future__ import annotations
 import contextlib
 
 from smartcam.exceptions import FrameError
-from smartcam.makes import IV3, PCIC, SR, read_chunks
+from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.protocols import LineDialect, LineMachine, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
 from tests.fuzz.fuzz_input import Choices
+from tests.makes.cameras import parse_pictures
 
 PARAMETERS: tuple[dict[str, str], ...] = ({}, {"trigger": "async"})
 DIALECTS = (
-    *(one.with_parameters(two) for one in PCIC.dialects.values() for two in PARAMETERS),
-    *IV3.dialects.values(),
-    *SR.dialects.values(),
+    *(
+        one.with_parameters(two)
+        for one in EmulatedIfm.protocol.dialects.values()
+        for two in PARAMETERS
+    ),
+    *EmulatedIv3.protocol.dialects.values(),
+    *EmulatedSr.protocol.dialects.values(),
 )
 QUESTIONS: tuple[m.Request, ...] = (
     m.Trigger(),
@@ -53,7 +58,7 @@ def check(data: bytes) -> None:
     torn = _told(dialect, greeting, asked, _pieces(stream, sizes))
     assert whole == torn, f"{whole} at once, {torn} in pieces {sizes!r}"
     with contextlib.suppress(FrameError):
-        read_chunks(stream)
+        parse_pictures(stream)
 
 
 def _pieces(stream: bytes, sizes: bytes) -> list[bytes]:

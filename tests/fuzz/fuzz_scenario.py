@@ -14,7 +14,8 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smartcam.emulator import Device, Scenario, load_scenarios
+from smartcam.emulator import Scenario
+from smartcam.emulator._inside import Device, load_scenarios
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from tests.emulator.parts import course

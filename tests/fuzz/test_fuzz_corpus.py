@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.emulator import Device
-from smartcam.inspection import Teaching
+from smartcam.emulator._inside import Device
+from smartcam.inspection._inside import Teaching
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.protocols import FramedDialect, LineMachine, Machine

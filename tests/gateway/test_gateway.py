@@ -11,7 +11,8 @@ import pytest
 import smartcam
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
-from smartcam.gateway import Gateway, GatewayFile, GatewaySettings
+from smartcam.gateway import Gateway, GatewaySettings
+from smartcam.gateway._inside import GatewayFile
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.inspection import Picture, Program, Teaching, load_cell
+from smartcam.inspection import Picture, Program, load_cell
+from smartcam.inspection._inside import Teaching
 from tests.fuzz.fuzz_input import Choices, text_of
 from tests.fuzz.fuzz_scenario import measured, scratch
 from tests.inspection.inside import (

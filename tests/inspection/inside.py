@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from smartcam.inspection._camera import frame_inspector
 from smartcam.inspection._camera.frame_inspector import failed_values
+from smartcam.inspection._locate.find import LocatedPart, PartSearch, locate
+from smartcam.inspection._locate.troubles import TeachingTrouble
 from smartcam.inspection._measure.edges import (
     Choice,
     Edge,

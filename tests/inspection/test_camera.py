@@ -393,7 +393,7 @@ async def test_a_driver_with_a_fault_is_a_lost_source(
     async with opened(cell) as camera:
         monkeypatch.setattr(DeskDriver, "open", lambda _: 1 / 0)
         desk.unplug()
-        await until(lambda: "ZeroDivisionError" in camera.trouble_seeing)
+        await until(lambda: "ZeroDivisionError" in camera.frame_trouble)
         with pytest.raises(CameraFaultError):
             await triggered(camera)
         monkeypatch.undo()

@@ -73,7 +73,7 @@ async def test_each_of_equal_results_has_its_own_picture_in_a_recording(
     assert (recorder.counts.results, recorder.counts.pictures) == (5, 5)
     found = [*load_recording(file).judged()]
     assert [one.result.value["level"] for one in found] == [10, 10, 10, 220, 10]
-    assert all(one.told for one in found)
+    assert all(one.linked for one in found)
     for one, frame in zip(found, judged, strict=True):
         assert one.picture is not None
         assert abs(one.picture.utc - frame.utc) < 1e-5

@@ -180,7 +180,7 @@ async def test_outlines_of_located_parts_are_in_a_fleets_frames(tmp_path: Path) 
     server = smartcam.fleet.serve(write_located(tmp_path))
     assert server.file.record is not None
     async with FleetRecorder(server, server.file.record), server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         url = server.urls["cam"]
         async with smartcam.connect(url) as camera, camera.frames() as frames:
             shown = []

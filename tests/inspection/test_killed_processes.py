@@ -174,10 +174,10 @@ async def test_a_killed_source_is_a_system_error_until_it_is_back(tmp_path: Path
         await camera.wait_status(
             lambda status: bool(status & Status.SYSTEM_ERROR), timeout=PATIENCE
         )
-        assert camera.trouble_seeing
+        assert camera.frame_trouble
         await refused(CameraFaultError, camera.trigger)
         assert (await camera.read_image()).startswith(b"\x89PNG")  # the last one that was judged
         await stack.enter_async_context(running(*command))
         await camera.wait_status(lambda status: not status & Status.SYSTEM_ERROR, timeout=PATIENCE)
-        assert camera.trouble_seeing == ""
+        assert camera.frame_trouble == ""
         assert (await camera.trigger(timeout=PATIENCE)).value.ok

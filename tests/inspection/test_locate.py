@@ -14,20 +14,13 @@ import pytest
 
 from smartcam.calibration import fit_plane
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection import (
-    LocatedPart,
-    PartModel,
-    Picture,
-    Region,
-    TeachingError,
-    TeachingTrouble,
-    load_cell,
-)
+from smartcam.inspection import PartModel, Picture, Region, TeachingError, load_cell
 from smartcam.interpreters import Context
 from smartcam.layout import Layout
 from smartcam.registry import INTERPRETERS
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
+from tests.inspection.inside import LocatedPart, TeachingTrouble
 from tests.inspection.proofs.locate import PartSearch, locate
 
 if TYPE_CHECKING:
@@ -129,7 +122,7 @@ def test_what_cannot_be_taught_is_told(
         taught[30:120, 75:85] = False
     with pytest.raises(TeachingError) as caught:
         PartModel.teach(picture, taught)
-    assert caught.value.why is why
+    assert caught.value.reason is why
     assert str(caught.value).startswith(why.value)
 
 

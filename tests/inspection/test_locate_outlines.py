@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection import PartModel, Picture, TeachingError, TeachingTrouble
+from smartcam.inspection import PartModel, Picture, TeachingError
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, photograph, shares
+from tests.inspection.inside import TeachingTrouble
 from tests.inspection.proofs.locate import PartSearch, locate
 
 ezdxf: Any = pytest.importorskip("ezdxf", reason="needs the extra inspection")
@@ -189,7 +190,7 @@ def test_file_that_is_no_outline_is_told(
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(TeachingError, match=said) as caught:
         PartModel.from_outline(tmp_path / name, 10.0)
-    assert caught.value.why is TeachingTrouble[why]
+    assert caught.value.reason is TeachingTrouble[why]
 
 
 def test_drawing_without_unit_or_in_space_is_told(tmp_path: Path) -> None:
@@ -198,13 +199,13 @@ def test_drawing_without_unit_or_in_space_is_told(tmp_path: Path) -> None:
     drawing.saveas(tmp_path / "a.dxf")
     with pytest.raises(TeachingError, match="names no known unit") as caught:
         PartModel.from_outline(tmp_path / "a.dxf", 10.0)
-    assert caught.value.why is TeachingTrouble.UNIT
+    assert caught.value.reason is TeachingTrouble.UNIT
     assert PartModel.from_outline(tmp_path / "a.dxf", 10.0, unit="mm").symmetry.fold == 2
     drawing.modelspace().add_line((0, 0, 0), (3, 3, 9))
     drawing.saveas(tmp_path / "a.dxf")
     with pytest.raises(TeachingError, match="LINE whose z changes") as caught:
         PartModel.from_outline(tmp_path / "a.dxf", 10.0, unit="mm")
-    assert caught.value.why is TeachingTrouble.UNSUPPORTED
+    assert caught.value.reason is TeachingTrouble.UNSUPPORTED
 
 
 def test_arguments_and_settings_that_cannot_work_are_told(tmp_path: Path) -> None:

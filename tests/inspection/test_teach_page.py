@@ -13,8 +13,9 @@ import pytest_asyncio
 
 from smartcam import frames
 from smartcam.calibration import fit_plane
-from smartcam.inspection import Teaching, load_cell
-from smartcam.web import TeachSite
+from smartcam.inspection import load_cell
+from smartcam.inspection._inside import Teaching
+from smartcam.web._inside import TeachSite
 from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong, see
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.inspection import Picture, Teaching, load_cell
-from smartcam.inspection._inside import learned, read_settings, setting_text
+from smartcam.inspection import Picture, load_cell
+from smartcam.inspection._inside import Teaching, learned, read_settings, setting_text
 
 if TYPE_CHECKING:
     from pathlib import Path

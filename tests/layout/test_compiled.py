@@ -18,7 +18,7 @@ from tests.layout.inside import _compiled as compiled
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.layout import Field
+    from smartcam.layout._inside import Field
     from smartcam.models import ByteOrder
 
 TEXT = "n: int32, (x: real32 mm, y: real32 mm)[n]"

@@ -25,7 +25,8 @@ from smartcam.exceptions import (
     LayoutError,
     MissingExtraError,
 )
-from smartcam.layout import Field, Layout, Record
+from smartcam.layout import Layout, Record
+from smartcam.layout._inside import Field
 
 ByteOrder = Literal["little", "big"]
 ORDERS = st.sampled_from(["little", "big"])

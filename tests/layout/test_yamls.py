@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.emulator import EmulatedCamera, load_scenario, load_scenarios
+from smartcam.emulator import EmulatedCamera, load_scenario
+from smartcam.emulator._inside import load_scenarios
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
 from smartcam.layout._inside import BadYamlError, load

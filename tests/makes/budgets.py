@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from smartcam.makes import PCIC, ImageChunk, read_chunks
+from smartcam.makes import EmulatedIfm
 from smartcam.makes._ifm.layouts import check_layout
 from smartcam.protocols import LineDialect, LineMachine, Role, Transport
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, streamed
+from tests.makes.inside import ImageChunk, read_chunks
 
 
 def _ifm_machine(pieces: list[bytes]) -> None:
-    dialect = PCIC.dialects["v3"]
+    dialect = EmulatedIfm.protocol.dialects["v3"]
     assert isinstance(dialect, LineDialect)
     machine = LineMachine(dialect, Role.CLIENT, Transport.TCP, max_length=DEFAULT_MAX_LENGTH)
     for piece in pieces:

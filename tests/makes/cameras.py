@@ -10,9 +10,15 @@ from typing import Any
 from smartcam.emulator import LineCamera
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.testing import CameraKind, LiveCamera
+from tests.makes.inside import read_chunks
 
 IV3_NUMBERS = "count: uint32, passed: bool, tool: uint16, tool_passed: bool, n: uint32"
 NUMBERS = [{"n": number} for number in range(10_000)]
+
+
+def parse_pictures(data: bytes) -> int:
+    """Return the number of pictures in an ifm sensor's answer."""
+    return len(read_chunks(data))
 
 
 @dataclass

@@ -25,8 +25,9 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
     UnsupportedError,
 )
-from smartcam.makes import EmulatedIfm, ImageChunk, read_chunks
+from smartcam.makes import EmulatedIfm
 from tests.handmade import until
+from tests.makes.inside import ImageChunk, read_chunks
 
 PATIENCE = 10.0
 TYPELESS = b'{"layouter":"flexible","elements":[{"type":1}]}'

@@ -25,8 +25,9 @@ import pytest
 
 from smartcam.emulator import ManualClock
 from smartcam.emulator.faults import Delay
-from smartcam.makes import EmulatedIfm, ImageChunk
+from smartcam.makes import EmulatedIfm
 from smartcam.protocols import messages as m
+from tests.makes.inside import ImageChunk
 
 CONFIDENCE = 300
 """Type of the chunk of a confidence image."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from smartcam.exceptions import FrameError
-from smartcam.makes import IV3, PCIC, SR
+from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Status
 from smartcam.protocols import LineCommand, LineReply
 from smartcam.protocols import messages as m
-from smartcam.testing import Came, Conversation, Sent, WireSuite
+from smartcam.testing import Conversation, Received, Sent, WireSuite
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 APPS_7 = "003\t07\t01\t07\t12"
@@ -40,13 +40,13 @@ def code(line: str) -> m.ResultContainer:
 
 V3_SESSION = (
     Sent(m.Connect(), b"1000L000000008\r\n1000G?\r\n"),
-    Came(v3(1000, WHO), (), b"1001L000000008\r\n1001p7\r\n"),
-    Came(v3(1001, "*"), (m.ConnectAnswer(version=1),)),
+    Received(v3(1000, WHO), (), b"1001L000000008\r\n1001p7\r\n"),
+    Received(v3(1001, "*"), (m.ConnectAnswer(version=1),)),
 )
 
 
 class TestPcicWire(WireSuite):
-    protocol = PCIC
+    protocol = EmulatedIfm.protocol
     conversations = (
         Conversation(
             name="a trigger by its ticket, and what the device says meanwhile",
@@ -54,23 +54,25 @@ class TestPcicWire(WireSuite):
             steps=[
                 *V3_SESSION,
                 Sent(m.GetStatus(), v3(1002, "E?")),
-                Came(v3(1002, "000000000"), (m.StatusReport(status=READY),)),
+                Received(v3(1002, "000000000"), (m.StatusReport(status=READY),)),
                 Sent(m.Query(), v3(1003, "A?")),
-                Came(v3(1003, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
+                Received(v3(1003, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
                 Sent(m.Trigger(), v3(1004, "A?") + v3(1005, "T?")),
                 Sent(m.Query(), v3(1006, "A?")),
-                Came(v3("0000", "star;old;stop"), ()),
-                Came(v3(1004, APPS_7), (), v3(1007, "A?")),
-                Came(v3(1006, APPS_7), ()),
-                Came(v3(1007, APPS_7), (result(7, b"star;old;stop"), m.QueryAnswer(application=7))),
-                Came(
+                Received(v3("0000", "star;old;stop"), ()),
+                Received(v3(1004, APPS_7), (), v3(1007, "A?")),
+                Received(v3(1006, APPS_7), ()),
+                Received(
+                    v3(1007, APPS_7), (result(7, b"star;old;stop"), m.QueryAnswer(application=7))
+                ),
+                Received(
                     v3("0001", "110001006:Trigger overrun"),
                     (m.Notice("error", 110001006, "Trigger overrun"),),
                 ),
-                Came(v3("0010", "000500000:{}"), (m.Notice("notification", 500000, "{}"),)),
-                Came(v3(1005, "star;\r\n\xff;stop"), (), v3(1008, "A?")),
-                Came(v3("0010", "000500002:{}"), ()),
-                Came(
+                Received(v3("0010", "000500000:{}"), (m.Notice("notification", 500000, "{}"),)),
+                Received(v3(1005, "star;\r\n\xff;stop"), (), v3(1008, "A?")),
+                Received(v3("0010", "000500002:{}"), ()),
+                Received(
                     v3(1008, APPS_7),
                     (
                         m.TriggerAnswer(),
@@ -86,18 +88,18 @@ class TestPcicWire(WireSuite):
             steps=[
                 *V3_SESSION,
                 Sent(m.SwitchApplication(application=12), v3(1002, "a12")),
-                Came(v3(1002, "*"), (), v3(1003, "A?")),
-                Came(v3(1003, "003\t12\t01\t07\t12"), (m.SwitchAnswer(application=12),)),
+                Received(v3(1002, "*"), (), v3(1003, "A?")),
+                Received(v3(1003, "003\t12\t01\t07\t12"), (m.SwitchAnswer(application=12),)),
                 Sent(m.ReadImage(), v3(1004, "I01?")),
-                Came(v3(1004, "!"), (), v3(1005, "I02?")),
-                Came(v3(1005, "!"), (m.Image(code=1, data=b""),)),
+                Received(v3(1004, "!"), (), v3(1005, "I02?")),
+                Received(v3(1005, "!"), (m.Image(code=1, data=b""),)),
                 Sent(m.SetInput(data=b"bolt"), v3(1006, "j00000000004bolt")),
-                Came(v3(1006, "*"), (m.SetInputAnswer(),)),
+                Received(v3(1006, "*"), (m.SetInputAnswer(),)),
                 Sent(m.Trigger(), v3(1007, "A?") + v3(1008, "T?")),
-                Came(v3(1008, "!"), (m.TriggerAnswer(code=4),)),
+                Received(v3(1008, "!"), (m.TriggerAnswer(code=4),)),
                 Sent(LineCommand(line="S?"), v3(1009, "S?")),
-                Came(v3(1009, "?"), (LineReply(code=2, data=b"?"),)),
-                Came(v3(1010, "*"), (FrameError,)),
+                Received(v3(1009, "?"), (LineReply(code=2, data=b"?"),)),
+                Received(v3(1010, "*"), (FrameError,)),
             ],
         ),
         Conversation(
@@ -107,9 +109,9 @@ class TestPcicWire(WireSuite):
             steps=[
                 *V3_SESSION,
                 Sent(m.Trigger(), v3(1002, "A?") + v3(1003, "t")),
-                Came(v3(1002, APPS_7), ()),
-                Came(v3(1003, "*"), (m.TriggerAnswer(),)),
-                Came(
+                Received(v3(1002, APPS_7), ()),
+                Received(v3(1003, "*"), (m.TriggerAnswer(),)),
+                Received(
                     v3("0001", "110001006:Trigger overrun"),
                     (
                         m.Notice("error", 110001006, "Trigger overrun"),
@@ -117,35 +119,35 @@ class TestPcicWire(WireSuite):
                         m.StatusReport(status=READY),
                     ),
                 ),
-                Came(v3("0000", "star;1;stop"), (), v3(1004, "A?")),
-                Came(v3("0000", "star;2;stop"), ()),
-                Came(v3(1004, APPS_7), (result(7, b"star;1;stop"),), v3(1005, "A?")),
-                Came(v3(1005, "003\t12\t01\t07\t12"), (result(12, b"star;2;stop", "7, 12"),)),
+                Received(v3("0000", "star;1;stop"), (), v3(1004, "A?")),
+                Received(v3("0000", "star;2;stop"), ()),
+                Received(v3(1004, APPS_7), (result(7, b"star;1;stop"),), v3(1005, "A?")),
+                Received(v3(1005, "003\t12\t01\t07\t12"), (result(12, b"star;2;stop", "7, 12"),)),
             ],
         ),
         Conversation(
             name="no frame",
             dialect="v3",
-            steps=[*V3_SESSION, Came(b"1002L00000000x\r\n", (FrameError,))],
+            steps=[*V3_SESSION, Received(b"1002L00000000x\r\n", (FrameError,))],
         ),
         Conversation(
             name="a length that is not kept",
             dialect="v3",
-            steps=[*V3_SESSION, Came(b"0000L000000008\r\n0000abcd", (FrameError,))],
+            steps=[*V3_SESSION, Received(b"0000L000000008\r\n0000abcd", (FrameError,))],
         ),
         Conversation(
             name="v4: answers in order, with their length",
             dialect="v4",
             steps=[
                 Sent(m.Connect(), b"G?\r\n"),
-                Came(v4(WHO), (), b"p0\r\n"),
-                Came(v4("*"), (m.ConnectAnswer(version=1),)),
+                Received(v4(WHO), (), b"p0\r\n"),
+                Received(v4("*"), (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"A?\r\n"),
                 Sent(m.Query(), b""),
-                Came(v4("001\t01\t01"), (), b"T?\r\n"),
-                Came(v4("star;1;stop"), (), b"A?\r\n"),
-                Came(v4("001\t01\t01"), (), b"A?\r\n"),
-                Came(
+                Received(v4("001\t01\t01"), (), b"T?\r\n"),
+                Received(v4("star;1;stop"), (), b"A?\r\n"),
+                Received(v4("001\t01\t01"), (), b"A?\r\n"),
+                Received(
                     v4("001\t01\t01"),
                     (m.TriggerAnswer(), result(1, b"star;1;stop"), m.QueryAnswer(application=1)),
                 ),
@@ -156,13 +158,13 @@ class TestPcicWire(WireSuite):
             dialect="v2",
             steps=[
                 Sent(m.Connect(), b"1000G?\r\n"),
-                Came(f"1000{WHO}\r\n".encode(), (), b"1001p7\r\n"),
-                Came(b"1001*\r\n", (m.ConnectAnswer(version=1),)),
+                Received(f"1000{WHO}\r\n".encode(), (), b"1001p7\r\n"),
+                Received(b"1001*\r\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"1002A?\r\n1003T?\r\n"),
-                Came(f"1002{APPS_7}\r\n".encode(), ()),
-                Came(b"0000star;old;stop\r\n", (), b"1004A?\r\n"),
-                Came(b"1003!\r\n", ()),
-                Came(
+                Received(f"1002{APPS_7}\r\n".encode(), ()),
+                Received(b"0000star;old;stop\r\n", (), b"1004A?\r\n"),
+                Received(b"1003!\r\n", ()),
+                Received(
                     f"1004{APPS_7}\r\n".encode(),
                     (result(7, b"star;old;stop"), m.TriggerAnswer(code=4)),
                 ),
@@ -173,32 +175,32 @@ class TestPcicWire(WireSuite):
             dialect="v1",
             steps=[
                 Sent(m.Connect(), b"G?\r\n"),
-                Came(f"{WHO}\r\n".encode(), (), b"p0\r\n"),
-                Came(b"*\r\n", (m.ConnectAnswer(version=1),)),
+                Received(f"{WHO}\r\n".encode(), (), b"p0\r\n"),
+                Received(b"*\r\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Query(), b"A?\r\n"),
-                Came(b"!\r\n", (m.QueryAnswer(application=m.UNNAMED_APPLICATION),)),
+                Received(b"!\r\n", (m.QueryAnswer(application=m.UNNAMED_APPLICATION),)),
             ],
         ),
     )
 
 
 class TestIv3Wire(WireSuite):
-    protocol = IV3
+    protocol = EmulatedIv3.protocol
     conversations = (
         Conversation(
             name="triggers, programs and errors",
             dialect="lines",
             steps=[
                 Sent(m.Connect(), b"RT\r"),
-                Came(b"ER,RT,03\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
+                Received(b"ER,RT,03\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
                 Sent(m.Query(), b"PR\r"),
-                Came(b"PR,099\r", (m.QueryAnswer(application=99),)),
+                Received(b"PR,099\r", (m.QueryAnswer(application=99),)),
                 Sent(m.Trigger(), b"PR\r"),
                 Sent(m.Query(), b""),
-                Came(b"PR,098\r", (), b"T2\r"),
-                Came(b"RT,00003,NG,01,OK,0000095\r", (), b"PR\r"),
-                Came(b"PR,098\r", (), b"PR\r"),
-                Came(
+                Received(b"PR,098\r", (), b"T2\r"),
+                Received(b"RT,00003,NG,01,OK,0000095\r", (), b"PR\r"),
+                Received(b"PR,098\r", (), b"PR\r"),
+                Received(
                     b"PR,098\r",
                     (
                         m.TriggerAnswer(),
@@ -217,13 +219,13 @@ class TestIv3Wire(WireSuite):
                     ),
                 ),
                 Sent(m.SwitchApplication(application=7), b"PW,7\r"),
-                Came(b"ER,PW,22\r", (), b"PR\r"),
-                Came(b"PR,099\r", (m.SwitchAnswer(code=22, application=99),)),
+                Received(b"ER,PW,22\r", (), b"PR\r"),
+                Received(b"PR,099\r", (m.SwitchAnswer(code=22, application=99),)),
                 Sent(m.Trigger(), b"PR\r"),
-                Came(b"PR,099\r", (), b"T2\r"),
-                Came(b"ER,T2,03\r", (m.TriggerAnswer(code=3),)),
+                Received(b"PR,099\r", (), b"T2\r"),
+                Received(b"ER,T2,03\r", (m.TriggerAnswer(code=3),)),
                 Sent(LineCommand(line="DR,03,0"), b"DR,03,0\r"),
-                Came(b"DR,03,0,0023250\r", (LineReply(data=b"DR,03,0,0023250"),)),
+                Received(b"DR,03,0,0023250\r", (LineReply(data=b"DR,03,0,0023250"),)),
             ],
         ),
         Conversation(
@@ -231,16 +233,18 @@ class TestIv3Wire(WireSuite):
             dialect="lines",
             steps=[
                 Sent(m.Connect(), b"RT\r"),
-                Came(b"RT,00000,NG\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
+                Received(
+                    b"RT,00000,NG\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))
+                ),
                 Sent(m.Query(), b"PR\r"),
-                Came(b"PW\r", (FrameError,)),
+                Received(b"PW\r", (FrameError,)),
             ],
         ),
     )
 
 
 class TestSrWire(WireSuite):
-    protocol = SR
+    protocol = EmulatedSr.protocol
     conversations = (
         Conversation(
             name="readings, with other answers between",
@@ -248,22 +252,22 @@ class TestSrWire(WireSuite):
             parameters={"bank": "3"},
             steps=[
                 Sent(m.Connect(), b"ERRSTAT\r"),
-                Came(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
+                Received(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
                 Sent(m.GetStatus(), b"BUSYSTAT\r"),
-                Came(b"OK,BUSYSTAT,NONE\r", (m.StatusReport(status=READY),)),
+                Received(b"OK,BUSYSTAT,NONE\r", (m.StatusReport(status=READY),)),
                 Sent(m.Trigger(), b"LON,03\r"),
                 Sent(m.Query(), b"NUM\r"),
-                Came(b"OK,NUM,1,0\r", (m.QueryAnswer(application=3),)),
-                Came(b"4006381333931\r", (m.TriggerAnswer(), code("4006381333931"))),
-                Came(b"4012345678901\r", (code("4012345678901"),)),
+                Received(b"OK,NUM,1,0\r", (m.QueryAnswer(application=3),)),
+                Received(b"4006381333931\r", (m.TriggerAnswer(), code("4006381333931"))),
+                Received(b"4012345678901\r", (code("4012345678901"),)),
                 Sent(m.Trigger(), b"LON,03\r"),
                 Sent(m.EndTrigger(), b"LOFF\r"),
-                Came(b"ERROR\r", (m.TriggerAnswer(), code("ERROR"))),
+                Received(b"ERROR\r", (m.TriggerAnswer(), code("ERROR"))),
                 Sent(m.Trigger(), b"LON,03\r"),
-                Came(b"ER,LON,20\r", (m.TriggerAnswer(code=20),)),
-                Came(b"ER,LOFF,20\r", (m.Notice("error", 20, "ER,LOFF,20"),)),
+                Received(b"ER,LON,20\r", (m.TriggerAnswer(code=20),)),
+                Received(b"ER,LOFF,20\r", (m.Notice("error", 20, "ER,LOFF,20"),)),
                 Sent(LineCommand(line="BCLR"), b"BCLR\r"),
-                Came(b"ER,BCLR,00\r", (LineReply(code=100, data=b"ER,BCLR,00"),)),
+                Received(b"ER,BCLR,00\r", (LineReply(code=100, data=b"ER,BCLR,00"),)),
             ],
         ),
         Conversation(
@@ -271,8 +275,8 @@ class TestSrWire(WireSuite):
             dialect="lines",
             steps=[
                 Sent(m.Connect(), b"ERRSTAT\r"),
-                Came(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
-                Came(b"ER,XYZ,00\r", (FrameError,)),
+                Received(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
+                Received(b"ER,XYZ,00\r", (FrameError,)),
             ],
         ),
     )

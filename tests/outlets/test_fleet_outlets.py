@@ -16,8 +16,7 @@ import pytest
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet import FleetServer, MemoryBus, load_fleet
 from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
-from smartcam.outlets import StoreQuestion
-from smartcam.outlets._inside import read_store
+from smartcam.outlets._inside import StoreQuestion, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
 from tests.outlets.outletkit import FarEnd, ListOutlet, until
@@ -43,7 +42,7 @@ def fleet(folder: Path, text: str = FLEET) -> Path:
 async def serving(path: Path) -> Any:
     server = FleetServer(path, bus=MemoryBus().end())
     async with FleetOutlets(server) as outlets, server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await until(lambda: server.hosts["line1/cam1"].connected)
         yield server, outlets.outlets
 
@@ -240,7 +239,7 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
     path = fleet(tmp_path, f"listen: tcp/127.0.0.1:0\n{FLEET}")
     server = FleetServer(path)
     async with FleetOutlets(server) as outlets, server:
-        await server.wait_tried()
+        await server.wait_first_attempts()
         await server.hosts["line1/cam1"].camera.trigger(timeout=20)
         await until(lambda: outlets.outlets.states["store"].account.delivered == 1)
         url = f"fleet://127.0.0.1:{server.address.port}"
@@ -256,11 +255,11 @@ async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path
 
 
 async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path: Path) -> None:
-    from smartcam.outlets import OutletDesk, OutletEntry
+    from smartcam.outlets import OutletContext, OutletEntry
 
     kind: Any = OUTLETS.load("sqlite")
     settings = kind.settings_class.model_validate({"file": "results.sqlite"})
-    store = kind("s", settings, tmp_path, OutletDesk(lambda _c, _a: [("passed", "bool", "")]))
+    store = kind("s", settings, tmp_path, OutletContext(lambda _c, _a: [("passed", "bool", "")]))
     await store.open()
     body = '{{"camera":"a","application":1,"value":{{"passed":{}}}}}'
     await store.deliver(

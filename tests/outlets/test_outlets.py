@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
-from smartcam.outlets import OutletEntry, Outlets, OutletsFile
+from smartcam.outlets import OutletEntry, Outlets
+from smartcam.outlets._inside import OutletsFile
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import FarEnd, ListOutlet, numbers, result, until
 

@@ -17,8 +17,8 @@ import pytest
 from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, EntryRefusedError
 from smartcam.models import PoseSigma
-from smartcam.outlets import OutletDesk, OutletEntry, Outlets, StoreQuestion
-from smartcam.outlets._inside import columns_of, read_store
+from smartcam.outlets import OutletContext, OutletEntry, Outlets
+from smartcam.outlets._inside import StoreQuestion, columns_of, read_store
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import result, until
 
@@ -39,7 +39,7 @@ def entry(number: int, value: Any, *, at: float | None = None, kind: str = "resu
 
 def store(folder: Path, columns: Any = COLUMNS, **settings: Any) -> Any:
     found = STORE.settings_class.model_validate({"file": "results.sqlite", **settings})
-    return STORE("sqlite", found, folder, OutletDesk(lambda _camera, _application: columns))
+    return STORE("sqlite", found, folder, OutletContext(lambda _camera, _application: columns))
 
 
 def rows(folder: Path, query: str) -> list[Any]:

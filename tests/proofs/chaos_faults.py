@@ -12,8 +12,8 @@ from typing import Any, Literal, Protocol
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.models import Status
-from smartcam.testing import LinkProxy
 from smartcam.testing import proxy as rules
+from smartcam.testing.proxy import LinkProxy
 
 CAMERA_MESSAGES = ("StatusReport", "ResultContainer", "QueryAnswer", "SwitchAnswer", "ClockAnswer")
 CLIENT_MESSAGES = ("Trigger", "SetSequenceNumber", "Query", "Stop", "Start", "SwitchApplication")

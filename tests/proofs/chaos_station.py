@@ -18,7 +18,7 @@ from smartcam.backoff import Backoff
 from smartcam.camera import Camera
 from smartcam.models import Result, Statistics
 from smartcam.streams import Subscription
-from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import LinkProxy
 from tests.client.clientkit import imbalances
 from tests.proofs.books import (
     LINK_LOST,

@@ -26,7 +26,8 @@ from smartcam import (
     Status,
     StatusChanged,
 )
-from smartcam.emulator import EmulatedCamera, LogEntry, Run
+from smartcam.emulator import EmulatedCamera, Run
+from smartcam.emulator._inside import LogEntry
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ResultCode

@@ -38,7 +38,8 @@ from smartcam.exceptions import InterpretationError, SmartCamError, WrongApplica
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Result
 from smartcam.protocols import BVS
-from smartcam.testing import LinkProxy, proxy
+from smartcam.testing import proxy
+from smartcam.testing.proxy import LinkProxy
 from tests.client.clientkit import imbalances, loop_reports
 from tests.makes.cameras import IV3_NUMBERS
 from tests.timed_loop import TimedLoop

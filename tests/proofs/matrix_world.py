@@ -24,7 +24,7 @@ from smartcam.camera import Camera
 from smartcam.models import Result
 from smartcam.protocols import BVS, FramedDialect
 from smartcam.protocols._inside import ResultCode
-from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import LinkProxy
 from tests.client.clientkit import imbalances, loop_reports
 from tests.proofs.books import BookKeeper, ClientEar, layout_of
 

@@ -251,7 +251,7 @@ async def agent(program: Any) -> None:
             ):
                 if made is None or asked is None:
                     return
-                await program.call(made.wait_tried(), fails=True)
+                await program.call(made.wait_first_attempts(), fails=True)
                 async with asyncio.timeout(50), aiohttp.ClientSession() as session:
                     for path in ("/healthz", "/metrics"):
                         url = f"http://127.0.0.1:{asked.port}{path}"

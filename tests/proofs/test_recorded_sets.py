@@ -18,19 +18,20 @@ import pytest
 
 from benchmarks.recorded_robots import read_poses
 from smartcam.calibration import (
-    Code,
     calibrate_hand_eye_from_poses,
     calibrate_intrinsics,
     calibrate_stereo,
     compare,
     find_target,
 )
+from smartcam.geometry._inside import Code
 from tests.calibration.scenes import PAIRS_BOARD
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.calibration import HandEyeCalibration, Remark, TargetView
+    from smartcam.calibration import HandEyeCalibration, TargetView
+    from smartcam.geometry._inside import Remark
 
 DATA = Path(__file__).parents[1] / "data"
 DEBIAN = Path("/usr/share/doc/opencv-doc/examples/data")

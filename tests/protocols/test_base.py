@@ -19,12 +19,11 @@ from smartcam.protocols import (
     Protocol,
     RawRequest,
     Role,
-    Spelled,
     Transport,
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy
+from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, Spelled
 from tests.machines import B16, BID, CODE, NO_ID, THESIS
 from tests.protocols.inside import UNDOCUMENTED
 

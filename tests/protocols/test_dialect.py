@@ -14,17 +14,9 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import Status
-from smartcam.protocols import (
-    CodeMeaning,
-    Frame,
-    FramedDialect,
-    RawRequest,
-    Spelled,
-    StatusBits,
-    Verdict,
-)
+from smartcam.protocols import CodeMeaning, Frame, FramedDialect, RawRequest, StatusBits, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, ResultCode
+from smartcam.protocols._inside import HANDBOOK, ResultCode, Spelled
 from tests.machines import (
     B16,
     BID,

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError, LocalProtocolError, UnsupportedError
 from smartcam.models import Status
-from smartcam.protocols import INSIGHT, Frame, LinkEnded, LinkFailed, Role, State, Transport
+from smartcam.protocols import Frame, LinkEnded, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import Event
+from smartcam.protocols._inside import INSIGHT, Event
 from tests.protocols.inside import (
     MAX_LINE_BYTES,
     MAX_READ_BYTES,

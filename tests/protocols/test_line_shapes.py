@@ -22,11 +22,11 @@ from smartcam.protocols import (
     TicketedDialect,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import refuse_line
 from smartcam.registry import PROTOCOLS
-from smartcam.testing import Came, Conversation, Sent, WireSuite
+from smartcam.testing import Conversation, Received, Sent, WireSuite
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 
@@ -91,7 +91,7 @@ ECHO = LineDialect(
         LineRow(m.GetStatus, "RS", m.StatusReport, status),
         LineRow(m.Query, "PR", m.QueryAnswer, query),
         LineRow(m.Trigger, "TA", m.ResultContainer, taken, echo="TA", also=(m.TriggerAnswer,)),
-        LineRow(m.EndTrigger, "TE", None, unread),
+        LineRow(m.EndTrigger, "TE", None, refuse_line),
     ),
     split=first_word,
     codes=CODES,
@@ -134,12 +134,12 @@ class TestSeveralLines(WireSuite):
             dialect="several",
             steps=[
                 Sent(m.Connect(), b"VER\n"),
-                Came(b"Model 2\nOK\n", (m.ConnectAnswer(version=1),)),
+                Received(b"Model 2\nOK\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"MEASURE\n"),
                 Sent(m.Query(), b""),
-                Came(b"BUSY\n", (m.StatusReport(status=READY),)),
-                Came(b"1.5\n2.5\nOK\n", (result("1.5\n2.5\nOK"),), b"SCENE\n"),
-                Came(b"7\n", (m.QueryAnswer(application=7),)),
+                Received(b"BUSY\n", (m.StatusReport(status=READY),)),
+                Received(b"1.5\n2.5\nOK\n", (result("1.5\n2.5\nOK"),), b"SCENE\n"),
+                Received(b"7\n", (m.QueryAnswer(application=7),)),
             ],
         ),
     )
@@ -153,13 +153,13 @@ class TestEcho(WireSuite):
             dialect="echo",
             steps=[
                 Sent(m.Connect(), b"RM\n"),
-                Came(b"RM,1\n", (m.ConnectAnswer(version=1),)),
+                Received(b"RM,1\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"TA\n"),
                 Sent(m.EndTrigger(), b"TE\n"),
-                Came(b"TA\n", ()),
-                Came(b"12.5,1\n", (m.TriggerAnswer(), result("12.5,1"))),
+                Received(b"TA\n", ()),
+                Received(b"12.5,1\n", (m.TriggerAnswer(), result("12.5,1"))),
                 Sent(m.Trigger(), b"TA\n"),
-                Came(b"ER,TA,03\n", (m.TriggerAnswer(code=3),)),
+                Received(b"ER,TA,03\n", (m.TriggerAnswer(code=3),)),
             ],
         ),
         Conversation(
@@ -167,9 +167,9 @@ class TestEcho(WireSuite):
             dialect="echo",
             steps=[
                 Sent(m.Connect(), b"RM\n"),
-                Came(b"RM,1\n", (m.ConnectAnswer(version=1),)),
+                Received(b"RM,1\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"TA\n"),
-                Came(b"12.5,1\n", (FrameError,)),
+                Received(b"12.5,1\n", (FrameError,)),
             ],
         ),
     )
@@ -183,14 +183,14 @@ class TestIds(WireSuite):
             dialect="atonce",
             steps=[
                 Sent(m.Connect(), b"||1>TYPE\n"),
-                Came(b"||1>Model\n", (m.ConnectAnswer(version=1),)),
+                Received(b"||1>Model\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"||2>READ\n"),
                 Sent(m.Query(), b"||3>JOB\n"),
-                Came(b"||0>somebody else's\n", (result("somebody else's"),)),
-                Came(b"||3>5\n", (m.QueryAnswer(application=5),)),
-                Came(b"||2>A\n", (result("A"),)),
+                Received(b"||0>somebody else's\n", (result("somebody else's"),)),
+                Received(b"||3>5\n", (m.QueryAnswer(application=5),)),
+                Received(b"||2>A\n", (result("A"),)),
                 Sent(m.Trigger(), b"||1>READ\n"),
-                Came(b"||2>A\n", (FrameError,)),
+                Received(b"||2>A\n", (FrameError,)),
             ],
         ),
     )
@@ -326,7 +326,7 @@ def test_frames_have_as_many_digits_as_their_dialect_says(tickets: range, digits
 
 
 OWN = (
-    LineRow(m.Reboot, "RESTART", None, unread),
+    LineRow(m.Reboot, "RESTART", None, refuse_line),
     LineRow(LineCommand, "{line}", LineReply, lambda line: LineReply(data=line.encode())),
 )
 

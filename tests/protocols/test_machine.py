@@ -19,7 +19,6 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Status
 from smartcam.protocols import (
-    Counters,
     Frame,
     FramedDialect,
     LinkEnded,
@@ -30,7 +29,14 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event, Policy, ResultBurst
+from smartcam.protocols._inside import (
+    DEFAULT_MAX_LENGTH,
+    HANDBOOK,
+    Counters,
+    Event,
+    Policy,
+    ResultBurst,
+)
 from tests.machines import (
     B16,
     BID,

@@ -89,7 +89,7 @@ async def recording(
     agent = server(place, *urls, source=source)
     recorder = FleetRecorder(agent, section(**fields), _clock=clock)
     async with recorder, agent:
-        await agent.wait_tried()
+        await agent.wait_first_attempts()
         yield recorder, agent
 
 

@@ -263,7 +263,7 @@ async def test_full_disk_is_told_once_counted_and_heals(
         agent = server(tmp_path, box.url)
         recorder = FleetRecorder(agent, section(), on_trouble=told.append)
         async with recorder, agent:
-            await agent.wait_tried()
+            await agent.wait_first_attempts()
             camera = agent.hosts[NAME].camera
             assert (await camera.trigger()).raw[:4] == b"\1\0\0\0"
             await until(lambda: not recorder.accounts[NAME].waiting)

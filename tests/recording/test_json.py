@@ -35,7 +35,8 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import RawFrame, TraceEntry
-from smartcam.protocols import BVS, INSIGHT, Frame
+from smartcam.protocols import BVS, Frame
+from smartcam.protocols._inside import INSIGHT
 from smartcam.protocols.messages import Sender
 from smartcam.recording._mcap.json import MAX_CACHED_FRAME_TEXTS, FrameTexts, body_of, frame_text
 from tests.recording.inside import KINDS, message_fields, message_of, nanoseconds

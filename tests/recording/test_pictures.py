@@ -543,7 +543,9 @@ def test_result_has_the_picture_that_the_recorder_was_told(tmp_path: Path) -> No
             if number != 2:
                 recorder.add_picture(shot(number), result=result(number, number))
     found = [*load_recording(path).judged("left")]
-    numbers = [(one.result.number, one.picture and one.picture.sequence, one.told) for one in found]
+    numbers = [
+        (one.result.number, one.picture and one.picture.sequence, one.linked) for one in found
+    ]
     assert numbers == [(1, 1, True), (2, None, False), (3, 3, True)]
 
 
@@ -556,7 +558,7 @@ def test_result_of_a_later_client_never_has_the_picture_of_an_earlier_ones(tmp_p
             recorder.add_picture(shot(number, utc=BEGIN + seconds + 1.5), result=made)
     found = [*load_recording(path).judged("left")]
     assert [one.picture and one.picture.sequence for one in found] == [1, 2]
-    assert all(one.told for one in found)
+    assert all(one.linked for one in found)
 
 
 def test_triggered_result_has_the_first_picture_surely_exposed_after_the_trigger(
@@ -577,7 +579,7 @@ def test_triggered_result_has_the_first_picture_surely_exposed_after_the_trigger
     found = [*load_recording(path).judged()]
     numbers = [(one.result.number, one.picture and one.picture.sequence) for one in found]
     assert numbers == [(1, 2), (2, 4), (3, None)]
-    assert not any(one.told for one in found)
+    assert not any(one.linked for one in found)
 
 
 def test_result_that_nobody_triggered_has_no_picture_by_the_times(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ async def test_a_fleet_is_seen_and_used_from_ros1() -> None:
     async with Bridge() as bridge, smartcam.fleet.serve(plant) as server, asyncio.timeout(PATIENCE):
         address = FleetAddress.parse(server.address.url)
         async with bridged(bridge.url, heard.append, address, section) as ros:
-            await ros.wait_tried()
+            await ros.wait_first_attempts()
             names = ["/plant/cam4", "/plant/line_1/cam3"]
             assert [one.full_name for one in ros.bridged] == ros.names == names
             assert sorted(one.full_name for one in heard) == names

@@ -14,6 +14,7 @@ from smartcam.ros2._cameras.image_messages import (
 from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
 from smartcam.ros2._cameras.results import CameraResults
 from smartcam.ros2._node.attachment import Attachment
+from smartcam.ros2._node.parameters import RosParameters
 from smartcam.ros2._node.qos import PARAMETERS, SENSOR_DATA
 from smartcam.ros2._node.tokens import Entity, gid_of
 from smartcam.ros2._types.built_in import MESSAGES, SERVICES

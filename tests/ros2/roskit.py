@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from smartcam.ros2 import Node, RosContext, RosTypes
-from smartcam.ros2._inside import NativeContext, NativeNode
+from smartcam.ros2 import Node, RosTypes
+from smartcam.ros2._inside import NativeContext, NativeNode, RosContext
 from tests.processes import free_place
 
 PATIENCE = 60.0

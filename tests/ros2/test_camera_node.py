@@ -11,11 +11,12 @@ import pytest
 
 import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, SmartCamError
-from smartcam.ros2 import CameraNode, CameraNodeOptions, Node, RosParameters
+from smartcam.ros2 import CameraNode, CameraNodeOptions, Node
 from smartcam.ros2._inside import LATCHED, OK
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import Plant
 from tests.processes import free_place
+from tests.ros2.inside import RosParameters
 from tests.ros2.nodekit import COUNTER, FAST, NAME, OTHER, NotedNode, away, box, seen, until
 from tests.ros2.roskit import make_node, soon, way
 
@@ -348,7 +349,7 @@ async def test_closing_waits_for_what_is_being_opened() -> None:
 async def test_a_camera_of_a_fleet_whose_agent_goes_and_comes() -> None:
     async with Plant() as plant, plant.camera() as camera:
         node = NotedNode()
-        options = CameraNodeOptions(agent_alive=lambda: camera._caller.met is not None)
+        options = CameraNodeOptions(is_agent_alive=lambda: camera._caller.met is not None)
         async with CameraNode(camera, node, options=options) as made:
             await until(lambda: made.lifecycle.active)
             assert node.last("~/status").ready

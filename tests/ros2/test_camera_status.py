@@ -224,7 +224,7 @@ async def test_changes_that_come_too_fast_leave_the_last_one() -> None:
 
 async def test_a_camera_that_was_not_heard_of_is_stale() -> None:
     heard = False
-    async with away(3600, agent_alive=lambda: heard) as one:
+    async with away(3600, is_agent_alive=lambda: heard) as one:
         assert _diagnosis(one).level == STALE
         assert "closed the connection" in _diagnosis(one).message
         heard = True

@@ -60,7 +60,7 @@ class Pair:
     def __init__(self) -> None:
         self.frames: asyncio.Queue[DepthFrame] = asyncio.Queue()
         self.opened = self.closed = 0
-        self.nearest = 0.5
+        self.min_depth = 0.5
 
     async def __aenter__(self) -> Any:
         self.opened += 1

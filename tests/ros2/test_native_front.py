@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import HandEyeCalibration, PlaneCalibration
-from smartcam.calibration.formats import ROBOTS, pose_to
+from smartcam.calibration._inside import ROBOTS
+from smartcam.calibration.formats import pose_to
 from smartcam.fleet._inside import RosSection
 
 pytestmark = pytest.mark.long

@@ -23,9 +23,9 @@ from smartcam.exceptions import (
     ServiceCallError,
     ServiceTimeoutError,
 )
-from smartcam.ros2 import Node, QoS, RosContext
-from smartcam.ros2._inside import LATCHED
-from smartcam.testing import LinkProxy
+from smartcam.ros2 import Node, QoS
+from smartcam.ros2._inside import LATCHED, RosContext
+from smartcam.testing.proxy import LinkProxy
 from tests.processes import free_place
 from tests.ros2.inside import Attachment
 from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, TRIGGER, soon, two_nodes, until

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
-from smartcam.ros2 import Node, RosParameters, RosTypes
+from smartcam.ros2 import Node, RosTypes
 from smartcam.ros2._node.parameter_values import decode_value, encode_value, typed
+from tests.ros2.inside import RosParameters
 
 PATIENCE = 10.0
 INT64 = (1 << 63) - 1

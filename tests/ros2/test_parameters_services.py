@@ -17,7 +17,8 @@ from smartcam.exceptions import (
     ServiceTimeoutError,
     SmartCamError,
 )
-from smartcam.ros2 import Node, RosContext
+from smartcam.ros2 import Node
+from smartcam.ros2._inside import RosContext
 from tests.processes import free_place
 from tests.ros2.inside import PARAMETERS
 from tests.ros2.roskit import STRING, soon, two_nodes, until

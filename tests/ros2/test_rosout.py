@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import RosError
-from smartcam.ros2 import Node, RosPublisher
+from smartcam.ros2 import Node
 from smartcam.ros2._node.rosout import MAX_TEXT_CHARACTERS, MAX_WAITING_RECORDS, ROSOUT, RosOut
+from smartcam.ros2._node.topics import RosPublisher
 from tests.processes import free_place
 from tests.ros2.roskit import soon, two_nodes, until
 

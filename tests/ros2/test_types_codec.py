@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smartcam.exceptions import RosMessageError
-from smartcam.ros2 import MessageType, RosTypes
+from smartcam.ros2 import RosTypes
+from smartcam.ros2._inside import MessageType
 from tests.ros2.inside import MESSAGES
 from tests.ros2.typekit import add_test_msgs, drawn
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from smartcam.ros2 import MessageType, RosTypes
+from smartcam.ros2 import RosTypes
+from smartcam.ros2._inside import MessageType
 from tests.ros2.typekit import ASCII, add_test_msgs, drawn
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from tests.ros2.inside import INTEGERS, NUMBERS, stored
 if TYPE_CHECKING:
     import random
 
-    from smartcam.ros2 import MessageType, RosTypes
+    from smartcam.ros2 import RosTypes
+    from smartcam.ros2._inside import MessageType
 
 ASCII = ("", "a", "camera", "x" * 17)
 WORDS = (*ASCII, "größe", "部品")

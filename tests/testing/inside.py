@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from smartcam.testing.proxy import _log
+from smartcam.testing.proxy._log import Entry
 from smartcam.testing.proxy._rules import (
     MAX_COPY_BYTES,
     MAX_HOLD_BYTES,

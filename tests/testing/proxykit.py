@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import Rule
+from smartcam.testing.proxy import LinkProxy, Rule
 from tests.handmade import until
 
 HOST = "127.0.0.1"

@@ -64,7 +64,7 @@ async def test_good_client_meets_every_expectation(emulator: ThreadedCamera) -> 
     log.expect_disconnect_before_close(timeout=PATIENCE)
     log.expect_no_errors()
     assert m.Trigger() in log.received
-    assert any(isinstance(message, m.ResultContainer) for message in log.said)
+    assert any(isinstance(message, m.ResultContainer) for message in log.sent)
 
 
 def test_message_that_did_not_come_is_named_with_the_log(emulator: ThreadedCamera) -> None:

@@ -13,10 +13,10 @@ import pytest
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
-from smartcam.protocols import BVS, INSIGHT, Transport
+from smartcam.protocols import BVS, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import HANDBOOK, ONLINE
-from smartcam.testing import Came, Conversation, Sent, WireSuite
+from smartcam.protocols._inside import HANDBOOK, INSIGHT, ONLINE
+from smartcam.testing import Conversation, Received, Sent, WireSuite
 from smartcam.testing._suites.protocols.conversations import Step
 from tests import ROOT
 from tests.machines import B16, BID, THESIS
@@ -53,8 +53,8 @@ def framed(dialect: FramedDialect, transport: Transport) -> Conversation:
     def came(*messages: m.Message) -> list[Step]:
         told = [carried(dialect, one) for one in messages if dialect.has(type(one))]
         if transport is Transport.UDP:
-            return [Came(dialect.encode(one), (one,)) for one in told]
-        return [Came(b"".join(map(dialect.encode, told)), tuple(told))] if told else []
+            return [Received(dialect.encode(one), (one,)) for one in told]
+        return [Received(b"".join(map(dialect.encode, told)), tuple(told))] if told else []
 
     def sent(message: m.Message) -> list[Step]:
         return [Sent(message, dialect.encode(message))] if dialect.has(type(message)) else []
@@ -84,8 +84,8 @@ def broken(
         name=f"{dialect.label}, {error.__name__}",
         steps=[
             Sent(m.Connect(), dialect.encode(m.Connect())),
-            Came(dialect.encode(answer), (answer,)),
-            Came(data, (error,)),
+            Received(dialect.encode(answer), (answer,)),
+            Received(data, (error,)),
         ],
         dialect=dialect.name,
     )
@@ -115,9 +115,9 @@ class TestBvs(WireSuite):
 
 LOGGING_IN: list[Step] = [
     Sent(m.Connect(), b""),
-    Came(b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: ", (), b"op\r\n"),
-    Came(b"Password: ", (), b"f00l\r\n"),
-    Came(b"User Logged In\r\n", (m.ConnectAnswer(code=1, version=1),)),
+    Received(b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: ", (), b"op\r\n"),
+    Received(b"Password: ", (), b"f00l\r\n"),
+    Received(b"User Logged In\r\n", (m.ConnectAnswer(code=1, version=1),)),
 ]
 CELLS = (m.CellValue("A001", "12.5"), m.CellValue("B001", None))
 
@@ -132,22 +132,22 @@ class TestInSight(WireSuite):
             steps=[
                 *LOGGING_IN,
                 Sent(m.GetStatus(), b"GO\r\n"),
-                Came(b"1\r\n", (m.StatusReport(status=ONLINE),)),
+                Received(b"1\r\n", (m.StatusReport(status=ONLINE),)),
                 Sent(m.Query(), b"GJ\r\n"),
-                Came(b"1\r\n7\r\n", (m.QueryAnswer(code=1, application=7),)),
+                Received(b"1\r\n7\r\n", (m.QueryAnswer(code=1, application=7),)),
                 Sent(m.Stop(), b"SO0\r\n"),
-                Came(b"1\r\n", (m.StopAnswer(code=1),)),
+                Received(b"1\r\n", (m.StopAnswer(code=1),)),
                 Sent(m.SwitchApplication(application=12), b"SJ12\r\n"),
-                Came(b"1\r\n", (), b"GJ\r\n"),
-                Came(b"1\r\n12\r\n", (m.SwitchAnswer(code=1, application=12),)),
+                Received(b"1\r\n", (), b"GJ\r\n"),
+                Received(b"1\r\n12\r\n", (m.SwitchAnswer(code=1, application=12),)),
                 Sent(m.Start(), b"SO1\r\n"),
-                Came(b"1\r\n", (m.StartAnswer(code=1),)),
+                Received(b"1\r\n", (m.StartAnswer(code=1),)),
                 Sent(m.Trigger(), b"SW8\r\n"),
-                Came(b"1\r\n", (m.TriggerAnswer(code=1),), b"GJ\r\n"),
-                Came(b"1\r\n12\r\n", (), b"GVA001\r\n"),
-                Came(b"1\r\n12.5\r\n", (), b"GVB001\r\n"),
-                Came(b"-1\r\n", (), b"GJ\r\n"),
-                Came(
+                Received(b"1\r\n", (m.TriggerAnswer(code=1),), b"GJ\r\n"),
+                Received(b"1\r\n12\r\n", (), b"GVA001\r\n"),
+                Received(b"1\r\n12.5\r\n", (), b"GVB001\r\n"),
+                Received(b"-1\r\n", (), b"GJ\r\n"),
+                Received(
                     b"1\r\n12\r\n",
                     (
                         m.ResultContainer(
@@ -156,7 +156,7 @@ class TestInSight(WireSuite):
                     ),
                 ),
                 Sent(m.ReadImage(), b"RI\r\n"),
-                Came(b"1\r\n50\r\n" + IMAGE_LINES, (m.Image(code=1, data=BITMAP),)),
+                Received(b"1\r\n50\r\n" + IMAGE_LINES, (m.Image(code=1, data=BITMAP),)),
                 Sent(m.Disconnect(), b""),
             ],
         ),
@@ -165,15 +165,15 @@ class TestInSight(WireSuite):
             dialect="native",
             steps=[
                 Sent(m.Connect(), b""),
-                Came(GREETING, (), b"admin\r\n"),
-                Came(b"Password: ", (), b"\r\n"),
-                Came(b"Invalid Password\r\n", (m.ConnectAnswer(code=-6, version=1),)),
+                Received(GREETING, (), b"admin\r\n"),
+                Received(b"Password: ", (), b"\r\n"),
+                Received(b"Invalid Password\r\n", (m.ConnectAnswer(code=-6, version=1),)),
             ],
         ),
         Conversation(
             name="no camera",
             dialect="native",
-            steps=[Sent(m.Connect(), b""), Came(b"SSH-2.0-OpenSSH_9.2\r\n", (FrameError,))],
+            steps=[Sent(m.Connect(), b""), Received(b"SSH-2.0-OpenSSH_9.2\r\n", (FrameError,))],
         ),
     )
 

@@ -26,7 +26,7 @@ from smartcam.protocols import LineDialect as Dialect
 from smartcam.protocols import LineMachine as Machine
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
-from smartcam.testing import Came, Conversation, Sent, WireSuite
+from smartcam.testing import Conversation, Received, Sent, WireSuite
 from smartcam.testing._suites.protocols.words import ABILITIES
 from tests.testing.acme_page import acme, acme_is_known
 
@@ -36,7 +36,7 @@ ACME: Protocol = acme.ACME
 LINES: Dialect = acme.LINES
 
 CELLS = (m.CellValue("0", "12.5"), m.CellValue("1", "bolt"))
-CONNECT = (Sent(m.Connect(), b"HELLO\n"), Came(b"ACME\n", (m.ConnectAnswer(version=1),)))
+CONNECT = (Sent(m.Connect(), b"HELLO\n"), Received(b"ACME\n", (m.ConnectAnswer(version=1),)))
 TALK = Conversation(
     name="a trigger",
     dialect="lines",
@@ -44,15 +44,15 @@ TALK = Conversation(
     steps=(
         *CONNECT,
         Sent(m.GetStatus(), b"STATE\n"),
-        Came(b"stop\n", (m.StatusReport(status=Status(0)),)),
+        Received(b"stop\n", (m.StatusReport(status=Status(0)),)),
         Sent(m.Query(), b"PROGRAM\n"),
-        Came(b"7\n", (m.QueryAnswer(application=7),)),
+        Received(b"7\n", (m.QueryAnswer(application=7),)),
         Sent(m.Trigger(), b"TRIGGER\n"),
-        Came(b"12.5 bolt\n", (m.ResultContainer(data=b"12.5 bolt", cells=CELLS),)),
+        Received(b"12.5 bolt\n", (m.ResultContainer(data=b"12.5 bolt", cells=CELLS),)),
     ),
 )
 NONSENSE = Conversation(
-    name="nonsense", dialect="lines", steps=(*CONNECT, Came(b"what?\n", (FrameError,)))
+    name="nonsense", dialect="lines", steps=(*CONNECT, Received(b"what?\n", (FrameError,)))
 )
 
 
@@ -444,7 +444,7 @@ def test_machine_that_does_not_fail_fails() -> None:
 
 
 def test_machine_that_raises_fails() -> None:
-    talk = dataclasses.replace(TALK, steps=(*CONNECT, Came(b"\xff\n", (FrameError,))))
+    talk = dataclasses.replace(TALK, steps=(*CONNECT, Received(b"\xff\n", (FrameError,))))
     with pytest.raises(UnicodeDecodeError):
         fails(ANYTHING, changed(machine=Raising), conversation=talk)
 

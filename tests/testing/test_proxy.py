@@ -12,17 +12,16 @@ import pytest
 import smartcam
 from smartcam import ConfigurationError, ConnectFailedError, TriggerTimeoutError
 from smartcam.emulator import EmulatedCamera
-from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
     DelayBytes,
     Drip,
     DuplicateBytes,
-    Entry,
     Flip,
     InsertBytes,
     Late,
+    LinkProxy,
     Lose,
     Rate,
     Reorder,
@@ -30,8 +29,8 @@ from smartcam.testing.proxy import (
     SplitBytes,
     Stall,
 )
-from smartcam.testing.proxy import _log as log
-from tests.testing.inside import MAX_COPY_BYTES, MAX_HOLD_BYTES
+from tests.testing.inside import MAX_COPY_BYTES, MAX_HOLD_BYTES, Entry
+from tests.testing.inside import _log as log
 from tests.testing.proxykit import HOST, MESSAGE, SHORT, client, linked, target
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import pytest
 
-from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
@@ -23,9 +22,9 @@ from smartcam.testing.proxy import (
     Drip,
     DropBytes,
     DuplicateBytes,
-    Entry,
     Flip,
     InsertBytes,
+    LinkProxy,
     Rate,
     ResetConnection,
     Rule,
@@ -35,7 +34,7 @@ from smartcam.testing.proxy import (
 from smartcam.testing.proxy import _directions as directions
 from smartcam.testing.proxy import _tcp as tcp
 from tests.handmade import until
-from tests.testing.inside import Direction
+from tests.testing.inside import Direction, Entry
 from tests.testing.proxykit import (
     HOST,
     MESSAGE,

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import pytest
 
 from smartcam import ConfigurationError
-from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import Entry, Late, Lose, Reorder, Repeat, Rule
+from smartcam.testing.proxy import Late, LinkProxy, Lose, Reorder, Repeat, Rule
 from smartcam.testing.proxy import _udp as udp
 from tests.handmade import until
-from tests.testing.inside import Direction
+from tests.testing.inside import Direction, Entry
 from tests.testing.proxykit import HOST, SHORT, Mailbox, mailbox
 
 FIVE = [b"1", b"2", b"3", b"4", b"5"]

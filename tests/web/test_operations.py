@@ -72,7 +72,7 @@ async def watched(
         server = FleetServer(file(urls, **operations), bus=bus.end())
         site = await stack.enter_async_context(OperationsSite(server))
         await stack.enter_async_context(server)
-        await server.wait_tried()
+        await server.wait_first_attempts()
         fleet = Fleet(bus.end(), None, "plant", None, PATIENCE, {})
         yield server, site, await stack.enter_async_context(fleet), boxes
 
@@ -96,7 +96,7 @@ async def test_it_is_ready_once_each_camera_was_tried_and_stays_so() -> None:
                     await until(lambda: server.hosts["there"].connected)
                     status, said = await readiness()
                     assert (status, said["reason"]) == (503, "1 of 2 cameras were tried")
-                    await server.wait_tried()
+                    await server.wait_first_attempts()
                     status, said = await readiness()
                     assert (status, said["ready"], said["agent"]) == (200, True, "a1")
                     assert (said["connected"], said["not_connected"]) == (1, ["silent"])
@@ -119,7 +119,7 @@ async def test_agent_whose_router_is_gone_is_not_ready_until_that_is_back() -> N
         async with FleetServer(hub):
             site = await stack.enter_async_context(OperationsSite(server))
             await stack.enter_async_context(server)
-            await server.wait_tried()
+            await server.wait_first_attempts()
             assert (await ask(site, "/readyz"))[0] == 200
         await until(lambda: not site.readiness()["ready"])
         status, text = await ask(site, "/readyz")

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import smartcam
-from smartcam.emulator import EmulatedCamera, LogEntry
-from smartcam.emulator._inside import PIECES, TABLE_SIZE
+from smartcam.emulator import EmulatedCamera
+from smartcam.emulator._inside import PIECES, TABLE_SIZE, LogEntry
 from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status

@@ -20,13 +20,9 @@ from smartcam.calibration import (
     Transform,
     target_to_data,
 )
+from smartcam.calibration._inside import PictureFolder
 from smartcam.calibration.simulation import render
-from smartcam.calibration.wizards import (
-    CalibrationService,
-    PictureFolder,
-    hand_eye_wizard,
-    sheet_wizard,
-)
+from smartcam.calibration.wizards import CalibrationService, hand_eye_wizard, sheet_wizard
 from smartcam.exceptions import NotRunningError
 from smartcam.web import WizardSite
 from tests.processes import printed_by

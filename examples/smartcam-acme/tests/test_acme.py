@@ -11,11 +11,11 @@ from smartcam.exceptions import FrameError, TriggerTimeoutError, UnsupportedErro
 from smartcam.protocols import messages as m
 from smartcam.registry import PROTOCOLS
 from smartcam.testing import (
-    Came,
     CameraKind,
     Conversation,
     LiveCamera,
     ProtocolSuite,
+    Received,
     Sent,
     ThreadedCamera,
 )
@@ -24,7 +24,7 @@ PROTOCOLS.register("acme", ACME)  # the entry point does it where the package is
 
 CONNECT = (
     Sent(m.Connect(), b"HELLO\n"),
-    Came(b"ACME\n", (m.ConnectAnswer(version=1),)),
+    Received(b"ACME\n", (m.ConnectAnswer(version=1),)),
 )
 
 
@@ -63,15 +63,15 @@ class TestAcme(ProtocolSuite):
             steps=[
                 *CONNECT,
                 Sent(m.GetStatus(), b"STATE\n"),
-                Came(b"run\n", (m.StatusReport(status=RUNNING),)),
+                Received(b"run\n", (m.StatusReport(status=RUNNING),)),
                 Sent(m.Query(), b"PROGRAM\n"),
-                Came(b"7\n", (m.QueryAnswer(application=7),)),
+                Received(b"7\n", (m.QueryAnswer(application=7),)),
                 Sent(m.Trigger(), b"TRIGGER\n"),
-                Came(b"12.5 bolt\n", (measured("12.5 bolt"),)),
+                Received(b"12.5 bolt\n", (measured("12.5 bolt"),)),
             ],
         ),
         Conversation(
-            name="nonsense", dialect="lines", steps=[*CONNECT, Came(b"what?\n", (FrameError,))]
+            name="nonsense", dialect="lines", steps=[*CONNECT, Received(b"what?\n", (FrameError,))]
         ),
     )
     camera_kinds = (

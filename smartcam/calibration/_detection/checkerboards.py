@@ -29,7 +29,7 @@ from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import apply_homography, fit_homography
 from smartcam.calibration._targets import AREA_DIAMETER_SQUARES, AREA_DISTANCE_SQUARES
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -21,7 +21,7 @@ from smartcam.calibration._detection.ordering import arrangements, leftmost, mar
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import local_steps
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

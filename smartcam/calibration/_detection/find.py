@@ -10,7 +10,7 @@ from smartcam.calibration._detection.circle_grids import find_circles
 from smartcam.calibration._detection.image import grey_image
 from smartcam.calibration._detection.marker_grids import find_marker_grid
 from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, MarkerGrid
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from smartcam.calibration._targets import Target

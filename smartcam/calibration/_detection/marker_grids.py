@@ -22,7 +22,7 @@ from smartcam.calibration._detection.markers import (
 )
 from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

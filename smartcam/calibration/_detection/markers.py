@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._homography import apply_homography, derivatives, fit_homography
-from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,8 +19,7 @@ from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration._views import label
-from smartcam.geometry import Code
-from smartcam.geometry._inside import IDENTITY
+from smartcam.geometry._inside import IDENTITY, Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

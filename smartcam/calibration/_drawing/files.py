@@ -11,7 +11,7 @@ from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._plane.drawing import draw as draw_plane
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

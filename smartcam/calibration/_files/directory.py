@@ -10,7 +10,7 @@ import re
 from typing import TYPE_CHECKING
 
 from smartcam._arguments import check_path
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

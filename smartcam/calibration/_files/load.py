@@ -10,7 +10,7 @@ from smartcam.calibration._files.store import Document, read_document
 from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
 from smartcam.calibration._verdict import warn
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

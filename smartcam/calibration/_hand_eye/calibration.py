@@ -66,8 +66,8 @@ from smartcam.calibration._plane.validation import check_positive
 from smartcam.calibration._statistics import common_move
 from smartcam.calibration._views import as_list, as_views
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Remark, Transform
-from smartcam.geometry._inside import Rigid, as_vector, check_choice
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code, Remark, Rigid, as_vector, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -214,7 +214,7 @@ def calibrate_hand_eye(
             warning for warning in lens_calibration.warnings if warning.code == Code.SHEET_NOT_EXACT
         ]
     located = [locate(view, lens) for view in ordered]
-    if ordered[0].target.turned_alike:
+    if ordered[0].target.half_turn_symmetric:
         ordered = _numbered_alike(ordered, robot, located)
         located = [locate(view, lens) for view in ordered]
         views = [ordered[i] for i in np.argsort(order)]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.geometry import Code
-from smartcam.geometry._inside import Rigid, log_rotation
+from smartcam.geometry._inside import Code, Rigid, log_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,8 +21,8 @@ from smartcam.calibration._verdict import (
     judge,
 )
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import CameraModel, Code, Transform
-from smartcam.geometry._inside import Array, as_motion, as_points, check_finite
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, as_motion, as_points, check_finite
 from smartcam.models import Pose
 
 if TYPE_CHECKING:
@@ -314,7 +314,7 @@ class HandEyeCalibration(storage.SavedCalibration):
             )
         errors_of_views = [
             point_errors(lens, seen.rigid, turned.points, self.target_scale * turned.object_points)
-            for turned in (view, *([half_turned(view)] if view.target.turned_alike else []))
+            for turned in (view, *([half_turned(view)] if view.target.half_turn_symmetric else []))
         ]
         errors = min(errors_of_views, key=lambda view_errors: float(np.median(view_errors)))
         return errors if errors is errors_of_views[0] else errors[::-1]

@@ -20,8 +20,7 @@ from smartcam.calibration._hand_eye.equations import RobotPoses, carried, is_in_
 from smartcam.calibration._hand_eye.validation import seen_poses
 from smartcam.calibration._jackknife import jackknife
 from smartcam.calibration._plane.validation import check_positive
-from smartcam.geometry import Code
-from smartcam.geometry._inside import Rigid
+from smartcam.geometry._inside import Code, Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

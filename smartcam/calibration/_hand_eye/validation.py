@@ -23,8 +23,7 @@ from smartcam.calibration._hand_eye.equations import (
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._views import as_list
-from smartcam.geometry import Code
-from smartcam.geometry._inside import Rigid, as_motion
+from smartcam.geometry._inside import Code, Rigid, as_motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

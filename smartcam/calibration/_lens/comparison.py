@@ -21,8 +21,8 @@ from smartcam.calibration._lens.field import (
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.uncertainty import MapFigures, figures
 from smartcam.calibration._statistics import Noise
-from smartcam.geometry import CameraModel, Code, Transform
-from smartcam.geometry._inside import IDENTITY
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import IDENTITY, Code
 
 if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, Rigid

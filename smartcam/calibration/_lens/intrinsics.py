@@ -33,8 +33,8 @@ from smartcam.calibration._lens.suspicions import examined
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._views import TargetView, as_list, as_views, label
-from smartcam.geometry import CameraModel, Code, Remark, Transform
-from smartcam.geometry._inside import Array, Rigid, check_choice
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, Remark, Rigid, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -305,7 +305,7 @@ def calibrate_intrinsics(
     )
     turned = list[str]()
     target = given[0].target
-    if target.turned_alike and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
+    if target.half_turn_symmetric and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
         calibration, turned = _numbered_alike(calibration, distortion_model, fixed_names, sheet)
     again = functools.partial(
         calibrate_intrinsics,

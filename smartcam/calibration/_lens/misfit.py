@@ -23,8 +23,7 @@ from smartcam.calibration._lens.projection import (
     smooth_changes,
     whitening,
 )
-from smartcam.geometry import Code, Remark
-from smartcam.geometry._inside import COEFFICIENTS
+from smartcam.geometry._inside import COEFFICIENTS, Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

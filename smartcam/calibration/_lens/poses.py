@@ -14,8 +14,8 @@ from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
 from smartcam.calibration._lens.projection import excess
 from smartcam.calibration._views import TargetView, checked
-from smartcam.geometry import CameraModel, Code, Transform
-from smartcam.geometry._inside import Rigid, exp_rotation
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Code, Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,8 +18,7 @@ from smartcam.calibration._lens.bundle import (
     adjust_weighted,
     leave_out,
 )
-from smartcam.geometry import Code, Remark
-from smartcam.geometry._inside import Rigid
+from smartcam.geometry._inside import Code, Remark, Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,8 +16,8 @@ from smartcam.calibration._lens.bundle import (
 )
 from smartcam.calibration._lens.poses import likeliest_poses
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import CameraModel, Code
-from smartcam.geometry._inside import COEFFICIENTS, coefficient_names
+from smartcam.geometry import CameraModel
+from smartcam.geometry._inside import COEFFICIENTS, Code, coefficient_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -25,7 +25,7 @@ from smartcam.calibration._lens.misfit import (
 )
 from smartcam.calibration._lens.projection import excess
 from smartcam.calibration._views import label
-from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

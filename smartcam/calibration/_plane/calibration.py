@@ -53,8 +53,7 @@ from smartcam.calibration._plane.validation import (
 from smartcam.calibration._statistics import Noise, common_move, normal_deviations
 from smartcam.calibration._verdict import Allowed, judge
 from smartcam.exceptions import ConfigurationError
-from smartcam.geometry import Code, Remark
-from smartcam.geometry._inside import Array, as_points, as_vector
+from smartcam.geometry._inside import Array, Code, Remark, as_points, as_vector
 from smartcam.models import Localization
 
 if TYPE_CHECKING:

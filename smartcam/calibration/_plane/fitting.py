@@ -20,7 +20,7 @@ import numpy as np
 
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import apply_homography, element_derivatives
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable

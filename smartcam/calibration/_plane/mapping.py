@@ -14,9 +14,9 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._homography import apply_homography, derivatives, tangent_frames
-from smartcam.geometry import Code
 from smartcam.geometry._inside import (
     MAX_COORDINATE,
+    Code,
     as_points,
     check_finite,
     not_finite,

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smartcam.calibration._solvers import Chain, Poses, Solver
-from smartcam.geometry import Code
-from smartcam.geometry._inside import as_points
+from smartcam.geometry._inside import Code, as_points
 
 if TYPE_CHECKING:
     from datetime import datetime

@@ -15,7 +15,7 @@ import numpy as np
 
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
 from smartcam.calibration._statistics import Noise
-from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

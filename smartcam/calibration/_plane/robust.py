@@ -35,7 +35,7 @@ from smartcam.calibration._plane.fitting import (
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._views import as_list
-from smartcam.geometry import Code
-from smartcam.geometry._inside import as_motion
+from smartcam.geometry._inside import Code, as_motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -26,8 +26,7 @@ from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
 from smartcam.calibration._plane.validation import check_field, check_lever, check_positive
 from smartcam.calibration._statistics import Noise
-from smartcam.geometry import Code, Remark
-from smartcam.geometry._inside import as_points, frame_from_axes, rotate_ccw
+from smartcam.geometry._inside import Code, Remark, as_points, frame_from_axes, rotate_ccw
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

@@ -11,8 +11,7 @@ import numpy as np
 from smartcam._arguments import plain, shown
 from smartcam.calibration._plane.fitting import Normalization, Pairs
 from smartcam.calibration._units import MAX_UNASKED_M
-from smartcam.geometry import Code
-from smartcam.geometry._inside import as_points
+from smartcam.geometry._inside import Code, as_points
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

@@ -45,7 +45,7 @@ from smartcam.calibration._targets import (
     target_from_data,
 )
 from smartcam.calibration._views import checked
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

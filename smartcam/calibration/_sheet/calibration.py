@@ -33,8 +33,8 @@ from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
 from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import CameraModel, Code, Remark
-from smartcam.geometry._inside import Array, check_finite
+from smartcam.geometry import CameraModel
+from smartcam.geometry._inside import Array, Code, Remark, check_finite
 from smartcam.models import Localization
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from smartcam.calibration._least_squares import inverse_scaled, unit_diagonal
 from smartcam.calibration._lens.poses import check_view, locate
 from smartcam.calibration._lens.projection import excess, whitening
 from smartcam.calibration._solvers import Poses
-from smartcam.geometry import Code
 from smartcam.geometry._inside import (
+    Code,
     as_points,
     check_finite,
     cross_matrix,

@@ -39,8 +39,8 @@ from smartcam.calibration._stereo.start import (
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
 from smartcam.calibration._views import TargetView, as_covariances, as_list, label
-from smartcam.geometry import CameraModel, Code, Remark, Transform
-from smartcam.geometry._inside import Array, as_points, check_choice
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Array, Code, Remark, as_points, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -252,7 +252,7 @@ class StereoCalibration(storage.SavedCalibration):
         if left is None or right is None:
             return PairErrors(np.zeros(0), np.zeros((0, 2)))
         ways = [right]
-        if right.target.turned_alike:
+        if right.target.half_turn_symmetric:
             ways.append(half_turned(right))
         errors = [pair_errors(self._cameras, left, turned) for turned in ways]
         return min(errors, key=lambda errors_of_pair: _rms([errors_of_pair.epipolar]))

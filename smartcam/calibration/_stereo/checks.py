@@ -28,7 +28,8 @@ from smartcam.calibration._lens.suspicions import (
 )
 from smartcam.calibration._stereo.start import SIDES
 from smartcam.calibration._views import checked, label
-from smartcam.geometry import CameraModel, Code, Remark
+from smartcam.geometry import CameraModel
+from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -13,8 +13,7 @@ from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
 from smartcam.calibration._views import TargetView, as_list
-from smartcam.geometry import Code
-from smartcam.geometry._inside import IDENTITY, Rigid
+from smartcam.geometry._inside import IDENTITY, Code, Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,7 +115,7 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     poses: list[Poses] = list(zip(ones, twos, strict=True))
     target = next(view.target for moment in moments for view in moment if view is not None)
     turns = [IDENTITY]
-    if target.turned_alike:
+    if target.half_turn_symmetric:
         turns.append(half_turn(target))
     rig, apart, turned = _rig(moments, poses, right, turns)
     for number in turned:

@@ -8,7 +8,7 @@ Our own files are in ``calibration/_files``.
     camera = read_transform("handeye.calib", "easy_handeye2")
     pose = pose_from("kuka", [400, 120, 35.5, 90, 0, 180])
 
-:data:`TRANSFORMS`, :data:`SAMPLES` and :data:`TRAJECTORIES` are the tables of formats; those of
+``TRANSFORMS``, ``SAMPLES`` and ``TRAJECTORIES`` are the tables of formats; those of
 cameras are in ``_cameras.py`` (:func:`read_cameras`). To add a format, add a row with a function
 that parses and one that composes. Nothing that is read is trusted until it has been checked: size,
 depth, every number and every rotation.
@@ -19,7 +19,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from smartcam.calibration._units import LengthUnit
 from smartcam.calibration.formats import _foreign as foreign
 from smartcam.calibration.formats import _handeye as handeye
 from smartcam.calibration.formats import _opencv as opencv
@@ -33,30 +32,24 @@ from smartcam.calibration.formats._cameras import (
     write_cameras,
 )
 from smartcam.calibration.formats._file_format import MAX_FILE_BYTES, MAX_YAML_BYTES, Format, named
-from smartcam.calibration.formats._opencv import PlaneMatrix
 from smartcam.calibration.formats._plain import frame_name, known
 from smartcam.calibration.formats._planes import plane_frame
-from smartcam.calibration.formats._robots import ROBOTS, pose_from, pose_to
+from smartcam.calibration.formats._robots import pose_from, pose_to
 from smartcam.calibration.formats._samples import HandEyeSample
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.calibration._units import LengthUnit
+    from smartcam.calibration.formats._opencv import PlaneMatrix
     from smartcam.geometry import Transform
 
 __all__ = [
-    "ROBOTS",
-    "SAMPLES",
-    "TRAJECTORIES",
-    "TRANSFORMS",
     "CameraChain",
     "HandEyeSample",
-    "LengthUnit",
-    "PlaneMatrix",
-    "compose",
     "plane_frame",
     "pose_from",
     "pose_to",
@@ -194,7 +187,7 @@ def read_transform(
 
     Args:
         path: the file.
-        form: format of the file, a key of :data:`TRANSFORMS`.
+        form: name of the format, such as ``tf2``.
         target: the frame that the transform leads to, for a format that does not name it.
         source: the frame that the transform comes from, for a format that does not name it.
         unit: unit of the file's lengths; None for the unit that the file or its format says. A bare
@@ -216,7 +209,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 
     Args:
         path: the file.
-        form: format of the file, a key of :data:`TRANSFORMS`.
+        form: name of the format, such as ``tf2``.
         transform: ``source`` is the child, ``target`` its parent; a time is not written.
 
     Raises:
@@ -229,7 +222,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 def read_samples(
     path: str | os.PathLike[str], form: str, *, unit: LengthUnit | None = None
 ) -> Sequence[HandEyeSample]:
-    """Read the samples of a hand-eye calibration; ``form`` is a key of :data:`SAMPLES`.
+    """Read the samples of a hand-eye calibration; ``form`` is ``moveit`` or ``moveit_yaml``.
 
     Their frames are called base, effector, camera and object. Errors are those of
     :func:`read_transform`.
@@ -255,7 +248,7 @@ def read_trajectory(
     source: str = "body",
     unit: LengthUnit | None = None,
 ) -> Sequence[Transform]:
-    """Read poses over time, in the order of the file; ``form`` is a key of :data:`TRAJECTORIES`.
+    """Read poses over time, in the order of the file; ``form`` is ``asl`` or ``euroc``.
 
     Times are rounded to the nearest microsecond. Arguments and errors are those of
     :func:`read_transform`, and ``BAD_TIME``.
@@ -289,7 +282,7 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
     """Return the text of a file with a plane calibration's frame, its scale in a comment.
 
     Args:
-        form: format of the file, a key of :data:`TRANSFORMS`.
+        form: name of the format, such as ``tf2``.
         calibration: calibration that has a frame, see :func:`plane_frame`.
         suffix: required suffix of the file's name; None for any.
 

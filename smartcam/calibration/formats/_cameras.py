@@ -41,8 +41,8 @@ from smartcam.calibration.formats._plain import (
     stored_matrix,
     whole,
 )
-from smartcam.geometry import CameraModel, Code
-from smartcam.geometry._inside import COEFFICIENTS, check_size
+from smartcam.geometry import CameraModel
+from smartcam.geometry._inside import COEFFICIENTS, Code, check_size
 
 if TYPE_CHECKING:
     import os

@@ -13,7 +13,8 @@ from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._units import check_length, metres_of, no_unit
 from smartcam.calibration.formats._plain import malformed
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

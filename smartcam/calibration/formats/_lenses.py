@@ -14,7 +14,7 @@ from smartcam.calibration._lens.comparison import Lens
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats._cameras import read_cameras
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

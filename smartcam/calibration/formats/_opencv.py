@@ -25,7 +25,7 @@ from smartcam.calibration.formats._plain import (
     stored_matrix,
 )
 from smartcam.calibration.formats._xml import load_xml, storage_data
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from smartcam.calibration._plane.calibration import PlaneCalibration

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 import numpy as np
 
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code
 from smartcam.layout._inside import BadYamlError, compose
 
 if TYPE_CHECKING:

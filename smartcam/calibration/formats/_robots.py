@@ -23,8 +23,8 @@ import numpy as np
 
 from smartcam.calibration._units import check_angles, check_length, metres_of
 from smartcam.calibration.formats._plain import MAX_NUMBER, known
-from smartcam.geometry import Code, Transform
-from smartcam.geometry._inside import as_vector, matrix_from_quaternion
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code, as_vector, matrix_from_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -175,7 +175,7 @@ def pose_from(
     """Return a pose that a robot's controller shows.
 
     Args:
-        robot: the convention, a key of :data:`ROBOTS`.
+        robot: ``ur``, ``abb``, ``kuka``, ``fanuc``, ``meca500``, ``xyzw`` or ``wxyz``.
         values: numbers of the pose in the convention's order and units.
         target: name of the frame in which the pose is given.
         source: name of the frame whose pose is given.
@@ -211,7 +211,7 @@ def pose_to(robot: str, pose: Transform) -> list[float]:
     """Return a pose in the form of a robot's controller.
 
     Args:
-        robot: the convention, a key of :data:`ROBOTS`.
+        robot: ``ur``, ``abb``, ``kuka``, ``fanuc``, ``meca500``, ``xyzw`` or ``wxyz``.
         pose: ``T_base_tool``, metres.
 
     Returns:

@@ -25,7 +25,7 @@ from smartcam.calibration.formats._plain import (
     rigid,
     sequence,
 )
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,7 +19,8 @@ from smartcam.calibration.formats._file_format import Measured
 from smartcam.calibration.formats._plain import POSE, malformed, number, row
 from smartcam.calibration.formats._samples import same_frames
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -15,7 +15,7 @@ from smartcam._extras import load
 from smartcam.calibration._detection.charucos import charuco_board
 from smartcam.calibration._detection.marker_grids import marker_patterns
 from smartcam.calibration._targets import Charuco, Checkerboard, MarkerGrid
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

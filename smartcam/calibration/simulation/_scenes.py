@@ -21,8 +21,8 @@ from smartcam.calibration._hand_eye.equations import (
     information,
 )
 from smartcam.calibration._views import TargetView
-from smartcam.geometry import Code, Transform
-from smartcam.geometry._inside import Rigid, exp_rotation
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code, Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,6 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
-    from smartcam.calibration.wizards._pictures import PictureFolder
     from smartcam.calibration.wizards._plane import plane_wizard
     from smartcam.calibration.wizards._sequence import Wizard, WizardSession, ask
     from smartcam.calibration.wizards._services import CalibrationService
@@ -29,7 +28,6 @@ __all__ = [
     "Flag",
     "Number",
     "Option",
-    "PictureFolder",
     "Step",
     "Text",
     "Wizard",
@@ -48,7 +46,6 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_hand_eye": "hand_eye_wizard",
-            "_pictures": "PictureFolder",
             "_plane": "plane_wizard",
             "_sequence": "Wizard WizardSession ask",
             "_services": "CalibrationService",

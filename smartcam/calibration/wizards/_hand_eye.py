@@ -40,8 +40,8 @@ from smartcam.calibration.wizards._touches import ALLOWED
 from smartcam.calibration.wizards._usage import usage
 from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Transform
-from smartcam.geometry._inside import motion_from_data, motion_to_data
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code, motion_from_data, motion_to_data
 from smartcam.models import Pose
 
 if TYPE_CHECKING:
@@ -92,8 +92,8 @@ def hand_eye_wizard(
     """Return the wizard of a hand-eye calibration.
 
     Its parameters: ``name`` (of the calibration, passed to ``save_to``), and as defaults of the
-    first step ``setup`` and ``robot`` (the convention of typed poses, a key of
-    :data:`~smartcam.calibration.formats._robots.ROBOTS`); ``target``: a description of the target
+    first step ``setup`` and ``robot`` (the convention of typed poses, such as
+    ``kuka``); ``target``: a description of the target
     on the sheet, which is then not asked for.
 
     Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._locks import try_lock
 from smartcam._whole_files import sync_folder
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Flag, Step
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.models import Localization
 
 if TYPE_CHECKING:

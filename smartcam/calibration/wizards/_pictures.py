@@ -14,7 +14,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._detection.image import MAX_SIDE_PX, HasGrey
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     import os

@@ -32,7 +32,7 @@ from smartcam.calibration.wizards._touch_previews import compared, plain
 from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIDES, SIGMA, UNIT, Touches
 from smartcam.calibration.wizards._usage import usage
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:

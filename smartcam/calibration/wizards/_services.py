@@ -20,7 +20,7 @@ from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._listing import listing
 from smartcam.calibration.wizards._sequence import WizardSession
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -164,8 +164,8 @@ class CalibrationService:
             target: name of the file. With ``.json`` it is a copy that :meth:`load` reads; with
                 ``.yaml`` it is the matrix, which PyYAML and ``cv2.FileStorage`` read, as does
                 :func:`~smartcam.calibration.formats.read_matrix`.
-            form: write the frame of its plane in this format instead of the matrix, a key of
-                :data:`~smartcam.calibration.formats.TRANSFORMS`; the scale is in a comment.
+            form: write the frame of its plane in this format instead of the matrix, such as
+                ``tf2``; the scale is in a comment.
 
         Returns:
             The file's path in the folder.
@@ -177,8 +177,8 @@ class CalibrationService:
                 :func:`~smartcam.calibration.formats.plane_frame`; ``NOT_WRITTEN``: the file cannot
                 be written.
         """
-        from smartcam.calibration.formats import PlaneMatrix, compose
-        from smartcam.calibration.formats._opencv import compose_matrix
+        from smartcam.calibration.formats import compose
+        from smartcam.calibration.formats._opencv import PlaneMatrix, compose_matrix
 
         source = self.folder.find(name)
         path = self.folder.export(target)

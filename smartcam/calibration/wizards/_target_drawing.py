@@ -14,8 +14,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._detection.image import grey_image
 from smartcam.calibration._svg import circle, document, line, polygon, rectangle, round_down, text
-from smartcam.geometry import Code
-from smartcam.geometry._inside import as_points
+from smartcam.geometry._inside import Code, as_points
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

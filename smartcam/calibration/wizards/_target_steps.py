@@ -11,7 +11,7 @@ from smartcam.calibration._printing.sheets import scaled
 from smartcam.calibration._targets import target_from_data, target_to_data
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Flag, Number, Option, Step, Text
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

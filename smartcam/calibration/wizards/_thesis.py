@@ -24,7 +24,8 @@ from smartcam.calibration.wizards._services import CalibrationService
 from smartcam.calibration.wizards._sheet import sheet_wizard
 from smartcam.calibration.wizards._steps import Number, Option, Step, Text, as_lists, from_lists
 from smartcam.exceptions import CalibrationError, SmartCamError
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code
 from smartcam.models import Header, Pose
 
 if TYPE_CHECKING:

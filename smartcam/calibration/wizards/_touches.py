@@ -13,7 +13,7 @@ from smartcam.calibration.wizards._marks import Mark, Touch, Vector, choose
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Number, Option, Step
 from smartcam.calibration.wizards._touch_previews import before
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.models import Pose, Quaternion
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from smartcam.calibration.wizards._sequence import Wizard, ask
 from smartcam.calibration.wizards._steps import Option, Step
 from smartcam.calibration.wizards._touch_previews import compared
 from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

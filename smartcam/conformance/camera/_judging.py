@@ -73,7 +73,7 @@ def judge_item(camera: CameraUnderTest, item: Item) -> CameraFinding:
         result = {
             "outcome": CheckOutcome.DIFFERS,
             "expected": "the camera is still there",
-            "came": camera.gone,
+            "observed": camera.gone,
         }
     failed = result["outcome"] in {CheckOutcome.DIFFERS, CheckOutcome.UNDESCRIBED}
     place, grade = item.source(camera.known_dialect)
@@ -95,11 +95,15 @@ def _run(camera: CameraUnderTest, item: Item) -> dict[str, Any]:
         camera.require(item.needs)
         value = item.run(camera)
     except Undescribed as exc:
-        return {"outcome": CheckOutcome.UNDESCRIBED, "expected": exc.expected, "came": exc.came}
+        return {"outcome": CheckOutcome.UNDESCRIBED, "expected": exc.expected, "observed": exc.came}
     except Differs as exc:
-        return {"outcome": CheckOutcome.DIFFERS, "expected": exc.expected, "came": exc.came}
+        return {"outcome": CheckOutcome.DIFFERS, "expected": exc.expected, "observed": exc.came}
     except EndedError as exc:
-        return {"outcome": CheckOutcome.DIFFERS, "expected": "the link stays up", "came": str(exc)}
+        return {
+            "outcome": CheckOutcome.DIFFERS,
+            "expected": "the link stays up",
+            "observed": str(exc),
+        }
     except NotObserved as exc:
         return {"outcome": CheckOutcome.NOT_OBSERVED, "text": str(exc)}
     if isinstance(item, Question):

@@ -113,7 +113,7 @@ class CameraReport:
                 f"  {difference.item.name}: {difference.item.about}",
                 f"    source:   {difference.source}, {difference.grade}",
                 f"    expected: {difference.expected}",
-                f"    came:     {difference.came}",
+                f"    came:     {difference.observed}",
                 *(f"      {row}" for row in difference.wire),
             ]
         return ["", "differs from the documented device:", *lines] if lines else []

@@ -123,7 +123,7 @@ class CameraFinding:
     value: Any = None  # the answer to a question; None for a check
     text: str = ""  # a remark, or the reason why nothing was observed
     expected: str = ""  # expected behaviour, if it differs
-    came: str = ""  # observed behaviour, if it differs
+    observed: str = ""  # observed behaviour, if it differs
     wire: tuple[str, ...] = ()  # messages on the wire, if it differs
     seconds: float = 0.0  # duration
 
@@ -148,5 +148,5 @@ class CameraFinding:
         if self.text:
             row["text"] = self.text
         if self.failed:
-            row |= {"expected": self.expected, "came": self.came, "wire": list(self.wire)}
+            row |= {"expected": self.expected, "came": self.observed, "wire": list(self.wire)}
         return row

@@ -149,7 +149,7 @@ def _words(finding: CameraFinding) -> str:
         [
             f"{finding.item.about} ({finding.source}, {finding.grade})",
             f"expected: {finding.expected}",
-            f"came:     {finding.came}",
+            f"came:     {finding.observed}",
             *finding.wire,
         ]
     )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from smartcam.conformance.camera._suite import CameraConformance
 
-__all__ = ["TestCamera"]
-
 
 class TestCamera(CameraConformance):
     """The camera of ``--camera-url``."""

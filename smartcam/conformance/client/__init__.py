@@ -23,21 +23,13 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.conformance.client._checks import CHECKS
-    from smartcam.conformance.client._runs import perform
-    from smartcam.conformance.client._scenes import SCENES, Scene
     from smartcam.conformance.client._suite import ClientConformance
-    from smartcam.conformance.client._tasks import CommandClient, FunctionClient, Outcome, Task
+    from smartcam.conformance.client._tasks import Task
 
 __all__ = [
     "CHECKS",
-    "SCENES",
     "ClientConformance",
-    "CommandClient",
-    "FunctionClient",
-    "Outcome",
-    "Scene",
     "Task",
-    "perform",
 ]
 
 if not TYPE_CHECKING:
@@ -45,9 +37,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_checks": "CHECKS",
-            "_runs": "perform",
-            "_scenes": "SCENES Scene",
             "_suite": "ClientConformance",
-            "_tasks": "CommandClient FunctionClient Outcome Task",
+            "_tasks": "Task",
         },
     )

@@ -27,7 +27,7 @@ class ClientFinding(NamedTuple):
     expects: str  # behaviour that the documents require of a client
     source: str  # source in the documents
     wire: tuple[str, ...]  # messages on the wire, one line each
-    said: str  # output of the client
+    output: str  # output of the client
 
     def __str__(self) -> str:
         """Return the finding as lines."""
@@ -39,8 +39,8 @@ class ClientFinding(NamedTuple):
             "  on the wire (> from the client):",
             *(f"    {line}" for line in self.wire or ("nothing",)),
         ]
-        if self.said:
-            lines += ["  the client said:", *(f"    {line}" for line in self.said.splitlines())]
+        if self.output:
+            lines += ["  the client said:", *(f"    {line}" for line in self.output.splitlines())]
         return "\n".join(lines)
 
     def as_json(self) -> str:
@@ -59,7 +59,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
     wrong = check.rule(run)
     if wrong is None:
         return None
-    outcome_text = "; ".join(filter(None, (run.outcome.error, run.outcome.said)))
+    outcome_text = "; ".join(filter(None, (run.outcome.error, run.outcome.output)))
     return ClientFinding(
         check=check.name,
         grade=check.grade.value,
@@ -70,7 +70,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
         expects=check.expects,
         source=check.source,
         wire=tuple(run.lines),
-        said=outcome_text,
+        output=outcome_text,
     )
 
 

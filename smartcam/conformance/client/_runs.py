@@ -17,7 +17,7 @@ from smartcam.protocols.messages import ResultContainer, Sender, StatusReport
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.emulator import LogEntry
+    from smartcam.emulator._inside import LogEntry
     from smartcam.models import Status
     from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message

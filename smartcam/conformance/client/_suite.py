@@ -73,8 +73,8 @@ class ClientConformance:
     not fail its test; the plugin ``smartcam`` shows it at the end.
 
     Attributes:
-        command: program and arguments, see :class:`~smartcam.conformance.client.CommandClient`;
-            None for ``--client-command``.
+        command: program and arguments, in which ``{task}``, ``{host}``, ``{port}``, ``{url}``,
+            ``{transport}`` and ``{dialect}`` are replaced; None for ``--client-command``.
         dialects: names of the dialects that the client speaks.
         transports: names of the transports that the client can use.
         timeout: seconds for a task. A client's own timeouts must end within it.
@@ -134,7 +134,7 @@ class ClientConformance:
         check, dialect, transport = client_case
         run = self._run(check, dialect, transport, request.config)
         if not run.outcome.supported:
-            reason = f": {run.outcome.said}" if run.outcome.said else ""
+            reason = f": {run.outcome.output}" if run.outcome.output else ""
             pytest.skip(f'the client cannot do the task "{run.task}"{reason}')
         finding = judge(check, run)
         if finding is None:

@@ -92,7 +92,7 @@ class Outcome(NamedTuple):
         ended: whether the client ended in time.
         supported: whether the client supports the task.
         seconds: duration of the task.
-        said: further output of the client, shortened.
+        output: further output of the client, shortened.
     """
 
     results: tuple[bytes, ...] = ()
@@ -100,7 +100,7 @@ class Outcome(NamedTuple):
     ended: bool = True
     supported: bool = True
     seconds: float = 0.0
-    said: str = ""
+    output: str = ""
 
 
 class Client(ABC):
@@ -179,7 +179,7 @@ class _Worker:
         try:
             self.outcome = Outcome(results=self._results())
         except NotImplementedError as exc:
-            self.outcome = Outcome(supported=False, said=str(exc))
+            self.outcome = Outcome(supported=False, output=str(exc))
         except BaseException as exc:  # noqa: BLE001 - whatever a client raises is its failure
             self.outcome = Outcome(error=f"{type(exc).__name__}: {exc}"[:SHOWN_LENGTH])
         with contextlib.suppress(RuntimeError):  # the waiting loop is closed
@@ -278,14 +278,14 @@ class CommandClient(Client):
             await _end(process)
         seconds, errors = time.monotonic() - began, _shorten(err)
         if process.returncode == UNSUPPORTED:
-            return Outcome(supported=False, seconds=seconds, said=errors)
+            return Outcome(supported=False, seconds=seconds, output=errors)
         try:
             results, error = read_results(out), None
         except ValueError as exc:
             results, error = (), str(exc)
         if process.returncode:
             error = f"exit code {process.returncode}"
-        return Outcome(results, error, seconds=seconds, said=errors)
+        return Outcome(results, error, seconds=seconds, output=errors)
 
 
 async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:

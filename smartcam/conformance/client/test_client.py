@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from smartcam.conformance.client._suite import ClientConformance
 
-__all__ = ["TestClient"]
-
 
 class TestClient(ClientConformance):
     """The client of ``--client-command``."""

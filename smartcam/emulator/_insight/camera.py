@@ -34,8 +34,7 @@ from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._tally import Tally
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from smartcam.models import Status
-from smartcam.protocols import INSIGHT
-from smartcam.protocols._inside import ONLINE, words
+from smartcam.protocols._inside import INSIGHT, ONLINE, words
 from smartcam.settings import validated
 
 if TYPE_CHECKING:

@@ -101,7 +101,7 @@ class TelnetClient(LineClient):
         elif self._state is _LoginState.USER:
             self._user = line
             self._state = _LoginState.PASSWORD
-            self.hide_next()
+            self.hide_next_line()
             self.respond(words.PASSWORD_PROMPT)
         elif self._emulator.admits(self._user, line):
             self._state = _LoginState.COMMANDS
@@ -114,4 +114,4 @@ class TelnetClient(LineClient):
         """Answer the current line; without ``more`` the answer is complete."""
         self.say_bytes(data)
         if not more:
-            self.go_on()
+            self.end_line()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam._arguments import check_text
 from smartcam.emulator._scenario.scenario import Mistake, Scenario, ScenarioFile
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._inside import read_model
+from smartcam.layout._inside import file_schema, read_model
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,8 +67,4 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
 
 def scenario_schema() -> dict[str, Any]:
     """Return the JSON Schema of scenario files."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **ScenarioFile.model_json_schema(),
-        "title": "smartcam scenario",
-    }
+    return file_schema(ScenarioFile, "scenario")

@@ -62,7 +62,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 __all__ = [
-    "FAULTS",
     "BusyForEver",
     "ChangeByteOrder",
     "ClearFaults",
@@ -75,7 +74,6 @@ __all__ = [
     "Drop",
     "Duplicate",
     "ExtraResult",
-    "Fault",
     "HalfOpen",
     "Insert",
     "LateResult",
@@ -92,7 +90,6 @@ __all__ = [
     "SecondClient",
     "Split",
     "Truncate",
-    "make_faults",
 ]
 
 MAX_FAULTS = 10_000
@@ -260,7 +257,7 @@ class Insert(CameraWireFault):
         return self
 
     @property
-    def word(self) -> m.Message | None:
+    def inserted(self) -> m.Message | None:
         """The message that is inserted, None for bytes."""
         return _build(self.message, self.fields) if isinstance(self.message, str) else None
 

@@ -170,9 +170,9 @@ def misfit(
         return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"
     if isinstance(fault.on, str) and not dialect.has(MESSAGE_NAMES[fault.on]):
         return "on", f"dialect {dialect.label} has no {fault.on}"
-    if isinstance(fault, Insert) and fault.word is not None:
+    if isinstance(fault, Insert) and fault.inserted is not None:
         try:
-            dialect.encode(fault.word)
+            dialect.encode(fault.inserted)
         except LocalProtocolError as exc:
             return "fields", str(exc)
         except UnsupportedError:

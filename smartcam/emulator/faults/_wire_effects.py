@@ -205,7 +205,7 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
     places = [number for number, message in enumerate(sent) if message.changeable]
     if not places:
         return sent
-    word = fault.word
+    word = fault.inserted
     data = dialect.encode(word) if word is not None else fault.data or b""
     new = cut_datagram(data, dialect)
     new.faults.append(fault.kind)

@@ -440,7 +440,7 @@ class Agent:
         self._claims.on_event(event)
         self._on_event(event)
 
-    async def wait_tried(self) -> None:
+    async def wait_first_attempts(self) -> None:
         """Wait until the first attempt with each camera has ended; bounded."""
         end = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
         for host in tuple(self.hosts.values()):

@@ -225,8 +225,7 @@ class FleetServer(Server):
         domain: int | None = None
         if self.file.ros2 is not None:
             with from_part("ros2", '"ros2:" in a fleet file needs'):
-                from smartcam.ros2 import RosContext
-                from smartcam.ros2._inside import SETTINGS
+                from smartcam.ros2._inside import SETTINGS, RosContext
 
             settings |= SETTINGS
             domain = RosContext(domain=self.file.ros2.domain).domain
@@ -441,10 +440,10 @@ class FleetServer(Server):
         await stack.enter_async_context(camera)
         return camera.url
 
-    async def wait_tried(self) -> None:
+    async def wait_first_attempts(self) -> None:
         """Wait for the end of each camera's first attempt; bounded by ``connect_timeout``."""
         if self._agent is not None:
-            await self._agent.wait_tried()
+            await self._agent.wait_first_attempts()
 
     def events(
         self,

@@ -37,7 +37,7 @@ from smartcam.fleet._file.operations import OperationsSection  # noqa: TC001 - p
 from smartcam.fleet._file.recording import RecordSection, mistakes_of
 from smartcam.fleet._file.ros import Fields, RosCamera, RosSection, node_names
 from smartcam.fleet._file.standby import Standby, standby_of
-from smartcam.layout._inside import read_model
+from smartcam.layout._inside import file_schema, read_model
 from smartcam.settings import (
     CameraSettings,
     is_fleet,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames import FrameSource
     from smartcam.geometry import CameraModel
-    from smartcam.inspection import CellCamera
+    from smartcam.inspection._inside import CellCamera
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
@@ -514,11 +514,7 @@ def _no_file(url: str) -> ConfigurationError:
 
 def fleet_schema() -> dict[str, Any]:
     """Return the JSON Schema of fleet files."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **FleetFile.model_json_schema(),
-        "title": "smartcam fleet",
-    }
+    return file_schema(FleetFile, "fleet")
 
 
 Mistake = tuple["Sequence[int | str]", str]
@@ -644,13 +640,13 @@ def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamer
         MissingExtraError: a package that it needs is not installed.
     """
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection import Software, make_camera
+        from smartcam.inspection._inside import Software, make_camera
     return make_camera(name, validated(Software, given, f"{name}: software"), folder)
 
 
 def _of_software(name: str, given: dict[str, Any], folder: Path) -> Iterator[Mistake]:
     with from_part("inspection", '"software:" in a fleet file needs'):
-        from smartcam.inspection import Software, software_mistakes
+        from smartcam.inspection._inside import Software, software_mistakes
     try:
         software = Software.model_validate(given)
     except ValidationError as exc:

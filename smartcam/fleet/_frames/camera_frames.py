@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from smartcam.fleet._frames.sender import FrameSender
     from smartcam.fleet._frames.stream import FrameOrder, TakenFrame
     from smartcam.fleet._frames.video import SharedVideo
-    from smartcam.frames import Frame, FrameSource, SourceStatistics
+    from smartcam.frames import Frame, FrameSource
+    from smartcam.frames._inside import SourceStatistics
     from smartcam.geometry import CameraModel
     from smartcam.observers import Observer
 

@@ -55,7 +55,7 @@ class FleetFrameDriver(SharedFrameDriver):
             self._camera = self._make()
             self._frames = self._camera.frame_caller
         try:
-            await self._camera.attend(self._camera.settings.connect_timeout, session=False)
+            await self._camera.follow(self._camera.settings.connect_timeout, session=False)
         except SmartCamError as exc:
             raise as_source_error(self.name, exc) from exc
         return await super().open()

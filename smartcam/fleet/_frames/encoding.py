@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from smartcam.fleet._frames.wire import FrameForm
-    from smartcam.frames import Codecs, Frame, H264Encoder
+    from smartcam.frames import Codecs, Frame
+    from smartcam.frames._inside import H264Encoder
 
 FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL", "h264": "H264"}
 """Pixel format of frames in each encoding."""

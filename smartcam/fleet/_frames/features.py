@@ -8,10 +8,11 @@ import math
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.frames import DeviceFeatures, Feature, FeatureValue
+from smartcam.frames import DeviceFeatures, Feature
 
 if TYPE_CHECKING:
     from smartcam.fleet._program.caller import Caller
+    from smartcam.frames._inside import FeatureValue
 
 CALL_TIMEOUT: Final = 60.0
 """Seconds for a call, unless the caller has an earlier deadline."""

@@ -192,7 +192,7 @@ class SharedFrameDriver(FrameDriver):
         arguments = {**self._request.form.fields(), "stream": stream}
         rate = self._request.rate
         if rate is not None:
-            arguments |= {"quality": rate.quality, "rest": rate.rest}
+            arguments |= {"quality": rate.quality, "rest": rate.pause}
         if self._video is not None:
             arguments["have"] = self._video.have
         return arguments

@@ -116,11 +116,11 @@ class PictureStream(FrameStream):
 
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
-        since, until = self.pace.window(loop.time(), reader.came, order.min_interval)
+        since, until = self.pace.window(loop.time(), reader.last_arrival, order.min_interval)
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
             await reader.fresh(since, until)
             frame = await anext(reader)
-        self.pace.note_taken(reader.came, reader.statistics().offered)
+        self.pace.note_taken(reader.last_arrival, reader.statistics().offered)
         async with asyncio.timeout(order.timeout):
             taken = TakenFrame(*await self.encode(frame, order.encoding))
         self.pace.note_sent(loop.time())

@@ -78,4 +78,4 @@ class VideoUnits:
         if not last:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TAKE_TIMEOUT):
-                    await sink.taken()
+                    await sink.wait_taken()

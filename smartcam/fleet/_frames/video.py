@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from smartcam.exceptions import FrameSourceError
 
 if TYPE_CHECKING:
-    from smartcam.frames import Frame, FrameSource, H264Encoder
+    from smartcam.frames import Frame, FrameSource
+    from smartcam.frames._inside import H264Encoder
 
 LATE_SECONDS = 0.3
 """Seconds for which an encoded frame is kept for programs that have the frames before it."""

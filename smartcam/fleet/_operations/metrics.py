@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._agent.host import Host
     from smartcam.fleet._agent.server import FleetServer
-    from smartcam.frames import SourceStatistics
+    from smartcam.frames._inside import SourceStatistics
     from smartcam.models import Statistics
     from smartcam.outlets._inside import OutletState
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from smartcam._client._inside import Outcome, TriggerRequest
     from smartcam.fleet._bus.bus import Handle
     from smartcam.fleet._program.program import Program, Reply
-    from smartcam.protocols import Counters
+    from smartcam.protocols._inside import Counters
 
 MAX_DRIFT_RATIO = 1e-4
 """Largest drift between two clocks, seconds per second."""

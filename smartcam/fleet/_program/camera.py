@@ -54,7 +54,7 @@ from smartcam.models import (
     StatusChanged,
     ValueT,
 )
-from smartcam.protocols import Counters
+from smartcam.protocols._inside import Counters
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ class FleetCamera(Camera[ValueT]):
         if self._opened or self._closed is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         try:
-            await self.attend(self.settings.connect_timeout)
+            await self.follow(self.settings.connect_timeout)
             self._check_session()
             if self.settings.application is not None:
                 application = self.settings.application
@@ -216,7 +216,7 @@ class FleetCamera(Camera[ValueT]):
             raise
         return self
 
-    async def attend(self, timeout: float, *, session: bool = True) -> None:
+    async def follow(self, timeout: float, *, session: bool = True) -> None:
         """Start to follow the camera, even if it is not there yet.
 
         Args:

@@ -652,7 +652,7 @@ class Fleet:
         if before is not None:
             await before.close()
         async with self._meeting_slots:
-            await camera.attend(self._timeout)
+            await camera.follow(self._timeout)
 
     # ------------------------------------------------------------------ several cameras
 

@@ -107,7 +107,7 @@ class RateControl:
     ::
 
         control = RateControl(bitrate=4e6)
-        ...  # send a frame of control.quality, control.rest seconds after the last one at least
+        ...  # send a frame of control.quality, control.pause seconds after the last one at least
         control.sent(size, went, took)
 
     The control lowers the quality to its limit, and only then the frame rate; it raises the frame
@@ -157,7 +157,7 @@ class RateControl:
         return self._fps
 
     @property
-    def rest(self) -> float:
+    def pause(self) -> float:
         """Least time between two frames, seconds."""
         return 1 / self._fps
 
@@ -186,7 +186,7 @@ class RateControl:
         """
         size, took = max(1, size), max(1e-6, took)
         if self._went is None or went <= self._went:
-            seconds = self.rest
+            seconds = self.pause
         else:
             seconds = went - self._went
             self._flow.add(size, seconds)

@@ -208,7 +208,7 @@ class VideoDriver(FrameDriver):
                     await clock.wait_for(read.time)
                 sink.frame(self._frame(read, live))
                 if not self._paced and not live:
-                    await sink.taken()
+                    await sink.wait_taken()
                 read = await thread.do(reading.read)
         except FrameSourceError as error:
             sink.ended(error)

@@ -85,7 +85,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return self._device.inspector.judged
 
     @property
-    def trouble_seeing(self) -> str:
+    def frame_trouble(self) -> str:
         """Reason why no frames come; "" if they come."""
         return self._device.inspector.trouble
 
@@ -115,7 +115,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         try:
             return await super()._trigger(application, request, timeout)
         except CameraFaultError as exc:
-            raise CameraFaultError(f"{exc}: {self.trouble_seeing or 'it is closed'}") from exc
+            raise CameraFaultError(f"{exc}: {self.frame_trouble or 'it is closed'}") from exc
 
     async def _read_image(self, timeout: float) -> bytes:
         return await self._picture(timeout, drawn=False)

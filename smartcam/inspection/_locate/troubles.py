@@ -34,13 +34,13 @@ class TeachingError(ConfigurationError):
     """A part cannot be taught.
 
     Args:
-        why: reason for programs.
+        reason: reason for programs, such as ``FEW_EDGES``.
         text: reason for people.
 
     Attributes:
-        why: reason for programs.
+        reason: reason for programs, such as ``FEW_EDGES``.
     """
 
-    def __init__(self, why: TeachingTrouble, text: str) -> None:
-        super().__init__(f"{why.value}: {text}")
-        self.why: TeachingTrouble = why
+    def __init__(self, reason: TeachingTrouble, text: str) -> None:
+        super().__init__(f"{reason.value}: {text}")
+        self.reason: TeachingTrouble = reason

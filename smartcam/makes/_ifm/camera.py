@@ -156,7 +156,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     def hear(self, client: LineClient, line: str) -> None:
         """Carry out a request; during a long one, further requests are read."""
-        call = cast("IfmClient", client.keep())
+        call = cast("IfmClient", client.answer_later())
         untold = call.dialect.tickets and not call.ticket
         call.answer("?") if untold else super().hear(call, line)
 

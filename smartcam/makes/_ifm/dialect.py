@@ -25,9 +25,9 @@ from smartcam.protocols import (
     TicketedDialect,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import refuse_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Mapping
@@ -190,15 +190,15 @@ def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, .
         LineRow(None, "debug", m.Notice, lambda text: m.Notice("debug", 0, text[:200]), word=DEBUG),
     )
     return (
-        LineRow(m.Connect, "G?", m.ConnectAnswer, unread, script=_connect),
+        LineRow(m.Connect, "G?", m.ConnectAnswer, refuse_line, script=_connect),
         LineRow(m.GetStatus, "E?", m.StatusReport, _status),
         LineRow(
             m.Query, "A?", m.QueryAnswer, lambda text: m.QueryAnswer(application=_active(text))
         ),
-        LineRow(m.SwitchApplication, "a{application}", m.SwitchAnswer, unread, script=_switch),
+        LineRow(m.SwitchApplication, "a{application}", m.SwitchAnswer, refuse_line, script=_switch),
         trigger,
-        *((LineRow(m.ReadImage, "I01?", m.Image, unread, script=_image),) if lengths else ()),
-        LineRow(m.SetInput, "j{data}", m.SetInputAnswer, unread, script=_input),
+        *((LineRow(m.ReadImage, "I01?", m.Image, refuse_line, script=_image),) if lengths else ()),
+        LineRow(m.SetInput, "j{data}", m.SetInputAnswer, refuse_line, script=_input),
         *(unasked if tickets else ()),
         LineRow(LineCommand, "{line}", LineReply, _reply),
     )

@@ -12,7 +12,8 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from smartcam.layout import Field, Layout
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import Field
 
 MARK = "smartcam;"
 """The text before each result of an uploaded layout; other results and codes begin

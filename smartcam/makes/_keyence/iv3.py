@@ -26,9 +26,9 @@ from smartcam.protocols import (
     Protocol,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import refuse_line
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -113,7 +113,9 @@ LINES = LineDialect(
     rows=(
         LineRow(m.Connect, "RT", m.ConnectAnswer, _connected, also=(m.StatusReport,)),
         LineRow(m.Query, "PR", m.QueryAnswer, _program),
-        LineRow(m.SwitchApplication, "PW,{application}", m.SwitchAnswer, unread, script=_switch),
+        LineRow(
+            m.SwitchApplication, "PW,{application}", m.SwitchAnswer, refuse_line, script=_switch
+        ),
         LineRow(m.Trigger, "T2", m.ResultContainer, _triggered, word="RT", also=(m.TriggerAnswer,)),
         LineRow(None, "result", m.Notice, _unasked, word="RT"),
         LineRow(LineCommand, "{line}", LineReply, _reply),

@@ -29,9 +29,9 @@ from smartcam.protocols import (
     Protocol,
     Transport,
     Verdict,
-    unread,
 )
 from smartcam.protocols import messages as m
+from smartcam.protocols._inside import refuse_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -116,7 +116,7 @@ def _rows(bank: int | None) -> tuple[LineRow, ...]:
         LineRow(m.GetStatus, "BUSYSTAT", m.StatusReport, _busy),
         LineRow(m.Query, "NUM", m.QueryAnswer, counted),
         LineRow(m.Trigger, lon, m.ResultContainer, _scanned, word="", also=(m.TriggerAnswer,)),
-        LineRow(m.EndTrigger, "LOFF", None, unread),
+        LineRow(m.EndTrigger, "LOFF", None, refuse_line),
         LineRow(
             None, "LOFF", m.Notice, lambda line: m.Notice("error", _code(line), line), word="LOFF"
         ),

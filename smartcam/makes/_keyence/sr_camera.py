@@ -65,7 +65,7 @@ class EmulatedSr(LineCamera):
 
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
-        call = client.keep()
+        call = client.answer_later()
         word, _, argument = line.partition(",")
         bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK
         if line == "LON" or (word == "LON" and bank):

@@ -9,7 +9,7 @@ from smartcam._extras import load
 from smartcam._loop_thread import LoopThread
 from smartcam.exceptions import ConfigurationError, OutletError
 from smartcam.outlets._opcua.settings import OpcUaSettings
-from smartcam.outlets._outlet import Outlet, OutletDesk
+from smartcam.outlets._outlet import Outlet, OutletContext
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
@@ -31,8 +31,10 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
     settings_class = OpcUaSettings
     max_batch: ClassVar[int] = 100
 
-    def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
-        super().__init__(name, settings, folder, desk)
+    def __init__(
+        self, name: str, settings: OpcUaSettings, folder: Path, context: OutletContext
+    ) -> None:
+        super().__init__(name, settings, folder, context)
         self._thread = LoopThread(f"smartcam.outlets.{name}.server")
         self._loop: asyncio.AbstractEventLoop | None = None  # event loop of the cameras
         self._server: VisionServer | None = None
@@ -51,9 +53,11 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         from smartcam.outlets._opcua.server import VisionServer
 
         self._loop = asyncio.get_running_loop()
-        desk = OutletDesk(self.desk.columns, self._command, self.desk.cameras, self.desk.names)
+        context = OutletContext(
+            self.context.columns, self._command, self.context.cameras, self.context.names
+        )
         await asyncio.to_thread(self._thread.start)
-        self._server = server = VisionServer(self.name, self.settings, self.folder, desk)
+        self._server = server = VisionServer(self.name, self.settings, self.folder, context)
         await self._in_server_thread(server.start())
         self._open = True
         for camera, state in self._states.items():
@@ -95,9 +99,9 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
 
     async def _command(self, camera: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
         """Carry out a command in the cameras' thread; called in the server's thread."""
-        if self.desk.command is None or self._loop is None:
+        if self.context.command is None or self._loop is None:
             raise ConfigurationError("commands are not allowed here")
-        work: Any = self.desk.command(camera, verb, given)
+        work: Any = self.context.command(camera, verb, given)
         done: dict[str, Any] = await asyncio.wrap_future(
             asyncio.run_coroutine_threadsafe(work, self._loop)
         )

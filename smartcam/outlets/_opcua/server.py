@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import VisionJob, VisionResult
     from smartcam.outlets._opcua.nodeset import Transition
     from smartcam.outlets._opcua.settings import OpcUaSettings
-    from smartcam.outlets._outlet import Column, OutletDesk
+    from smartcam.outlets._outlet import Column, OutletContext
 
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
@@ -58,11 +58,13 @@ class VisionServer:
         name: name of the outlet.
         settings: settings of the server.
         folder: folder of relative paths.
-        desk: functions of the process that has the cameras.
+        context: functions of the process that has the cameras.
     """
 
-    def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
-        self.name, self.settings, self.folder, self.desk = name, settings, folder, desk
+    def __init__(
+        self, name: str, settings: OpcUaSettings, folder: Path, context: OutletContext
+    ) -> None:
+        self.name, self.settings, self.folder, self.context = name, settings, folder, context
         self.outbox = PublishQueue()
         self.book = ResultBook(settings.kept_results)
         self.cameras: dict[str, CameraFace] = {}
@@ -97,7 +99,7 @@ class VisionServer:
         self.files = TransferFiles(server, own_index)
         await self._link_types()
         self.outbox.start()
-        chosen = filter(self.settings.chooses, self.desk.cameras())
+        chosen = filter(self.settings.chooses, self.context.cameras())
         for name in itertools.islice(chosen, MAX_CAMERAS):
             await self._make(name)
         await server.start()
@@ -202,9 +204,9 @@ class CameraFace:
             self._command,
             self,
             picture=self._picture,
-            names=lambda: server.desk.names(name),
+            names=lambda: server.context.names(name),
             new_job=server.new_job,
-            simulated=dict(server.desk.cameras()).get(name),
+            simulated=dict(server.context.cameras()).get(name),
         )
         self._methods = Methods(
             self.system, self.nodes, server.values, server.book, server.outbox.settled
@@ -233,9 +235,9 @@ class CameraFace:
         self._server.calls[self.nodes.id(parent), name] = call
 
     async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        if self._server.desk.command is None:
+        if self._server.context.command is None:
             raise ConfigurationError("commands are not allowed here")
-        return await self._server.desk.command(name, verb, given)
+        return await self._server.context.command(name, verb, given)
 
     def _picture(self, fields: Mapping[str, Any]) -> Path | None:
         pattern = self._settings.pictures
@@ -263,7 +265,7 @@ class CameraFace:
         if result.application is None:
             return ()
         try:
-            return self._server.desk.columns(result.camera, result.application)
+            return self._server.context.columns(result.camera, result.application)
         except SmartCamError as exc:
             self.message(f"application {result.application}: {exc}", type(exc).__name__, None)
             return ()

@@ -177,7 +177,7 @@ class RecordedDriver(TaskDriver):
                 captured = min(now, due) if self._paced else now
                 sink.frame(dataclasses.replace(frame, captured=captured, source=self.name))
                 if not self._paced:
-                    await sink.taken()
+                    await sink.wait_taken()
                 last = frame
         except (ConfigurationError, RecordingError) as exc:
             sink.ended(FrameSourceError(str(exc), source=self.name))

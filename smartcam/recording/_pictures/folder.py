@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.exceptions import RecordingError
-    from smartcam.frames import FrameSource, ReaderStatistics
+    from smartcam.frames import FrameSource
+    from smartcam.frames._inside import ReaderStatistics
     from smartcam.recording._folders.track import RecordingAccount
 
 MIN_FILE_BYTES: Final = 1e5

@@ -30,8 +30,7 @@ from smartcam.recording._pictures.protobuf import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.frames import PixelFormat
-    from smartcam.frames._inside import Drawing
+    from smartcam.frames._inside import Drawing, PixelFormat
 
 MAX_SIDE_PX: Final = 1 << 20
 """Largest number of pixels along a side of a picture that is written or read."""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.exceptions import RecordingError
-    from smartcam.frames import Frame, ReaderStatistics
+    from smartcam.frames import Frame
+    from smartcam.frames._inside import ReaderStatistics
 
 
 class PictureRecorder(Protocol):

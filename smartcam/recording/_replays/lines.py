@@ -323,7 +323,7 @@ class ReplayedLines(LineCamera):
         """Send a client the bytes that the recorded camera sent before any line."""
         self._places[client] = 0
         if 0 in self.plan.secrets:
-            client.hide_next()
+            client.hide_next_line()
         self._play(client, self.plan.greeting)
 
     def hear(self, client: LineClient, line: str) -> None:
@@ -331,11 +331,11 @@ class ReplayedLines(LineCamera):
         place = self._places[client]
         self._places[client] += 1
         if self._at_once:
-            client = client.keep()
+            client = client.answer_later()
         data = line.encode(self.lines.encoding, "replace")
         answer = self.plan.secrets.get(place) or self.plan.answers.get(data)
         if answer is None and (image := self._image_for(line)) is not None:
-            self._play(client, [TimedLine(0.0, image)], client.go_on)
+            self._play(client, [TimedLine(0.0, image)], client.end_line)
             return
         if answer is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
@@ -346,7 +346,7 @@ class ReplayedLines(LineCamera):
             client.answer(None)
             return
         if place + 1 in self.plan.secrets:
-            client.hide_next()
+            client.hide_next_line()
         pieces = self._take(data, answer)
         self._play(client, pieces, self._ended(client, trigger=triggers and bool(pieces)))
         if triggers and self._on_over is not None and not self.remaining:
@@ -377,7 +377,7 @@ class ReplayedLines(LineCamera):
         def end() -> None:
             if trigger:
                 self._answered = max(self._answered, number)
-            client.go_on()
+            client.end_line()
 
         return end
 
@@ -393,7 +393,7 @@ class ReplayedLines(LineCamera):
             last = index == len(pieces) - 1
 
             def say(data: bytes = piece.data, last: bool = last) -> None:
-                client.say_again(data)
+                client.say_recorded(data)
                 if last and done is not None:
                     done()
 

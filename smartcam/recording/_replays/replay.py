@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator import TableScene
     from smartcam.emulator._inside import ClientLink, Clock, TimerHandle
-    from smartcam.layout import Field
+    from smartcam.layout._inside import Field
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
     from smartcam.recording._replays.pictures import ReplayedPictures

@@ -141,7 +141,7 @@ class DepthTopics:
 
     def _learn(self, stereo: StereoDepth) -> None:
         """Note the values of an open pair, and publish its place."""
-        self._nearest, place = stereo.nearest, self._place
+        self._nearest, place = stereo.min_depth, self._place
         if place is not None:
             turn = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
             seen = place @ turn

@@ -18,7 +18,7 @@ from smartcam.frames._inside import jpeg_header
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.frames import PixelFormat
+    from smartcam.frames._inside import PixelFormat
     from smartcam.geometry import CameraModel
 
 BILLION: Final = 1_000_000_000

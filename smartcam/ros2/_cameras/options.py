@@ -38,7 +38,7 @@ class CameraNodeOptions:
         hardware_id: id of the hardware in diagnostics; empty for the camera's address.
         settings: settings of the session with the camera, if they differ from the camera's own:
             the agent's, for a camera of a fleet.
-        agent_alive: function that returns whether the agent with the session is alive; None if
+        is_agent_alive: function that returns whether the agent with the session is alive; None if
             there is no agent.
         frames: parameters for the source of its frames, by v4l2_camera's names:
             ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
@@ -59,7 +59,7 @@ class CameraNodeOptions:
     status_rate: float = 20.0
     hardware_id: str = ""
     settings: CameraSettings | None = None
-    agent_alive: Callable[[], bool] | None = None
+    is_agent_alive: Callable[[], bool] | None = None
     frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
     controls: Callable[[], Awaitable[FrameSource]] | None = None
     calibrations: str | os.PathLike[str] | ThesisCalibration | None = None

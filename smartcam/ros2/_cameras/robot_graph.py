@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._ros_names import resolve
 from smartcam.exceptions import RosError
-from smartcam.geometry import Code
+from smartcam.geometry._inside import Code
 from smartcam.ros2._cameras.image_messages import frame_from, utc_of
 from smartcam.ros2._cameras.lens_messages import lens_from
 from smartcam.ros2._cameras.transform_listener import TransformListener

@@ -211,8 +211,8 @@ class CameraStatus:
 
     def _is_session_alive(self, counted: Statistics) -> bool:
         """Return True if the program that has the session is alive, or was."""
-        if self._options.agent_alive is not None:
-            return self._options.agent_alive()
+        if self._options.is_agent_alive is not None:
+            return self._options.is_agent_alive()
         return bool(counted.sessions or counted.last_error)
 
     def _values(

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry import Code, Transform
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Code
 from smartcam.ros2._cameras.image_messages import utc_of
 from smartcam.ros2._node.qos import QoS
 

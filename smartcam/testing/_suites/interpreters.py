@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from hypothesis.strategies import DataObject
 
-    from smartcam.interpreters import Spec
+    from smartcam.interpreters._inside import Spec
 
 MAX_ERROR_LENGTH = 500
 """Largest number of characters of an error's text, which has at most 64 of a container's bytes."""

@@ -1,4 +1,11 @@
-"""A faulty link on demand: a proxy between a client and a camera that changes their bytes."""
+"""A faulty link on demand: a proxy between a client and a camera that changes their bytes.
+
+::
+
+    async with LinkProxy("127.0.0.1", emulator.port, rules=[Cut(at=20)]) as proxy:
+        async with smartcam.connect(proxy.url(emulator.url)) as camera:
+            ...
+"""
 
 from __future__ import annotations
 
@@ -7,7 +14,6 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.testing.proxy._log import Entry
     from smartcam.testing.proxy._proxy import LinkProxy
     from smartcam.testing.proxy._rules import (
         CoalesceBytes,
@@ -20,7 +26,6 @@ if TYPE_CHECKING:
         InsertBytes,
         Late,
         Lose,
-        Pace,
         Rate,
         Reorder,
         Repeat,
@@ -37,13 +42,11 @@ __all__ = [
     "Drip",
     "DropBytes",
     "DuplicateBytes",
-    "Entry",
     "Flip",
     "InsertBytes",
     "Late",
     "LinkProxy",
     "Lose",
-    "Pace",
     "Rate",
     "Reorder",
     "Repeat",
@@ -57,10 +60,9 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_log": "Entry",
             "_proxy": "LinkProxy",
             "_rules": "CoalesceBytes Cut DelayBytes Drip DropBytes DuplicateBytes Flip "
-            "InsertBytes Late Lose Pace Rate Reorder Repeat ResetConnection Rule "
+            "InsertBytes Late Lose Rate Reorder Repeat ResetConnection Rule "
             "SplitBytes Stall",
         },
     )

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import CircleGrid, Code, find_target, make_sheet
+from smartcam.calibration import CircleGrid, find_target, make_sheet
 from smartcam.calibration._detection.blobs import dark_pieces
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import alike_areas, apply_homography, fit_homography, lattices
 from tests.calibration.scenes import STRAIGHT, drawn, refused
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection.ordering import (
     Arrangement,
     arrangements,
@@ -21,6 +21,7 @@ from smartcam.calibration._detection.ordering import (
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._inside import Target
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests import ROOT
 from tests.calibration.inside import alike_areas, grey_image, lattices, scaled
 from tests.calibration.scenes import STRAIGHT, check_pair, drawn, refused

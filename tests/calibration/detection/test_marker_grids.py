@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Code, MarkerGrid, find_target, target_from_data, target_to_data
+from smartcam.calibration import MarkerGrid, find_target, target_from_data, target_to_data
 from smartcam.calibration._detection.marker_grids import marker_patterns
 from smartcam.calibration._targets import resized
+from smartcam.geometry._inside import Code
 from tests.calibration.scenes import STRAIGHT, drawn, refused
 
 APRIL = MarkerGrid.april_grid(columns=6, rows=4, tag=0.03, spacing=0.3)

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Charuco, Code, TargetView, find_target
+from smartcam.calibration import Charuco, TargetView, find_target
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Markers, agreeing
 from tests.calibration.scenes import BENT, STRAIGHT, Drawn, drawn, refused
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._inside import Target
+from smartcam.geometry._inside import Code
 from tests.calibration.scenes import drawn, refused
 
 

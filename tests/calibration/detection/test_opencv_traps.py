@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import Code, RobotSigmas, calibrate_hand_eye, fit_plane
+from smartcam.calibration import RobotSigmas, calibrate_hand_eye, fit_plane
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import fit_homography
 from tests.calibration.scenes import CAMERA, refused, scene
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Sheet, find_target, make_sheet
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target, make_sheet
 from smartcam.calibration._inside import Target
-from tests.calibration.inside import Rays
+from tests.calibration.inside import Rays, Sheet
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

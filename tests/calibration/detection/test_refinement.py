@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Checkerboard, CircleGrid, Code, find_target
+from smartcam.calibration import CameraModel, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection.dots import UNREFINED_SIGMA_PX as UNREFINED_DOT
 from smartcam.calibration._detection.dots import GridMap, refine_dots
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import (
     UNREFINED_SIGMA_PX,
     apply_homography,

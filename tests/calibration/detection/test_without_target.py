@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection import boards, circle_grids
 from smartcam.calibration._detection.saddles import (
     MAX_SADDLES_EXAMINED,
@@ -17,6 +17,7 @@ from smartcam.calibration._detection.saddles import (
     find_saddles,
 )
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import (
     MAX_OUTLINES,
     MAX_OUTLINES_OF_ALL_WINDOWS,

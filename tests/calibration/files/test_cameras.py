@@ -11,14 +11,13 @@ import pytest
 from smartcam import CalibrationError
 from smartcam.calibration import (
     CameraModel,
-    Code,
     IntrinsicCalibration,
     StereoCalibration,
     TargetView,
     calibrate_intrinsics,
     calibrate_stereo,
 )
-from smartcam.geometry._inside import motion_from_data, motion_to_data
+from smartcam.geometry._inside import Code, motion_from_data, motion_to_data
 from tests.calibration.lenskit import BOARD, LEFT, pairs, poses, seen
 
 

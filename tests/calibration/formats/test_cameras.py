@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from smartcam import CalibrationError
-from smartcam.calibration import CameraModel, Code, calibrate_intrinsics
+from smartcam.calibration import CameraModel, calibrate_intrinsics
 from smartcam.calibration._inside import parse_camera_info, rectify
 from smartcam.calibration.formats import CameraChain, read_cameras, write_camera_info, write_cameras
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import (
     FORMS,
     CameraForm,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Code, Transform
+from smartcam.calibration import CameraModel, Transform
 from smartcam.calibration._inside import read_lenses
 from smartcam.calibration.formats import (
     pose_from,
@@ -20,6 +20,7 @@ from smartcam.calibration.formats import (
     read_trajectory,
     read_transform,
 )
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import CameraForm
 from tests.calibration.scenes import refused
 

@@ -25,7 +25,6 @@ from smartcam.calibration.formats import (
     TRAJECTORIES,
     TRANSFORMS,
     HandEyeSample,
-    PlaneMatrix,
     compose,
     plane_frame,
     read_matrix,
@@ -36,7 +35,7 @@ from smartcam.calibration.formats import (
     write_trajectory,
     write_transform,
 )
-from smartcam.calibration.formats._opencv import compose_matrix
+from smartcam.calibration.formats._opencv import PlaneMatrix, compose_matrix
 from smartcam.calibration.wizards import CalibrationService
 from tests import ROOT
 from tests.calibration.inside import PlaneModel, real, write

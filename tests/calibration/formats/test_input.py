@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.calibration import Code, Transform
+from smartcam.calibration import Transform
 from smartcam.calibration.formats import (
     SAMPLES,
     TRAJECTORIES,
@@ -25,6 +25,7 @@ from smartcam.calibration.formats import (
     write_transform,
 )
 from smartcam.exceptions import CalibrationError, MissingExtraError
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import MAX_TEXT_BYTES, load_json, load_yaml
 from tests.geometry.rigid import FEW, refused
 from tests.layout.bombs import laughs, merges

@@ -11,7 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.calibration import Transform
-from smartcam.calibration.formats import ROBOTS, pose_from, pose_to
+from smartcam.calibration._inside import ROBOTS
+from smartcam.calibration.formats import pose_from, pose_to
 from smartcam.calibration.formats._robots import angles_zyx, rotation_zyx
 from tests.geometry.rigid import FEW, angles, close, refused, transforms
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from smartcam.calibration import (
     CameraModel,
     Checkerboard,
-    Code,
     HandEyeCalibration,
     RobotSigmas,
     TargetView,
@@ -29,7 +28,7 @@ from smartcam.calibration import (
 )
 from smartcam.calibration.simulation import hand_eye_scene, view
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry._inside import exp_rotation
+from smartcam.geometry._inside import Code, exp_rotation
 from tests.calibration.inside import Setup, half_turned
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 

@@ -10,13 +10,12 @@ import pytest
 from benchmarks import robots
 from benchmarks.robots import Kind
 from smartcam.calibration import (
-    Code,
     RobotSigmas,
     Transform,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
-from smartcam.geometry._inside import Rigid, exp_rotation
+from smartcam.geometry._inside import Code, Rigid, exp_rotation
 from tests.calibration.inside import RobotPoses, second_turn, second_turns
 from tests.calibration.scenes import scene
 

@@ -12,7 +12,6 @@ from benchmarks.recorded_robots import SETS, RecordedSet, read_poses, read_set
 from benchmarks.robots_judge import OURS, folds, judged, rms
 from smartcam.calibration import (
     CameraModel,
-    Code,
     HandEyeCalibration,
     TargetView,
     Transform,
@@ -20,6 +19,7 @@ from smartcam.calibration import (
     calibrate_hand_eye_from_poses,
     calibrate_intrinsics,
 )
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import LINEAR
 
 pytestmark = pytest.mark.long

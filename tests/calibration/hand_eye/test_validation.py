@@ -10,7 +10,6 @@ import pytest
 
 from smartcam.calibration import (
     Checkerboard,
-    Code,
     HandEyeCalibration,
     RobotSigmas,
     TargetView,
@@ -26,7 +25,7 @@ from smartcam.calibration._hand_eye.validation import (
     most_error,
 )
 from smartcam.calibration.simulation import hand_eye_scene
-from smartcam.geometry._inside import Rigid
+from smartcam.geometry._inside import Code, Rigid
 from tests.calibration.inside import PoseObservations, RobotPoses, Setup
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 

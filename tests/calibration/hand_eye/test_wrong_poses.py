@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import (
-    Code,
     RobotSigmas,
     Transform,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
     fit_tool_tip,
 )
+from smartcam.geometry._inside import Code
 from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Code, Transform, compare
+from smartcam.calibration import CameraModel, Transform, compare
 from smartcam.calibration._inside import Lens, compare_lenses, rig_difference
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry._inside import IDENTITY, exp_rotation
+from smartcam.geometry._inside import IDENTITY, Code, exp_rotation
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, rms, spread_poses
 

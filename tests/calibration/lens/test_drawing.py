@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import (
-    Code,
     HandEyeCalibration,
     IntrinsicCalibration,
     StereoCalibration,
@@ -25,6 +24,7 @@ from smartcam.calibration import (
 from smartcam.calibration._drawing.bars import short_names
 from smartcam.calibration._stereo.calibration import PairFit
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
 from tests.calibration.scenes import SHEET, scene

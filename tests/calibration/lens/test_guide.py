@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Charuco, Code, Transform, suggest_views
+from smartcam.calibration import CameraModel, Charuco, Transform, suggest_views
 from smartcam.calibration._inside import Target
 from smartcam.calibration._lens.guide import NextView, candidates
 from smartcam.exceptions import CalibrationError
-from smartcam.geometry._inside import exp_rotation
+from smartcam.geometry._inside import Code, exp_rotation
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
 

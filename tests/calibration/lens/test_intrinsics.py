@@ -14,13 +14,12 @@ from smartcam import CalibrationError
 from smartcam.calibration import (
     Charuco,
     Checkerboard,
-    Code,
     IntrinsicCalibration,
     Transform,
     calibrate_intrinsics,
 )
 from smartcam.calibration._lens.start import fit_lens, lens_basis, parameter_names
-from smartcam.geometry._inside import Rigid
+from smartcam.geometry._inside import Code, Rigid
 from tests.calibration.inside import (
     Bundle,
     Coverage,

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code, Transform, locate
-from smartcam.geometry._inside import exp_rotation
+from smartcam.calibration import Transform, locate
+from smartcam.geometry._inside import Code, exp_rotation
 from tests.calibration.inside import excess, linearize, pose_changes, whitening
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, TURNED, WIDE, poses, seen
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import Checkerboard, Code, calibrate_intrinsics, compare
+from smartcam.calibration import Checkerboard, calibrate_intrinsics, compare
 from smartcam.calibration._inside import Lens, compare_lenses
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import half_turned, lens_values, with_lens
 from tests.calibration.lens.estimates import spread_poses
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, poses, seen

@@ -8,10 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration import CameraModel, Code, calibrate_intrinsics
+from smartcam.calibration import CameraModel, calibrate_intrinsics
 from smartcam.calibration._inside import Lens, compare_lenses
 from smartcam.calibration._lens.uncertainty import figures, uncertainty
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
 

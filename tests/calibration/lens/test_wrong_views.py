@@ -14,7 +14,6 @@ from smartcam.calibration import (
     Charuco,
     Checkerboard,
     CircleGrid,
-    Code,
     TargetView,
     Transform,
     calibrate_intrinsics,
@@ -23,6 +22,7 @@ from smartcam.calibration import (
 )
 from smartcam.calibration._lens.misfit import Equations
 from smartcam.calibration._lens.suspicions import squares_off
+from smartcam.geometry._inside import Code
 from tests.calibration.lenskit import BOARD, LEFT, poses, seen
 from tests.calibration.scenes import refused
 

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code, PlaneCalibration, fit_plane
+from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
 from smartcam.calibration._plane.robust import (
     MAX_FITTED_PROPOSALS,
@@ -20,7 +20,7 @@ from smartcam.calibration._plane.robust import (
     PROPOSALS,
     agreeing,
 )
-from smartcam.geometry._inside import Array
+from smartcam.geometry._inside import Array, Code
 from tests.calibration.inside import Fit, fit
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene, grid, scenes, spread
 from tests.geometry.rigid import FEW, refused

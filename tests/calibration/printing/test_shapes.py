@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid
 from smartcam.calibration._inside import Target
 from smartcam.calibration._printing.shapes import Box, ink, outlines, quartered
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Disc, Label, Polygon, PrintedPage, pdf, rectangle, svg
 
 if TYPE_CHECKING:

@@ -16,17 +16,16 @@ from smartcam.calibration import (
     Charuco,
     Checkerboard,
     CircleGrid,
-    Code,
     MarkerGrid,
-    Sheet,
     make_sheet,
     scaled,
     target_from_data,
 )
 from smartcam.calibration._inside import Target, on_paper
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests import ROOT
-from tests.calibration.inside import BORDER_MM, Disc, Label, Polygon, Rays, page_size
+from tests.calibration.inside import BORDER_MM, Disc, Label, Polygon, Rays, Sheet, page_size
 
 GOLDEN = ROOT / "docs" / "sheet.svg"
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code, Transform
+from smartcam.calibration import Transform
 from smartcam.calibration._inside import rectify
 from smartcam.calibration._stereo.triangulation import CameraPair, epipolar_distances, triangulate
-from smartcam.geometry._inside import Array
+from smartcam.geometry._inside import Array, Code
 from tests.calibration.lenskit import FISHEYE, LEFT, RIG, RIGHT
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ from smartcam import CalibrationError
 from smartcam.calibration import (
     Checkerboard,
     CircleGrid,
-    Code,
     StereoCalibration,
     Transform,
     calibrate_stereo,
 )
 from smartcam.calibration._stereo.errors import spacing_errors
 from smartcam.calibration._stereo.start import Lenses, as_moments, start
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, remark_sides
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
@@ -162,7 +162,7 @@ def test_calibrate_stereo_of_swapped_sides_has_a_remark() -> None:
 
 def test_calibrate_stereo_numbers_a_sheet_that_looks_the_same_when_turned_alike() -> None:
     target = Checkerboard(columns=8, rows=6, square=0.025)
-    assert target.turned_alike
+    assert target.half_turn_symmetric
     lefts = poses(6, name="left")
     left = seen(LEFT, lefts, target=target)
     right = seen(RIGHT, [RIG @ one for one in lefts], target=target, seed=2)

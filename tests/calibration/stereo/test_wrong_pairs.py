@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration import Code, StereoCalibration, TargetView, Transform, calibrate_stereo
-from smartcam.geometry._inside import exp_rotation
+from smartcam.calibration import StereoCalibration, TargetView, Transform, calibrate_stereo
+from smartcam.geometry._inside import Code, exp_rotation
 from tests.calibration.inside import check_apart
 from tests.calibration.lens.test_wrong_views import flipped, mirrored
 from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen

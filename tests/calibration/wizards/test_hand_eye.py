@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Folder, HandEyeCalibration, Transform
-from smartcam.calibration._inside import listing
-from smartcam.calibration.formats import ROBOTS, pose_to
+from smartcam.calibration._inside import ROBOTS, listing
+from smartcam.calibration.formats import pose_to
 from smartcam.calibration.simulation import render
 from smartcam.calibration.wizards import WizardSession, hand_eye_wizard
 from smartcam.calibration.wizards._hand_eye import SUGGESTIONS

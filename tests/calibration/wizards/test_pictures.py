@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from smartcam._extras import load
-from smartcam.calibration._inside import decode_picture
-from smartcam.calibration.wizards import PictureFolder
+from smartcam.calibration._inside import PictureFolder, decode_picture
 from smartcam.calibration.wizards import _pictures as pictures
 from smartcam.calibration.wizards._pictures import taker
 from smartcam.exceptions import FrameTimeoutError, LocalProtocolError

@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration import Checkerboard, Code, PlaneCalibration, TargetView, fit_plane
+from smartcam.calibration import Checkerboard, PlaneCalibration, TargetView, fit_plane
 from smartcam.calibration._inside import LOOKS
 from smartcam.calibration.wizards._marks import Mark, Touch
 from smartcam.calibration.wizards._target_drawing import MAX_SIDE_PX, cell_counts, draw
 from smartcam.calibration.wizards._touch_previews import HEAT_MAP_CELLS, before, compared, plain
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import Code
 from tests.calibration.inside import Look, outline
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import Code, fit_plane
+from smartcam.calibration import fit_plane
 from smartcam.calibration._verdict import CURES, VIEW_CURES, Allowed, judge, refused
 from smartcam.calibration.wizards._points import calibrated_plane
+from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,7 +17,8 @@ from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
 if TYPE_CHECKING:
     from typing import Self
 
-    from smartcam.frames import Codecs, H264Decoder, RtspServer
+    from smartcam.frames import Codecs, RtspServer
+    from tests.frames.inside import H264Decoder
 
 LIMIT = 20.0
 """Seconds for an answer: the server waits for a frame."""

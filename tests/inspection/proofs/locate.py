@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.inspection import PartModel, Picture
-from smartcam.inspection._locate.find import PartSearch, locate
 from smartcam.inspection._locate.segments import pixels_in
 from tests.inspection.drawn_parts import (
     PARTS,
@@ -45,13 +44,14 @@ from tests.inspection.drawn_parts import (
     shares,
     slopes,
 )
+from tests.inspection.inside import PartSearch, locate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.inspection import LocatedPart
+    from tests.inspection.inside import LocatedPart
 
 
 __all__ = ["PartSearch", "locate"]

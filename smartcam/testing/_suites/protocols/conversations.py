@@ -38,7 +38,7 @@ class Sent(NamedTuple):
     wire: bytes
 
 
-class Came(NamedTuple):
+class Received(NamedTuple):
     """Bytes of the camera: any piece of a stream, or one datagram.
 
     Attributes:
@@ -53,7 +53,7 @@ class Came(NamedTuple):
     wire: bytes = b""
 
 
-Step: TypeAlias = Sent | Came
+Step: TypeAlias = Sent | Received
 
 
 @dataclass(frozen=True, kw_only=True)

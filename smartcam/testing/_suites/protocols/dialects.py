@@ -19,17 +19,9 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import jsonable
-from smartcam.protocols import (
-    CodeMeaning,
-    Frame,
-    FramedDialect,
-    RawRequest,
-    Spelled,
-    Transport,
-    Verdict,
-)
+from smartcam.protocols import CodeMeaning, Frame, FramedDialect, RawRequest, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import Framer
+from smartcam.protocols._inside import Framer, Spelled
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 from smartcam.testing._suites.protocols.parameters import Parameters

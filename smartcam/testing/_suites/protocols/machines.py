@@ -16,10 +16,10 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     UnsupportedError,
 )
-from smartcam.protocols import Counters, Frame, LinkEnded, LinkFailed, State, Transport, Verdict
+from smartcam.protocols import Frame, LinkEnded, LinkFailed, State, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._inside import ResultBurst
-from smartcam.testing._suites.protocols.conversations import Came, Player, Sent
+from smartcam.protocols._inside import Counters, ResultBurst
+from smartcam.testing._suites.protocols.conversations import Player, Received, Sent
 from smartcam.testing._suites.protocols.dialects import see_spelled
 from smartcam.testing._suites.protocols.parameters import Parameters
 from smartcam.testing._suites.protocols.words import REQUESTS, example
@@ -77,7 +77,7 @@ class MachineChecks(Parameters):
                 for step in stream.steps:
                     player.step(step, cuts(step), room=room)
         for place, step in enumerate(stream.steps):
-            if isinstance(step, Came):
+            if isinstance(step, Received):
                 size = len(step.data)
                 for cut in range(1, size, 1 + size // MAX_CUTS):
                     player = Player(self.protocol, stream).play(place)
@@ -246,7 +246,7 @@ class MachineChecks(Parameters):
                 continue
             machine.send(m.Disconnect())
             player.written()
-            later = [step.data for step in conversation.steps[place:] if isinstance(step, Came)]
+            later = [step.data for step in conversation.steps[place:] if isinstance(step, Received)]
             for data in (b"", *later):
                 machine.receive_data(data)
                 machine.events()
@@ -303,7 +303,7 @@ class MachineChecks(Parameters):
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
         """Check the counter of bytes, which is in an attempt's error."""
         player = Player(self.protocol, conversation).play()
-        received = sum(len(step.data) for step in conversation.steps if isinstance(step, Came))
+        received = sum(len(step.data) for step in conversation.steps if isinstance(step, Received))
         counted = player.machine.counters.bytes_received
         assert counted == received, f"counters.bytes_received is {counted}, {received} came"
 
@@ -419,11 +419,11 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
 
 
 def _samples(conversation: Conversation) -> list[bytes]:
-    return [step.data for step in conversation.steps if isinstance(step, Came)]
+    return [step.data for step in conversation.steps if isinstance(step, Received)]
 
 
 def _bytewise(step: Step) -> list[bytes] | None:
-    return [bytes([byte]) for byte in step.data] if isinstance(step, Came) else None
+    return [bytes([byte]) for byte in step.data] if isinstance(step, Received) else None
 
 
 def _unsplit(_: Step) -> None:
@@ -435,8 +435,8 @@ def _joined(steps: Sequence[Step]) -> list[Step]:
     joined: list[Step] = []
     for step in steps:
         last = joined[-1] if joined else None
-        if isinstance(step, Came) and isinstance(last, Came) and not last.wire:
-            joined[-1] = Came(last.data + step.data, last.events + step.events, step.wire)
+        if isinstance(step, Received) and isinstance(last, Received) and not last.wire:
+            joined[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
         else:
             joined.append(step)
     return joined
@@ -450,7 +450,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
     failed = False
     for place, step in enumerate(conversation.steps):
         yield place, []
-        if isinstance(step, Came):
+        if isinstance(step, Received):
             yield place, [step.data[: len(step.data) // 2]]
             failed = any(isinstance(event, type) for event in step.events)
     if not failed:
