@@ -127,22 +127,22 @@ def _table_text(table: Any) -> str | None:
     if table.ndim != 1 or row is None:
         return None
     form, texts, numbers = row
-    rows: list[tuple[Any, ...]] = table.tolist()
-    if numbers and not math.isfinite(sum([row[place] for row in rows for place in numbers])):
-        return None  # the sum is not finite if a value is not
-    if texts:
-        rows = [
-            tuple(
-                _quoted(_text_or_hex(field)) if place in texts else field
-                for place, field in enumerate(row)
-            )
-            for row in rows
-        ]
-    return f"[{','.join([form % row for row in rows])}]"
+    found: list[str] = []
+    for values in table.tolist():
+        fields = [*values]
+        total = 0.0
+        for place in numbers:
+            total += fields[place]
+        if not math.isfinite(total):
+            return None  # the sum is not finite if a value is not
+        for place in texts:
+            fields[place] = _quoted(_text_or_hex(fields[place]))
+        found.append(form % (*fields,))
+    return f"[{','.join(found)}]"
 
 
 @functools.lru_cache(maxsize=256)
-def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
+def _row_form(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None:
     """Return the form of a row, the places of its texts and floats; None for other columns."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
@@ -154,7 +154,7 @@ def _row_form(dtype: Any) -> tuple[str, frozenset[int], tuple[int, ...]] | None:
     form = ",".join(
         [f"{_quoted(name).replace('%', '%%')}:{_FORMS[field.kind]}" for name, field in fields]
     )
-    texts = frozenset(place for place, kind in enumerate(kinds) if kind.kind == "S")
+    texts = tuple(place for place, kind in enumerate(kinds) if kind.kind == "S")
     floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")
     return f"{{{form}}}", texts, floats
 

@@ -26,6 +26,9 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 _HOOKS = ("on_frame", "on_state", "on_result", "on_picture", "on_error")
 
 
+_FAILED = "! an observer failed: %r"
+
+
 class TraceEntry(NamedTuple):
     """One frame as ``--trace`` writes it.
 
@@ -53,7 +56,7 @@ class RawFrame(NamedTuple):
     """One frame as it went over the wire, not yet decoded.
 
     Attributes:
-        at: time, UTC.
+        at: time, UTC; frames that came or went together share it.
         camera: name of the camera.
         dialect: dialect that the frame is decoded in.
         sender: side that sent the frame.
@@ -103,6 +106,15 @@ class Observer:
         """
         self.on_frame(frame.entry())
 
+    def on_raw_frames(self, frames: Sequence[RawFrame]) -> None:
+        """Handle frames that came or went together, in order: one or more; do not change them.
+
+        An observer that overrides this method gets every frame here, and ``on_raw_frame`` is not
+        called. If another observer wants single frames, there is one in each call.
+        """
+        for frame in frames:
+            self.on_raw_frame(frame)
+
     def on_state(self, event: CameraEvent) -> None:
         """Handle an event of ``camera.events()``, in the same order.
 
@@ -112,8 +124,8 @@ class Observer:
     def on_result(self, result: Result) -> None:
         """Handle an interpreted result: for a trigger, a stream or ``next_result()``.
 
-        Results are passed one by one only if an observer overrides this method, and not
-        ``on_results``.
+        Results that came together are counted and interpreted before the first call, and statuses
+        between them may be reported after the last one.
 
         The result of a trigger has ``triggered_at`` and ``latency``. A container without a caller
         or a subscriber is counted and not interpreted.
@@ -122,10 +134,8 @@ class Observer:
     def on_results(self, results: Sequence[Result]) -> None:
         """Handle results that came together, in order: one or more; do not change the sequence.
 
-        An observer that overrides it gets every result here, and ``on_result`` is not called.
-        If no observer wants single results, the results of a camera that runs free stay together,
-        which costs a fraction. They are counted and interpreted before the call, and statuses
-        between them may be reported after them.
+        An observer that overrides it gets every result here, and ``on_result`` is not called. If
+        another observer wants single results, there is one in each call.
         """
         for result in results:
             self.on_result(result)
@@ -166,7 +176,8 @@ class Observers:
             if not all(callable(getattr(observer, hook, None)) for hook in _HOOKS):
                 raise wrong_argument("observers", "objects of classes of Observer", observer)
         self._on_state = self._overriding("on_state")
-        self._on_result = tuple(self._looking_at("on_results", "on_result"))
+        seen = self._looking_at("on_results", "on_result")
+        self._on_result = [(hook, name == "on_results") for hook, name in seen]
         self._on_picture = self._overriding("on_picture")
         self.see_pictures: bool = bool(self._on_picture)
         self.see_states: bool = bool(self._on_state)
@@ -177,23 +188,27 @@ class Observers:
         return bool(self._all)
 
     @property
-    def trace(self) -> Callable[[RawFrame], None] | None:
-        """Function to call with every frame; None if no observer handles frames."""
-        hooks = tuple(self._looking_at("on_raw_frame", "on_frame"))
+    def trace(self) -> Callable[[Sequence[RawFrame]], None] | None:
+        """Function to call with frames that came or went together; None if nobody wants any."""
+        hooks = list(self._looking_at("on_raw_frames", "on_raw_frame", "on_frame"))
         if not hooks:
             return None
 
-        def on_frame(frame: RawFrame) -> None:
-            entry: TraceEntry | None = None
-            for hook, raw in hooks:
-                if raw:
-                    self._call(hook, frame)
-                    continue
-                if entry is None:
-                    entry = frame.entry()
-                self._call(hook, entry)
+        def on_frames(frames: Sequence[RawFrame]) -> None:
+            if all(name == "on_raw_frames" for _, name in hooks):
+                for hook, _ in hooks:
+                    self._call(hook, frames)
+                return
+            for frame in frames:
+                entry: TraceEntry | None = None
+                for hook, name in hooks:
+                    if name == "on_frame":
+                        entry = frame.entry() if entry is None else entry
+                        self._call(hook, entry)
+                    else:
+                        self._call(hook, frame if name == "on_raw_frame" else (frame,))
 
-        return on_frame
+        return on_frames
 
     def state(self, event: CameraEvent) -> None:
         """Report an event to all observers."""
@@ -208,11 +223,24 @@ class Observers:
     def results(self, results: Sequence[Result]) -> None:
         """Report results that came together; one by one if an observer wants single results."""
         if self.see_each:
-            for result in results:
-                self.result(result)
+            for _ in self.each(results):
+                pass
             return
         for hook, _ in self._on_result:
             self._call(hook, results)
+
+    def each(self, results: Sequence[Result]) -> Iterator[Result]:
+        """Report results one by one, and yield each when all observers have seen it."""
+        hooks = self._on_result
+        for result in results:
+            for hook, together in hooks:
+                try:
+                    hook((result,) if together else result)
+                except ENDS_PROGRAM:
+                    raise
+                except BaseException:  # an observer must not end the receive task
+                    logger.exception(_FAILED, hook)
+            yield result
 
     def picture(self, result: Result, frame: Picture) -> None:
         """Report the picture that a result was made of to all observers."""
@@ -231,20 +259,19 @@ class Observers:
         hooks = [_own_hook(observer, name) for observer in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
-    def _looking_at(self, first: str, other: str) -> Iterator[tuple[Callable[..., None], bool]]:
-        """Yield the overridden one of two methods of each observer, and whether it is ``first``.
+    def _looking_at(self, *names: str) -> Iterator[tuple[Callable[..., None], str]]:
+        """Yield the overridden one of several methods of each observer, and its name.
 
-        The method that is overridden last counts; ``first`` if one class overrides both.
+        The method that is overridden last counts; the first one of those that a class overrides.
         """
         for observer in self._all:
-            hook, second = _own_hook(observer, first), _own_hook(observer, other)
-            if hook is None or (
-                second is not None and _depth(observer, other) < _depth(observer, first)
-            ):
-                if second is not None:
-                    yield second, False
-            else:
-                yield hook, True
+            hooks = [
+                (name, hook) for name in names if (hook := _own_hook(observer, name)) is not None
+            ]
+            depths = [_depth(observer, name) for name, _ in hooks]
+            if hooks:
+                name, hook = hooks[depths.index(min(depths))]
+                yield hook, name
 
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -252,7 +279,7 @@ class Observers:
         except ENDS_PROGRAM:
             raise
         except BaseException:  # an observer must not end the receive task
-            logger.exception("! an observer failed: %r", hook)
+            logger.exception(_FAILED, hook)
 
 
 def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:

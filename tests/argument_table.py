@@ -402,7 +402,7 @@ NOT_HERE: dict[str, str] = {
         FrameSource.wait_until_streaming Outlet OutletContext Outlets.offer_result
         Outlets.offer_error Outlets.state_changed Device.handle Device.watch LineClient
         LineCamera TicketedClient TicketedCamera Recorder.describe Recorder.on_error
-        Recorder.on_frame Recorder.on_result Recorder.on_raw_frame Recorder.on_results
+        Recorder.on_frame Recorder.on_result Recorder.on_raw_frames Recorder.on_results
         Recorder.on_picture BagRecorder.on_picture Tool Recorder.on_state
         BagRecorder.on_frame ReplayedCamera.received Task ClientConformance
         CameraConformance EmulatedCamera.application_of EmulatedCamera.from_scenario

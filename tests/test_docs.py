@@ -43,7 +43,6 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 CAMERA = "bvs://192.168.0.10"
 """The address of a real camera in examples; an emulator's takes its place here."""
 LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
-pytestmark = pytest.mark.long
 
 OPTIONAL = ("opentelemetry.sdk", "prometheus_client")
 """Packages that some examples import and the tests do not demand; the extra ``dev`` has them."""

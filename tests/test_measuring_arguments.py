@@ -53,7 +53,7 @@ def widths() -> Iterator[Any]:
             yield pytest.param(name, 1, marks=WIDEST)
         elif name in DEAR:
             yield pytest.param(name, 1, marks=LONG)
-            yield name, 7
+            yield name, 13
         else:
             yield name, 1
 

@@ -74,7 +74,7 @@ class Blind(Observer):
 def _frame(observers: Observers) -> None:
     trace = observers.trace
     assert trace is not None
-    trace(RAW)
+    trace((RAW,))
 
 
 HOOKS: dict[str, tuple[Callable[[Observers], None], tuple[Any, ...]]] = {
@@ -143,7 +143,7 @@ def test_frames_go_only_to_observers_that_look() -> None:
     looking: list[Observer] = [Blind(), Everything("one", calls), Blind()]
     trace = Observers(looking).trace
     assert trace is not None
-    trace(RAW)
+    trace((RAW,))
     assert calls == [("one", "frame", FRAME)]
 
 
@@ -165,9 +165,53 @@ def test_frame_goes_undecoded_to_who_takes_it_so_and_decoded_to_others() -> None
     calls: list[tuple[Any, ...]] = []
     trace = Observers([Raw("one", calls), Everything("two", calls), Blind()]).trace
     assert trace is not None
-    trace(RAW)
+    trace((RAW,))
     assert calls == [("one", "raw", RAW), ("two", "frame", FRAME)]
     assert (FRAME.direction, FRAME.message, FRAME.message_id) == (">", "Trigger", 0x40)
+
+
+class RawTogether(Raw):
+    """Takes frames together, and would note it if it were given one alone."""
+
+    def on_raw_frames(self, frames: Sequence[RawFrame]) -> None:
+        self.calls.append((self.name, "together", *frames))
+
+
+class DecodedAgain(RawTogether):
+    """Overrides the first hook last."""
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        self.calls.append((self.name, "frame", entry))
+
+
+def test_frames_come_together_if_nobody_wants_them_one_by_one() -> None:
+    calls: list[tuple[Any, ...]] = []
+    other = RAW._replace(camera="press 5")
+    for together in (True, False):
+        more = [] if together else [Raw("three", calls), DecodedAgain("four", calls)]
+        observers = [RawTogether("one", calls), Blind(), RawTogether("two", calls), *more]
+        trace = Observers(observers).trace
+        assert trace is not None
+        trace([RAW, other])
+        expected: list[tuple[Any, ...]] = [
+            (name, "together", RAW, other) for name in ("one", "two")
+        ]
+        if not together:
+            expected = [
+                call
+                for one in (RAW, other)
+                for call in (
+                    ("one", "together", one),
+                    ("two", "together", one),
+                    ("three", "raw", one),
+                    ("four", "frame", one.entry()),
+                )
+            ]
+        assert calls == expected
+        calls.clear()
+    RawTogether("one", calls).on_raw_frame(RAW)
+    Raw("two", calls).on_raw_frames([RAW, other])
+    assert calls == [("one", "raw", RAW), ("two", "raw", RAW), ("two", "raw", other)]
 
 
 def test_raw_frame_that_is_not_taken_goes_to_the_other_hook() -> None:
@@ -230,6 +274,16 @@ def test_results_come_one_by_one_to_all_where_one_wants_that() -> None:
         for one in OTHERS
         for name, what in (("one", "results"), ("two", "result"))
     ]
+
+
+def test_observer_that_raises_at_one_result_is_given_the_next(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    calls: list[tuple[Any, ...]] = []
+    observers = Observers([Broken("one", calls), Everything("two", calls)])
+    assert [*observers.each(OTHERS)] == OTHERS
+    assert calls == [(name, "result", one) for one in OTHERS for name in ("one", "two")]
+    assert len(caplog.records) == len(OTHERS)
 
 
 def test_results_that_are_not_overridden_go_to_the_other_hook() -> None:

@@ -193,7 +193,7 @@ async def attempt(
     progress: Try,
     name: str,
     max_length: int,
-    trace: Callable[[RawFrame], None] | None = None,
+    trace: Callable[[Sequence[RawFrame]], None] | None = None,
     disconnect_first: bool = True,
     liveness_timeout: float | None = None,
 ) -> Session:
@@ -206,7 +206,7 @@ async def attempt(
         progress: function that gets each step of the handshake.
         name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
-        trace: function that is called with every frame.
+        trace: function that is called with frames that came or went together.
         disconnect_first: send Disconnect before Connect.
         liveness_timeout: see :class:`~smartcam._client.link.Link`.
 
@@ -305,14 +305,14 @@ def names_of(dialects: Sequence[Dialect]) -> str:
 
 async def establish(
     settings: CameraSettings,
-    trace: Callable[[RawFrame], None] | None = None,
+    trace: Callable[[Sequence[RawFrame]], None] | None = None,
     layout: Layout | None = None,
 ) -> Session:
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
 
     Args:
         settings: the address, and the timeouts.
-        trace: function that is called with every frame.
+        trace: function that is called with frames that came or went together.
         layout: the fields of the results, for a camera that takes them.
 
     Raises:

@@ -121,9 +121,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     Attributes:
         loop: the event loop that the link is used in.
-        outcome: function that makes a future that one task awaits and another task sets.
-        wake_in_order: function that makes callers of the current delivery continue after
-            subscribers.
+        outcome: function that makes a future for one task to wait for, which the receive task or
+            another one sets.
+        wake_in_order: function that makes callers of the present delivery go on after subscribers.
+        trace: trace of the link's frames; None if nobody wants them.
         heard_at: loop time of the last byte received.
     """
 
@@ -150,8 +151,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         # if the machine can send several at once
         each: Callable[[Sequence[Message]], None] = functools.partial(send_each, machine)
         self._send_all = getattr(machine, "send_all", each)
-        # function that takes the bytes of an unfinished frame
-        self.on_rest: Callable[[bytes], None] | None = None
+        self.trace: FrameTrace | None = None
         self._chunks: collections.deque[Chunk] = collections.deque()
         self.deliveries = 0  # number of deliveries with events so far
         self._frames = 0  # number of frames received until the last chunk
@@ -352,7 +352,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def eof_received(self) -> None:
         """asyncio: the camera will send no more."""
-        self._show_rest()
+        if self.trace is not None:
+            self.trace.note_rest()
         self.machine.receive_eof()
         self._hand_on()
         self._lose(ConnectionResetError("the camera closed the connection"))
@@ -387,6 +388,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def _flush(self) -> None:
         frames = self.machine.data_to_send()
+        if self.trace is not None:
+            self.trace.tell()
         if not frames:
             return
         if self._datagrams:
@@ -419,6 +422,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def _hand_on(self) -> None:
         """Queue the events of the last bytes for the receive task."""
         events = self.machine.events()
+        if self.trace is not None:
+            self.trace.tell()
         if not events or self._closing:
             return
         received = self.machine.counters.frames_received
@@ -460,20 +465,69 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._paused = False
             self._transport.resume_reading()
 
-    def _show_rest(self) -> None:
-        show, self.on_rest = self.on_rest, None
-        pending = self.machine.pending if show is not None else b""
-        if show is not None and pending:
-            show(pending)
-
     def _lose(self, reason: BaseException) -> None:
         if self._loss is None:
             self._loss = reason
-            if self.on_rest is not None:
-                self._show_rest()
+            if self.trace is not None:
+                self.trace.note_rest()
         if self._full:
             self.resume_writing()
         self._doorbell.ring()
+
+
+class FrameTrace:
+    """The frames of a link that the log and the observers do not have yet.
+
+    They get those of a delivery together, before anything else happens because of it.
+
+    Args:
+        name: name of the camera.
+        show: function that is called with frames; None if only the log wants them.
+
+    Attributes:
+        machine: the link's machine.
+    """
+
+    __slots__ = ("_frames", "_name", "_over", "_show", "machine")
+
+    def __init__(self, name: str, show: Callable[[Sequence[RawFrame]], None] | None) -> None:
+        self.machine: LinkMachine
+        self._name, self._show = name, show
+        self._frames: list[RawFrame] = []
+        self._over = False  # whether the link's last bytes were noted
+
+    def note(self, sender: Sender, frame: Frame | RemoteProtocolError) -> None:
+        """Keep a frame, or bytes that make none; the machine calls this."""
+        frames, name = self._frames, self._name
+        at = frames[-1].at if frames else datetime.now(UTC)
+        content: Frame | TraceEntry
+        if isinstance(frame, RemoteProtocolError):
+            content = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
+        else:
+            content = frame
+        frames.append(RawFrame(at, name, self.machine.dialect, sender, content))
+
+    def note_rest(self) -> None:
+        """Tell of an unfinished frame, once: the link is over."""
+        over, self._over = self._over, True
+        rest = b"" if over else self.machine.pending
+        if rest:
+            text = f"{len(rest)} bytes that make no whole frame"
+            hexed = rest[:MAX_REST_BYTES].hex()
+            content = TraceEntry(datetime.now(UTC), self._name, "!", None, text, None, hexed)
+            dialect = self.machine.dialect
+            self._frames.append(RawFrame(content.at, self._name, dialect, Sender.CAMERA, content))
+            self.tell()
+
+    def tell(self) -> None:
+        """Pass the frames on."""
+        frames, self._frames = self._frames, []
+        if frames and logger.isEnabledFor(logging.DEBUG):
+            for frame in frames:
+                _, name, direction, _, message, _, data = frame.entry()
+                logger.debug("%s %s %s %s", name, direction, message, data[:128])
+        if frames and self._show is not None:
+            self._show(frames)
 
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
@@ -516,7 +570,7 @@ async def open_link(
     *,
     name: str,
     max_length: int,
-    trace: Callable[[RawFrame], None] | None = None,
+    trace: Callable[[Sequence[RawFrame]], None] | None = None,
     liveness_timeout: float | None = None,
 ) -> Link:
     """Open a link; bounded by the caller's deadline.
@@ -529,47 +583,26 @@ async def open_link(
         port: port of the camera.
         name: name of the camera in logs.
         max_length: bytes of the largest payload that is accepted.
-        trace: function that is called with every frame.
+        trace: function that is called with the frames of each delivery, and with those sent.
         liveness_timeout: see :class:`Link`.
 
     Raises:
         OSError: the name does not resolve, nothing listens, or the host is unreachable.
     """
     loop = asyncio.get_running_loop()
-    machine: LinkMachine
-
-    def note(frame: RawFrame) -> None:
-        if logger.isEnabledFor(logging.DEBUG):
-            entry = frame.entry()
-            logger.debug("%s %s %s %s", name, entry.direction, entry.message, entry.hex[:128])
-        if trace is not None:
-            trace(frame)
-
-    def on_frame(sender: Sender, frame: Frame | RemoteProtocolError) -> None:
-        at = datetime.now(UTC)
-        content: Frame | TraceEntry
-        if isinstance(frame, RemoteProtocolError):
-            content = TraceEntry(at, name, "!", None, str(frame), None, frame.data.hex())
-        else:
-            content = frame
-        note(RawFrame(at, name, machine.dialect, sender, content))
-
-    def on_rest(rest: bytes) -> None:
-        at, text = datetime.now(UTC), f"{len(rest)} bytes that make no whole frame"
-        content = TraceEntry(at, name, "!", None, text, None, rest[:MAX_REST_BYTES].hex())
-        note(RawFrame(at, name, machine.dialect, Sender.CAMERA, content))
-
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)
+    frames = FrameTrace(name, trace)
     machine = protocol.machine(
         dialects[0],
         Role.CLIENT,
         transport,
         max_length=max_length,
-        trace=on_frame if traced else None,
+        trace=frames.note if traced else None,
         kin=tuple(dialects),
     )
     link = Link(machine, name=name, host=host, port=port, liveness_timeout=liveness_timeout)
-    link.on_rest = on_rest if traced else None
+    if traced:
+        frames.machine, link.trace = machine, frames
     if transport is Transport.TCP:
         await loop.create_connection(lambda: link, host, port)
     else:

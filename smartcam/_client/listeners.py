@@ -60,8 +60,8 @@ class Listeners:
 
     @property
     def streams_results(self) -> bool:
-        """True if results go to streams, and to no listener that needs single results."""
-        return self._streams_hear and not (self._see_each or self._awaits_next)
+        """True if results go to streams, and to no caller that waits for a single one."""
+        return self._streams_hear and not self._awaits_next
 
     @property
     def hears_results(self) -> bool:
@@ -117,10 +117,31 @@ class Listeners:
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         """Pass on results that are only streamed and observed; ``size`` bytes in all."""
+        if self._see_each:
+            self._offer_each(results, now)
+            return
         if self.observed:
             self._observers.results(results)
         for stream in self.results:
             stream.offer_all(results, now, size)
+
+    def _offer_each(self, results: Sequence[Result], now: float) -> None:
+        """Show observers one result after the other, and pass the results on together.
+
+        A listener that a hook adds gets the result that the hook was called with, and later ones.
+        """
+        heard, streams, joined, done = self.results, [*self.results], self.results.joined, 0
+        try:
+            for place, result in enumerate(self._observers.each(results)):
+                if heard.joined != joined or self.may_await:
+                    _offer_all(streams, results[done:place], now)
+                    done = place + 1
+                    heard.offer(result, now, len(result.raw))
+                    for future in self._take_next_results():
+                        future.set_result(result)
+                    streams, joined = [*heard], heard.joined
+        finally:  # a hook may end the program
+            _offer_all(streams, results[done:], now)
 
     def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
         """Pass a result on.
@@ -178,6 +199,12 @@ class Listeners:
         self._next_results.clear()
         self.may_await = False
         return waiting
+
+
+def _offer_all(streams: Sequence[Queue[Result]], results: Sequence[Result], now: float) -> None:
+    size = sum([len(result.raw) for result in results])
+    for stream in streams:
+        stream.offer_all(results, now, size)
 
 
 def _drop_frames(error: SmartCamError) -> None:

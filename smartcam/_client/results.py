@@ -301,8 +301,8 @@ class Results:
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None if they must be passed singly.
 
-        That is the case if a trigger or a waiting call may need one, if one may be a pending
-        result, if an observer needs each, or if one cannot be interpreted.
+        Otherwise a trigger or a single waiter may need one of them, one may be a pending result,
+        and one that cannot be interpreted is its own item.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:

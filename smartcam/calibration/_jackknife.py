@@ -34,20 +34,20 @@ def jackknife(left_out: Array) -> Array:
     return covariance
 
 
-def weighed_jackknife(changes: Array, spreads: Array, whole: Array) -> Array:
+def weighed_jackknife(changes: Array, spreads: Array, whole: Array, power: float) -> Array:
     """Return the jackknife of a least-squares estimate, with less weight for views that pull more.
 
     The plain jackknife is too large by a half and more if single views carry much of the
     information, as they do for lenses. ``changes`` (V, K): by how much the estimate changes without
     each view. ``spreads`` (V, K, K) is the covariance of the estimate without each view, ``whole``
     (K, K) that with all; both are those that independent errors of all points would cause.
+    ``power``: with 1/2, and with all values that are estimated together, the expectation is the
+    covariance where points err independently; with less, views that err as a whole count for more.
     """
-    # With L L^T the whole covariance and W_i = L^-1 C_i L^-T, change i weighs W_i^(-1/3). With
-    # W_i^(-1/2) the squares' sum has the expectation of the covariance where points err
-    # independently, and halves of recorded sets differ by 1.2 times as much; with 1, the plain
-    # jackknife, they differ by 0.8 times as much, and simulated lenses by 0.7 (measured). Source:
-    # Bell and McCaffrey, Bias Reduction in Standard Errors for Linear Regression with Multi-Stage
-    # Samples (2002).
+    # With L L^T the whole covariance and W_i = L^-1 C_i L^-T, change i weighs W_i^-power. The
+    # squares' sum of the weighed changes has the expectation L sum(I - W_i^-1) L^T for 1/2, and the
+    # information I - W_i^-1 of all views adds up to I. Source: Bell and McCaffrey, Bias Reduction
+    # in Standard Errors for Linear Regression with Multi-Stage Samples (2002).
     if not changes.size:
         return np.zeros(whole.shape)
     scale = unit_diagonal(whole)
@@ -56,7 +56,7 @@ def weighed_jackknife(changes: Array, spreads: Array, whole: Array) -> Array:
     root = scale[:, None] * vectors[:, significant] * np.sqrt(values[significant])
     back = np.linalg.pinv(root)
     sizes, ways = np.linalg.eigh(back @ spreads @ back.T)
-    along = np.einsum("vji,jk,vk->vi", ways, back, changes) / np.maximum(sizes, 1.0) ** (1 / 3)
+    along = np.einsum("vji,jk,vk->vi", ways, back, changes) / np.maximum(sizes, 1.0) ** power
     steps = np.einsum("kj,vji,vi->vk", root, ways, along)
     covariance: Array = steps.T @ steps
     return covariance

@@ -265,11 +265,12 @@ async def _try(
     address, transport, dialects = way
     trial = Trial(names_of(dialects), transport.value, address=address)
 
-    def take(frame: RawFrame) -> None:
-        entry = frame.entry()
-        trial.keep(entry)
-        if trace is not None:
-            trace(entry)
+    def take(frames: Sequence[RawFrame]) -> None:
+        for frame in frames:
+            entry = frame.entry()
+            trial.keep(entry)
+            if trace is not None:
+                trace(entry)
 
     try:
         async with asyncio.timeout(share):

@@ -333,6 +333,10 @@ class _ClassInterpreter(PlainInterpreter):
         """Return an object, or the list of them."""
         return self._make(self.layout.parse(data, context.byte_order))
 
+    def read_all(self, containers: Sequence[bytes], context: Context) -> list[Any]:
+        """Return an object, or the list of them, for each container."""
+        return list(map(self._make, self.layout.parse_all(containers, context.byte_order)))
+
     def __repr__(self) -> str:
         return f"<interpreter {getattr(self._described, '__name__', self._described)}>"
 

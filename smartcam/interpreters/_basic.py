@@ -65,6 +65,10 @@ class RecordInterpreter(PlainInterpreter):
         """
         return self.layout.parse(data, context.byte_order)
 
+    def read_all(self, containers: Sequence[bytes], context: Context) -> list[Any]:
+        """Return the value of each container."""
+        return self.layout.parse_all(containers, context.byte_order)
+
 
 class TableInterpreter(PlainInterpreter):
     """Records as a numpy array; needs a layout.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import operator
 from itertools import repeat
@@ -10,11 +11,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters._base import PlainInterpreter
-from smartcam.layout._inside import UNITS, misfit
+from smartcam.layout._inside import UNITS, misfit, split_rows
 from smartcam.models import Header, Localization, Pose, PoseSigma, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from smartcam.interpreters._base import Context
     from smartcam.layout import Layout
@@ -102,6 +103,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._scales = use.scales
         self._checks = use.checks
         self._sigmas = use.sigmas
+        self._unusual = use.z is not None or use.checks or use.sigmas is not None
         self._empty = bytes(self.layout.size)
         self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
 
@@ -145,9 +147,7 @@ class LocalizationsInterpreter(PlainInterpreter):
                 pose = new(Pose, (header, new(Position, (x, y, z)), orientation))
                 feature_id = names.get(text)
                 if feature_id is None:
-                    feature_id = text.partition(b"\0")[0].decode()
-                    if len(names) < MAX_NAMES:
-                        names[text] = feature_id
+                    feature_id = self._name(text)
                 parts.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
             self._check_numbers(data, context)
@@ -159,6 +159,65 @@ class LocalizationsInterpreter(PlainInterpreter):
         if skipped:
             context.empty_slots += skipped
         return parts if self._sigmas is None else self._with_sigmas(parts, data, context)
+
+    def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
+        """Return the parts of each container: by columns, if nothing about them is unusual."""
+        found = None if self._unusual else self.layout.wire_rows(containers, context.byte_order)
+        parts = None if found is None else self._by_columns(*found, context)
+        if found is None or parts is None:
+            return super().read_all(containers, context)
+        context.number += len(containers)
+        return split_rows(parts, found[1])
+
+    def _by_columns(
+        self, rows: Iterable[Any], counts: list[int], context: Context
+    ) -> list[Localization] | None:
+        """Return the parts of all containers; None if one is empty or invalid, or there are none.
+
+        ``counts``: number of rows of each container.
+        """
+        if self._missing is not None:
+            rows = map(operator.concat, rows, self._missing)
+        if self._pick is not None:
+            rows = map(self._pick, rows)
+        columns: list[Sequence[Any]] = list(zip(*rows, strict=True))
+        if not columns:
+            return None
+        texts, quality, photo_index, x, y, theta = columns
+        if not all(x):
+            return None
+        if self._scales is not None:
+            scales = zip((quality, x, y, theta), *self._scales, strict=False)
+            quality, x, y, theta = ([value * by / over for value in of] for of, by, over in scales)
+        if context.y_down:
+            y, theta = ([0.0 - value for value in of] for of in (y, theta))  # avoids minus zero
+        total = sum(quality) + sum(x) + sum(y) + sum(theta)  # not finite if one is not
+        if not math.isfinite(total) or min(quality) < 0.0 or max(quality) > MAX_QUALITY:
+            return None
+        feature_ids: list[str | None] = list(map(self._names.get, texts))
+        if None in feature_ids:
+            feature_ids = list(map(self._name, texts))
+        new, none, half = _new_tuple, repeat(0.0), [0.5 * angle for angle in theta]
+        numbers = range(context.number, context.number + len(counts))
+        about = zip(numbers, repeat(context.received_at), repeat(context.camera), strict=False)
+        headers: Iterable[Any] = map(new, repeat(Header), about)
+        if counts.count(1) != len(counts):
+            headers = itertools.chain.from_iterable(map(repeat, headers, counts))
+        places = map(new, repeat(Position), zip(x, y, none, strict=False))
+        turns = zip(none, none, map(math.sin, half), map(math.cos, half), strict=False)
+        orientations = map(new, repeat(Quaternion), turns)
+        poses = map(new, repeat(Pose), zip(headers, places, orientations, strict=True))
+        each = zip(feature_ids, quality, photo_index, poses, strict=True)
+        return list(map(new, repeat(Localization), each))
+
+    def _name(self, text: bytes) -> str:
+        """Return the name of a feature; the first ones are kept."""
+        name = self._names.get(text)
+        if name is None:
+            name = text.partition(b"\0")[0].decode()
+            if len(self._names) < MAX_NAMES:
+                self._names[text] = name
+        return name
 
     def _with_sigmas(
         self, localizations: list[Localization], data: bytes, context: Context

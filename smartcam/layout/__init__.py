@@ -23,7 +23,15 @@ from typing import TYPE_CHECKING, Any
 from smartcam._arguments import check_flag, check_integer, wrong_argument
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.layout._classes import read_class
-from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
+from smartcam.layout._codec import (
+    Payload,
+    Record,
+    RecordCodec,
+    check_names,
+    named,
+    record_class,
+    split_rows,
+)
 from smartcam.layout._compiled import compile_text
 from smartcam.layout._text import misfit
 
@@ -202,11 +210,51 @@ class Layout:
         values = records.read(rows, payload, head.size, label="record")
         if self._is_list:
             return values
-        names = (*(field.name for field in self.head), self._spec.group_field)
-        units = (*(field.symbol for field in self.head), "")
         front = head.read_one(payload) if self.head else ()
-        result: Record = Record.__new__(record_class(names, units), (*front, values))
+        result: Record = Record.__new__(self._whole_class(), (*front, values))
         return result
+
+    def parse_all(self, payloads: Sequence[bytes], byte_order: ByteOrder = "little") -> list[Any]:
+        """Return the values of several payloads, each as from :meth:`parse`.
+
+        Raises:
+            InterpretationError: a payload does not fit; the error is that of the first one.
+        """
+        found = self.wire_rows(payloads, byte_order)
+        if found is not None:
+            rows, counts = found
+            try:
+                records = self._codecs[byte_order][1].convert(rows)
+            except (KeyError, UnicodeDecodeError):
+                pass  # to read one after the other finds the place
+            else:
+                if self._spec.repeat is None:
+                    return list(records)
+                lists = split_rows(records, counts)
+                if self._is_list:
+                    return lists
+                whole = self._whole_class()
+                return [Record.__new__(whole, (items,)) for items in lists]
+        return [self.parse(payload, byte_order) for payload in payloads]
+
+    def wire_rows(
+        self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
+    ) -> tuple[Rows, list[int]] | None:
+        """Return the rows of several payloads as :meth:`wire_records` does, and each one's number.
+
+        None if the layout has a head, or the size of a payload does not fit.
+        """
+        codec = self._codecs[byte_order][1]
+        size, fixed = codec.size, self._fixed
+        if self._spec.head:
+            return None
+        counts = [len(payload) // size for payload in payloads]
+        data = b"".join(payloads)
+        if sum(counts) * size != len(data):
+            return None
+        if fixed is not None and counts.count(fixed) != len(counts):
+            return None
+        return codec.unpack_all(data), counts
 
     def parse_records(self, payload: Payload, byte_order: ByteOrder = "little") -> list[Record]:
         """Return only the records, without the head; without a group there is one.
@@ -409,6 +457,11 @@ class Layout:
 
         loaded = load_yaml(text)
         return cls.from_dict(loaded) if isinstance(loaded, Mapping) else cls(loaded)
+
+    def _whole_class(self) -> type[Record]:
+        """Return the class of values that have the head's fields, and the list of records."""
+        names = (*(field.name for field in self.head), self._spec.group_field)
+        return record_class(names, (*(field.symbol for field in self.head), ""))
 
     def _table(self, byte_order: ByteOrder) -> TableCodec:
         """Return the codec of tables, which is created on first use since it needs numpy."""

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import bisect
 import functools
+import itertools
 import math
 import operator
 import struct
 from collections import namedtuple
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, SupportsIndex, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeVar, overload
 
 from smartcam.exceptions import ConfigurationError, hex_excerpt
 from smartcam.layout._classes import values_of
@@ -33,10 +34,15 @@ if TYPE_CHECKING:
     ConvertAll: TypeAlias = Callable[[Sequence[Any]], list[Any]]
     Rows: TypeAlias = Iterator[tuple[Any, ...]]
 
+T = TypeVar("T")
+
 Payload = bytes | bytearray | memoryview
 """Types that a container's data may have."""
 
 _BOOLS = {0x00: False, 0xFF: True}
+
+MIN_SHARED_TEXTS = 8
+"""Least number of texts of a column that are compared before they are decoded."""
 
 
 class Record(tuple[Any, ...]):
@@ -166,16 +172,23 @@ class RecordCodec:
         ``label`` names a record in errors. Raises InterpretationError if a byte is no bool, or a
         text is not UTF-8.
         """
+        try:
+            return self.convert(rows)
+        except (KeyError, UnicodeDecodeError) as exc:
+            raise self.locate(payload, offset, label) from exc
+
+    def convert(self, rows: Rows) -> list[Record]:
+        """Return the records with the unconverted values ``rows``.
+
+        Raises KeyError if a byte is no bool, UnicodeDecodeError if a text is not UTF-8.
+        """
         if not self._converters:
             return list(map(self.make, rows))
         columns: list[Sequence[Any]] = list(zip(*rows, strict=True))
         if not columns:
             return []
-        try:
-            for index, _, convert in self._converters:
-                columns[index] = convert(columns[index])
-        except (KeyError, UnicodeDecodeError) as exc:
-            raise self.locate(payload, offset, label) from exc
+        for index, _, convert in self._converters:
+            columns[index] = convert(columns[index])
         return list(map(self.make, zip(*columns, strict=True)))
 
     def read_one(self, payload: Payload) -> Record:
@@ -253,6 +266,14 @@ class RecordCodec:
         raise AssertionError("the fast way failed and the slow way did not")
 
 
+def split_rows(items: list[T], counts: list[int]) -> list[list[T]]:
+    """Return items of several payloads as a list for each, by the number of items of each."""
+    if counts.count(1) == len(counts):
+        return [[item] for item in items]
+    left = iter(items)
+    return [list(itertools.islice(left, count)) for count in counts]
+
+
 def named(value: object, names: Sequence[str], label: str) -> dict[str, Any]:
     """Return a mapping's, a record's or a sequence's values by name.
 
@@ -306,7 +327,7 @@ def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | 
     the time of a function call per value.
     """
     if field.type == "string":
-        return _text, lambda column: [raw.partition(b"\0")[0].decode() for raw in column]
+        return _text, _texts
     if field.type == "bool":
         return _both(bool if lenient else _BOOLS.__getitem__)
     if field.unit is None:
@@ -325,6 +346,16 @@ def _both(convert: Convert) -> tuple[Convert, ConvertAll]:
 
 def _text(raw: bytes) -> str:
     return raw.partition(b"\0")[0].decode()
+
+
+def _texts(column: Sequence[bytes]) -> list[str]:
+    """Return the texts of a column; of many equal ones, each only once."""
+    if len(column) >= MIN_SHARED_TEXTS:
+        different = set(column)
+        if 2 * len(different) <= len(column):
+            known = {raw: _text(raw) for raw in different}
+            return list(map(known.__getitem__, column))
+    return [raw.partition(b"\0")[0].decode() for raw in column]
 
 
 def _to_wire(field: Field, value: Any) -> Any:

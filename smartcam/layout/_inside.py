@@ -8,6 +8,7 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.layout._classes import describes_layout, read_class
+    from smartcam.layout._codec import split_rows
     from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, Field, misfit
     from smartcam.layout._texts import pack_texts
     from smartcam.layout._units import ShownUnits, units_of
@@ -29,6 +30,7 @@ __all__ = [
     "pack_texts",
     "read_class",
     "read_model",
+    "split_rows",
     "units_of",
 ]
 
@@ -37,6 +39,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_classes": "describes_layout read_class",
+            "_codec": "split_rows",
             "_text": "Field SI_SYMBOLS TYPES UNITS misfit",
             "_texts": "pack_texts",
             "_units": "ShownUnits units_of",

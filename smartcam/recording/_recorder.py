@@ -291,9 +291,9 @@ class Recorder(Observer):
         """Keep a frame."""
         self._put(entry, len(entry.hex), "frames")
 
-    def on_raw_frame(self, frame: RawFrame) -> None:
-        """Keep a frame; the thread decodes it."""
-        self._put(frame, 2 * frame.size, "frames")
+    def on_raw_frames(self, frames: Sequence[RawFrame]) -> None:
+        """Keep frames; the thread decodes them."""
+        self._put_all(frames, 2 * sum([frame.size for frame in frames]), "frames")
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep an event."""
@@ -544,6 +544,8 @@ class RecordingFile:
         self._frame_texts = FrameTexts()
         self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # frame numbers by data
         self._size = 0  # size when the file was closed
+        # time of the last message, and the same in nanoseconds: those of a delivery share one
+        self._at: tuple[datetime | None, int] = None, 0
 
     def start(self) -> None:
         """Write the beginning of the file."""
@@ -555,15 +557,17 @@ class RecordingFile:
 
     def add(self, item: Given) -> None:
         """Write one item; it is on the disk after the next :meth:`flush`."""
+        if isinstance(item, RawFrame):  # these two are most of a recording
+            text, data = self._frame_texts.text(item)
+            self._frame(item.camera, item.at, bounded(text), data)
+            return
+        if isinstance(item, Result):
+            frame = self._bodies.get((item.camera, item.raw.hex()))
+            self._message("results", item.camera, item.received_at, item, frame)
+            return
         match item:
-            case RawFrame():
-                text, data = self._frame_texts.text(item)
-                self._frame(item.camera, item.at, bounded(text), data)
             case TraceEntry():
                 self._frame(item.camera, item.at, message_of("frames", item), body_of(item))
-            case Result():
-                frame = self._bodies.get((item.camera, item.raw.hex()))
-                self._message("results", item.camera, item.received_at, item, frame)
             case Description(facts):
                 self._describe(facts)
             case RecordedError():
@@ -637,7 +641,9 @@ class RecordingFile:
     def _write(self, kind: str, camera: str, at: datetime, text: bytes) -> int:
         channel = self._channels.get((camera, kind)) or self._channel(camera, kind)
         self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
-        self._writer.add_message(channel, nanoseconds(at), text, number)
+        if at is not self._at[0]:
+            self._at = at, nanoseconds(at)
+        self._writer.add_message(channel, self._at[1], text, number)
         return number
 
     def _picture(self, picture: RecordedPicture) -> None:

@@ -385,6 +385,48 @@ async def test_observer_sees_each_of_a_burst_in_order(*, together: bool) -> None
         assert len(witness.seen) == 10
 
 
+class Subscriber(Witness):
+    """Adds listeners, and closes others, from its hook."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.camera: Any = None
+        self.streams: list[Any] = []
+        self.waiting: list[Any] = []
+
+    def on_result(self, result: Result) -> None:
+        super().on_result(result)
+        match result.number:
+            case 2 | 4:
+                self.streams.append(self.camera.results())
+            case 3:
+                self.streams[0].close()
+            case 5 | 8:
+                self.waiting.append(self.camera.next_result())
+            case 6:
+                self.streams.append(self.camera.results(batch=True))
+                self.waiting.append(self.camera.next_result())
+
+
+@each_way
+async def test_listener_that_an_observer_adds_gets_that_result_and_later_ones(
+    *, together: bool
+) -> None:
+    added = Subscriber()
+    async with by_hand(interpret_as="n: int32", observers=[added]) as (box, camera):
+        added.camera = camera
+        first, sizes = camera.results(), bursts(camera)
+        added.streams.append(first)
+        await say(camera, box, *numbered(box, 8), together=together)
+        assert sizes == ([8] if together else [])
+        assert [one.number for one in added.seen] == [*range(1, 9)]
+        assert first.statistics().queued == 0
+        got = [[one.number for one in await queued(one)] for one in added.streams[1:]]
+        assert got == [[2, 3, 4, 5, 6, 7, 8], [4, 5, 6, 7, 8], [6, 7, 8]]
+        assert [(await one).number for one in added.waiting] == [5, 6, 8]
+        assert fates(camera) == {"streamed": 8}
+
+
 class Gatherer(Witness):
     def __init__(self) -> None:
         super().__init__()
@@ -430,10 +472,15 @@ class Quiet(Observer):
         self.seen.append(error)
 
 
-async def test_observer_that_does_not_look_at_results_leaves_bursts_whole(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    quiet = Quiet()
+class Looks(Quiet):
+    """Looks at each result, too."""
+
+    def on_result(self, result: Result) -> None:
+        assert result.value.n in range(3)
+
+
+@pytest.mark.parametrize("quiet", [Quiet(), Looks()], ids=["errors only", "each result"])
+async def test_observer_leaves_bursts_whole(quiet: Quiet, monkeypatch: pytest.MonkeyPatch) -> None:
     async with by_hand(interpret_as="n: int32", observers=[quiet]) as (box, camera):
         results, alone = camera.results(), list[object]()
         kept = inside(camera)._results
@@ -465,8 +512,13 @@ def around(box: HandmadeCamera, results: list[bytes]) -> list[bytes]:
 
 
 @each_way
-async def test_results_between_statuses_are_what_they_are_one_by_one(*, together: bool) -> None:
-    async with by_hand(interpret_as="n: int32") as (box, camera):
+@pytest.mark.parametrize("observed", [False, True])
+async def test_results_between_statuses_are_what_they_are_one_by_one(
+    *, together: bool, observed: bool
+) -> None:
+    witness = Witness()
+    observers = [witness] if observed else []
+    async with by_hand(interpret_as="n: int32", observers=observers) as (box, camera):
         sizes, results, batch = bursts(camera), camera.results(), camera.results(batch=True)
         before = camera.statistics()
         for turn in range(3):
@@ -475,6 +527,7 @@ async def test_results_between_statuses_are_what_they_are_one_by_one(*, together
         seen = await queued(results)
         assert [(one.value.n, one.number) for one in seen] == [(n, n + 1) for n in range(12)]
         assert await queued(batch) == seen
+        assert witness.seen == (seen if observed else [])
         assert fates(camera) == {"streamed": 12}
         after = camera.statistics()
         assert after.inspections_by_others - before.inspections_by_others == 12

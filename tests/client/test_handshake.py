@@ -200,7 +200,7 @@ async def test_establish_newer_version_is_a_warning(caplog: pytest.LogCaptureFix
 async def test_establish_hands_the_trace_every_frame() -> None:
     frames: list[RawFrame] = []
     async with scripted(good) as listener:
-        session = await establish(settings(listener.port), frames.append)
+        session = await establish(settings(listener.port), frames.extend)
         await session.link.close(LIMIT)
     entries = [one.entry() for one in frames]
     assert [(entry.direction, entry.message) for entry in entries] == [

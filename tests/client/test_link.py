@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 
 import pytest
 
@@ -52,7 +52,7 @@ async def server() -> AsyncIterator[Listener]:
 async def open_to(
     port: int,
     transport: Transport = Transport.TCP,
-    trace: Callable[[RawFrame], None] | None = None,
+    trace: Callable[[Sequence[RawFrame]], None] | None = None,
 ) -> Link:
     return await open_link(
         BVS, [HANDBOOK], transport, HOST, port, name="cell 1", max_length=1 << 20, trace=trace
@@ -60,7 +60,7 @@ async def open_to(
 
 
 async def session(
-    server: Listener, trace: Callable[[RawFrame], None] | None = None
+    server: Listener, trace: Callable[[Sequence[RawFrame]], None] | None = None
 ) -> tuple[Link, Peer]:
     """Return a link with a session, and its other end."""
     link = await open_to(server.port, trace=trace)
@@ -481,8 +481,8 @@ async def test_drain_ends_with_the_link(server: Listener) -> None:
 class Entries(list[TraceEntry]):
     """Frames of a trace, decoded."""
 
-    def take(self, frame: RawFrame) -> None:
-        self.append(frame.entry())
+    def take(self, frames: Sequence[RawFrame]) -> None:
+        self += [frame.entry() for frame in frames]
 
 
 async def test_trace_has_frames_of_both_directions_and_broken_bytes(server: Listener) -> None:
@@ -508,6 +508,35 @@ async def test_trace_has_frames_of_both_directions_and_broken_bytes(server: List
         ),
     ]
     assert all(entry.at.utcoffset() is not None for entry in entries)
+
+
+async def test_trace_gets_the_frames_of_a_delivery_together_and_those_sent_at_once(
+    server: Listener,
+) -> None:
+    told: list[Sequence[RawFrame]] = []
+    link, peer = await session(server, told.append)
+    told.clear()
+    for times in (1, 40):
+        await deliver(link, peer, RESULT * times + BUSY)
+        (frames,) = told
+        assert [one.entry().message for one in frames] == ["ResultContainer"] * times + [
+            "StatusReport"
+        ]
+        assert {one.at for one in frames} == {frames[0].at}
+        told.clear()
+        await take(link, 2)
+    link.send(m.Query())
+    ((sent,),) = told
+    assert sent.entry().message == "Query"
+    told.clear()
+    peer.write(QUERY_ANSWER + RESULT[:7])
+    peer.close()
+    with pytest.raises(ConnectionLostError):
+        await take(link, 9)
+    assert [one.entry().message for frames in told for one in frames] == [
+        "QueryAnswer",
+        "7 bytes that make no whole frame",
+    ]
 
 
 async def test_trace_of_kin_is_in_the_words_of_the_one_that_answers(server: Listener) -> None:

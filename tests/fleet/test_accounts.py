@@ -21,7 +21,7 @@ from tests.fleet.lossy_bus import LossyBus, as_said, chance_of
 RESULTS_INTERVAL = 0.002
 
 
-RATE = 1000.0
+RATE = 500.0
 """Results in a second."""
 
 EARLY = 3
@@ -93,7 +93,7 @@ def check_no_gap(numbers: list[int]) -> None:
 
 @pytest.mark.parametrize(
     ("seed", "seconds"),
-    [(1, 1.25), pytest.param(2, 15, marks=pytest.mark.long)],
+    [(1, 1.25), pytest.param(2, 15, marks=[pytest.mark.long, pytest.mark.widest])],
 )
 async def test_results_over_a_bad_bus_come_all_in_order_to_each(seed: int, seconds: float) -> None:
     """Losses, doubles, delays and disorder; subscribers that come late, or are slow."""
@@ -154,7 +154,7 @@ async def test_cut_off_for_less_than_the_history_misses_none(cut: float) -> None
 @pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("slow", [False, True])
 async def test_cut_off_for_longer_knows_how_many_were_missed(slow: bool) -> None:
-    async with sending(history=(300, 1 << 24)) as sender, sender.plant.cameras(2) as cameras:
+    async with sending(history=(150, 1 << 24)) as sender, sender.plant.cameras(2) as cameras:
         reader, other = Reader(cameras[0]), Reader(cameras[1])
         idle = cameras[0].results(max_queue=5)
         sender.plant.box.device.start()
@@ -169,7 +169,7 @@ async def test_cut_off_for_longer_knows_how_many_were_missed(slow: bool) -> None
         await sender.stop()
         sent = sender.sent
         got = check(reader.stream, sent)
-        assert got.missed == sent - len(reader.numbers) > 1000
+        assert got.missed == sent - len(reader.numbers) > RATE
         # it was missed in one piece, and all that was kept has come
         gaps = [(a, b) for a, b in itertools.pairwise(reader.numbers) if b != a + 1]
         ((last, again),) = gaps
@@ -181,7 +181,7 @@ async def test_cut_off_for_longer_knows_how_many_were_missed(slow: bool) -> None
 
 
 async def test_who_subscribes_after_it_was_cut_off_has_missed_nothing_of_before() -> None:
-    async with sending(history=(300, 1 << 24)) as sender, sender.plant.cameras(1) as (camera,):
+    async with sending(history=(150, 1 << 24)) as sender, sender.plant.cameras(1) as (camera,):
         first = Reader(camera)
         sender.plant.box.device.start()
         await asyncio.sleep(0.5)
@@ -193,14 +193,14 @@ async def test_who_subscribes_after_it_was_cut_off_has_missed_nothing_of_before(
         await camera.wait_connected()
         await asyncio.sleep(0.5)
         await sender.stop()
-        assert check(first.stream, sender.sent).missed > 1000
+        assert check(first.stream, sender.sent).missed > RATE
         assert check(second.stream, sender.sent - before, EARLY).missed == 0
         for one in (first, second):
             await one.end()
 
 
 async def test_who_left_and_subscribes_again_begins_there() -> None:
-    async with sending(history=(300, 1 << 24)) as sender, sender.plant.cameras(1) as (camera,):
+    async with sending(history=(150, 1 << 24)) as sender, sender.plant.cameras(1) as (camera,):
         sender.plant.box.device.start()
         for _ in range(3):
             reader = Reader(camera)
@@ -235,7 +235,7 @@ async def test_who_does_not_read_harms_nobody() -> None:
                 max(most[1], len(host.results._entries)),
             ]
         await sender.stop()
-        assert sender.sent > 2500
+        assert sender.sent > 0.8 * RATE * 3
         assert most[0] <= history[0] + 10
         assert most[1] <= history[0] + 10
         assert not host._fresh

@@ -310,7 +310,7 @@ async def in_ros2(folder: Path, **more: Any) -> AsyncIterator[Face]:
 
 @contextlib.asynccontextmanager
 async def in_ros1(folder: Path, **more: Any) -> AsyncIterator[Face]:
-    async with plant(folder, **more) as server, Bridge() as bridge:
+    async with plant(folder, **more) as server, Bridge(wakes_after=0.002) as bridge:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
         given = (bridge.url, lambda _: None, address, section)

@@ -267,7 +267,7 @@ async def in_ros2() -> AsyncIterator[tuple[FleetServer, Face]]:
 
 @contextlib.asynccontextmanager
 async def in_ros1() -> AsyncIterator[tuple[FleetServer, Face]]:
-    async with plant() as server, Bridge() as bridge:
+    async with plant() as server, Bridge(wakes_after=0.002) as bridge:
         address = FleetAddress.parse(server.address.url)
         section = RosSection.model_validate({})
         async with bridged(bridge.url, lambda _: None, address, section) as ros:

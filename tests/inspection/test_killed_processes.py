@@ -87,7 +87,7 @@ async def refused(error: type[Exception], *calls: Callable[[], Coroutine[Any, An
                 await call()
 
 
-@pytest.mark.parametrize("transport", ["tcp", "udp"])
+@pytest.mark.parametrize("transport", ["tcp", pytest.param("udp", marks=pytest.mark.long)])
 async def test_a_killed_camera_ends_its_trigger_and_is_found_again(
     tmp_path: Path, transport: str
 ) -> None:

@@ -67,6 +67,7 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> PartModel:
     return PartModel.from_outline(request.param(tmp_path), 4.0, name="tee")
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("angle", [0.0, 2.3])
 def test_part_of_an_outline_is_found_where_its_drawing_lies(
     model: PartModel, angle: float, request: pytest.FixtureRequest

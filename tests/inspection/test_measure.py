@@ -356,12 +356,12 @@ def exact_pair() -> tuple[FoundPoint, FoundPoint]:
 def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> None:
     true = width(*exact_pair(), plane_of(plane(0, 1e-9)))
     errors, sigmas = [], []
-    for seed in range(80):
+    for seed in range(40):
         found = with_calibration(lambda one: width(*exact_pair(), one), plane_of(plane(seed)))
         errors.append(found.value - true.value)
         sigmas.append(found.sigma)
     predicted = float(np.sqrt(np.mean(np.square(sigmas)) / np.mean(np.square(errors))))
-    assert 0.78 < predicted < 1.3  # chance does 8 %
+    assert 0.78 < predicted < 1.3  # chance does 11 %
     ends = tilted(ENDS)
     assert true.value == pytest.approx(1e3 * float(np.linalg.norm(ends[1] - ends[0])), rel=1e-2)
 

@@ -31,7 +31,7 @@ SLOW = [
 @pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     "case",
-    [*SHORT, *(pytest.param(one, marks=pytest.mark.long) for one in SLOW)],
+    [*SHORT, *(pytest.param(one, marks=[pytest.mark.long, pytest.mark.widest]) for one in SLOW)],
     ids=lambda case: case.name,
 )
 def test_errors_are_near_the_bound_and_sigmas_true(case: Case) -> None:

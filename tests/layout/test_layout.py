@@ -886,6 +886,44 @@ def test_table_agrees_with_parse(case: tuple[Layout, bytes]) -> None:
         assert decoded == list(record)
 
 
+@pytest.mark.parametrize(
+    ("text", "payloads"),
+    [
+        ("(a: int8)[2]", [b"\1", b"\1\2\3"]),
+        ("a: int8", [b"", b"\1\2"]),
+        ("(a: int16)*", [b"\1", b"\1\2\3"]),
+        ("(ok: bool)*", [b"\0", b"\1"]),
+    ],
+)
+def test_payloads_together_have_the_error_of_the_first_that_does_not_fit(
+    text: str, payloads: list[bytes]
+) -> None:
+    layout = Layout(text)
+    (first, *_) = (error for one in payloads if (error := error_of(layout.parse, one)) is not None)
+    assert str(error_of(layout.parse_all, payloads)) == str(first)
+
+
+@MANY
+@given(containers(), st.lists(st.binary(max_size=40), max_size=3), st.integers(1, 9), ORDERS)
+def test_payloads_together_give_what_each_gives(
+    case: tuple[Layout, bytes], others: list[bytes], times: int, order: ByteOrder
+) -> None:
+    layout, payload = case
+    for payloads in ([payload] * times, [payload, *others] * times):
+        errors = [error_of(layout.parse, one, order) for one in payloads]
+        if any(errors):
+            (first, *_) = (one for one in errors if one is not None)
+            caught = error_of(layout.parse_all, payloads, order)
+            assert (type(caught), str(caught)) == (type(first), str(first))
+        else:
+            each, together = (
+                [layout.parse(one, order) for one in payloads],
+                layout.parse_all(payloads, order),
+            )
+            assert repr(together) == repr(each)  # NaN, too
+            assert [*map(type, together)] == [*map(type, each)]
+
+
 @MANY
 @given(layouts(), st.binary(max_size=60), st.booleans(), ORDERS)
 def test_any_bytes_give_a_value_or_an_interpretation_error(

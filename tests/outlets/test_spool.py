@@ -177,6 +177,7 @@ def test_the_account_can_be_read_while_a_process_has_the_spool(tmp_path: Path) -
     spool.close()
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("seed", range(6))
 def test_the_account_balances_whatever_is_done(tmp_path: Path, seed: int) -> None:
     dice = random.Random(seed)  # noqa: S311

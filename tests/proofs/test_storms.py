@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
+import runpy
 import sys
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from tests import ROOT
 from tests.proofs import adversary_storm, chaos_soak, late_storm
 from tests.proofs.adversary_storm import AdversaryStorm
 from tests.proofs.books import RECORD, BookKeeper, Ledger
@@ -199,10 +198,11 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("path", COMMANDS, ids=lambda path: path.stem)
-def test_long_form_starts_as_a_command(path: Path) -> None:
-    command = [sys.executable, "-m", f"tests.proofs.{path.stem}", "--help"]
-    done = subprocess.run(  # noqa: S603 - our own
-        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert "usage:" in done.stdout
+def test_long_form_starts_as_a_command(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [str(path), "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(path), run_name="__main__")
+    assert ended.value.code == 0
+    assert "usage:" in capsys.readouterr().out

@@ -12,6 +12,7 @@ from collections import namedtuple
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from fractions import Fraction
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -305,6 +306,28 @@ def test_texts_of_frames_that_are_alike_are_those_of_each(
         assert texts.text(raw) == (frame_text(entry), body_of(entry))
 
 
+def test_texts_of_frames_of_a_delivery_are_those_of_each() -> None:
+    texts, handbook, b16 = FrameTexts(), BVS.dialects["handbook"], BVS.dialects["b16"]
+    once, again = at(0), at(0)
+    kinds = [
+        (when, camera, dialect, sender, message_id, front)
+        for when in (once, again, at(1))
+        for camera in ("left", "right")
+        for dialect in (handbook, b16)
+        for sender in Sender
+        for message_id in (0x20, 0x12)
+        for front in (bytes(4), b"\1\0\0\0")
+    ]
+    random = Random(3)  # noqa: S311
+    for _ in range(400):
+        when, camera, dialect, sender, message_id, front = random.choice(kinds)
+        for _ in range(random.randrange(4)):
+            data = random.randbytes(random.choice([0, 4, 4, 4, 9]))
+            raw = RawFrame(when, camera, dialect, sender, Frame(message_id, front + data))
+            entry = raw.entry()
+            assert texts.text(raw) == (frame_text(entry), body_of(entry))
+
+
 def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
     texts, dialect = FrameTexts(), BVS.dialects["handbook"]
     (result,) = (
@@ -318,4 +341,4 @@ def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
         raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
         entry = raw.entry()
         assert texts.text(raw) == (frame_text(entry), body_of(entry))
-        assert 0 < len(texts._texts) <= MAX_CACHED_FRAME_TEXTS
+        assert 0 < len(texts._known) <= MAX_CACHED_FRAME_TEXTS

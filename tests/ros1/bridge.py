@@ -46,9 +46,11 @@ class Bridge(Server):
         reading: cleared, nothing is read.
         rosapi: what is said of a topic's subscribers.
         late: what the first link, a slow one, hears when a service has been withdrawn.
+        wakes_after: seconds in which the thread of a call wakes up after the response.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wakes_after: float = 0.1) -> None:
+        self.wakes_after = wakes_after
         self.links: list[web.WebSocketResponse] = []
         self.said: list[dict[str, Any]] = []
         self.topics: dict[str, dict[str, Any]] = {}
@@ -120,7 +122,7 @@ class Bridge(Server):
         with contextlib.suppress(ConnectionError):
             await served.link.send_str(json.dumps({**said, "args": args or {}, **more}))
         await self.until(lambda: identity in self.responses or served.withdrawn.is_set())
-        await asyncio.sleep(0.1)  # its thread wakes up
+        await asyncio.sleep(self.wakes_after)
         if served.withdrawn.is_set():
             raise Gone
         return self.responses.pop(identity)

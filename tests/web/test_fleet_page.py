@@ -373,7 +373,7 @@ async def test_browser_that_stalls_is_up_to_date_when_it_goes_on(page: Page) -> 
     fleet = MadeUpFleet(names(FEW))
     async with opened(page, fleet.as_fleet):
         stalled = asyncio.create_task(
-            page.evaluate("{ const end = Date.now() + 3000; while (Date.now() < end); }")
+            page.evaluate("{ const end = Date.now() + 1000; while (Date.now() < end); }")
         )
         async with asyncio.timeout(PATIENCE):
             while not stalled.done():

@@ -119,6 +119,9 @@ MIN_GOOD_POSES = 5
 MIN_POSES_FOR_ERROR = 5
 """The scatter of at least this many poses gives an expected error."""
 
+WEIGHT_POWER = 1 / 2
+"""Power of a pose's weight in the covariance: errors of poses are independent of each other."""
+
 POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
 """Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
 beyond what they cause is remarked on."""
@@ -232,9 +235,8 @@ def calibrate_hand_eye(
     )
     named = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
     bend_places = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
-    if (
-        lens_calibration is not None
-    ):  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
+    if lens_calibration is not None:
+        # a sheet bent by 0.15 mm would bend a lens that takes it as flat
         bend_places += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
     free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *bend_places)}
     free["scale and camera"] = (0, *free["camera"])
@@ -242,16 +244,14 @@ def calibrate_hand_eye(
         # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
         # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
         del free[NOTHING], free["scale"]
-    request = _Asked(_allowed(free, adjust), method, drop_bad)
-    result = _without_bad(problem, request, named, [transforms[i] for i in order], ordered)
-    _check_scale(result.target_scale, most_scale)
+    request = _Asked(_allowed(free, adjust), method, drop_bad, order, most_scale)
+    result = _without_bad(problem, request, named, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
         strays = [outlier for outlier in strays if outlier.code != Code.WRONG_LENS]
     return dataclasses.replace(
-        _reordered(result, np.argsort(order)),
+        result,
         warnings=(*result.warnings, *remarks, *of_sheet, *strays),
-        robot_poses=tuple(transforms),
         views=tuple(views),
         target_poses=tuple(located[i].transform for i in np.argsort(order)),
         allowed_error=allowed_error,
@@ -315,12 +315,10 @@ def calibrate_hand_eye_from_poses(
         sigmas=_positive(robot_sigmas),
     )
     named = [f"pose {i}" for i in order]
-    request = _Asked(_allowed({NOTHING: (), "scale": (0,)}, adjust), method, drop_bad)
-    result = _without_bad(problem, request, named, [transforms[i] for i in order], seen)
-    _check_scale(result.target_scale, most_scale)
+    free = _allowed({NOTHING: (), "scale": (0,)}, adjust)
+    request = _Asked(free, method, drop_bad, order, most_scale)
     return dataclasses.replace(
-        _reordered(result, np.argsort(order)),
-        robot_poses=tuple(transforms),
+        _without_bad(problem, request, named, transforms, seen),
         target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
         allowed_error=allowed_error,
     )
@@ -421,16 +419,23 @@ class _Asked(NamedTuple):
     free: Mapping[str, tuple[int, ...]]
     method: str  # name of the method, or ``auto``
     drop_bad: bool  # whether bad poses are left out
+    order: list[int]  # numbers of the given poses in the order of their values
+    most_scale: float  # part by which the target's size may be off
 
 
 def _without_bad(
     problem: Problem,
     request: _Asked,
     named: Sequence[str],
-    robot_poses: Sequence[Transform],
+    transforms: Sequence[Transform],
     seen: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
-    """Return the calibration from the poses that are not bad, with the errors of all poses."""
+    """Return the calibration from the poses that are not bad, with the errors of all poses.
+
+    ``transforms`` are the robot's poses as given, all else is in the order of their values. Raises
+    ``SCALE_MISMATCH``, besides the errors of poses that do not fit.
+    """
+    robot_poses = [transforms[i] for i in request.order]
     used, remarks = _start_poses(problem, request, named)
     result = _solved(problem.taken(used), request, robot_poses[0])
     while len(bad := _bad(result)) and request.drop_bad:
@@ -460,13 +465,15 @@ def _without_bad(
         if np.isfinite(errors_of_pose).all():
             errors[number] = left_out[number] = math.sqrt(float((errors_of_pose**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
-    sampled = problem.taken(used)
+    sampled, back = problem.taken(used), np.argsort(request.order)
     _check_fit(sampled, result)
+    _check_scale(result.target_scale, request.most_scale)
     return dataclasses.replace(
         result,
-        errors=errors,
-        leave_one_out=left_out,
-        used=tuple(np.isin(np.arange(problem.count), used).tolist()),
+        errors=errors[back],
+        leave_one_out=left_out[back],
+        robot_poses=tuple(transforms),
+        used=tuple(np.isin(back, used).tolist()),
         warnings=(
             *_size_remark(sampled, request),
             *_remarks(sampled, result),
@@ -613,8 +620,9 @@ def _check_scale(scale: float, most: float) -> None:
 def _covariance(chosen: Candidate) -> Array:
     """Return the covariance of steps of camera and target (12, 12), from the scatter between poses.
 
-    If the lens was calibrated from the same views and not adjusted since, its own error is
-    included. NaN if there are too few poses.
+    The differences to solutions that may be right as well are included. If the lens was calibrated
+    from the same views and not adjusted since, its own error is, too. NaN if there are too few
+    poses.
     """
     solution, others = chosen.solution, chosen.others
     if others is None or chosen.problem.count < MIN_POSES_FOR_ERROR:
@@ -624,14 +632,19 @@ def _covariance(chosen: Candidate) -> Array:
     information, left = solution.information, others.information
     if information is None or left is None:  # solved without a part of the poses, not without each
         return jackknife(steps[:MAX_FOLDS])
+    if len(information) > 12:
+        steps = np.concatenate([steps, others.change - solution.change], axis=1)
     places = of_one_place(chosen.problem.robot.poses)
-    alike = [
-        places == place for place in np.unique(places)
-    ]  # poses of one place are left out together
+    # poses of one place are left out together
+    alike = [places == place for place in np.unique(places)]
     steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # correct to first order
     left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
-    spreads = np.array([inverse_scaled(information_left)[:12, :12] for information_left in left])
-    scatter = weighed_jackknife(steps, spreads, inverse_scaled(information)[:12, :12])
+    spreads = np.array([inverse_scaled(information_left) for information_left in left])
+    full = inverse_scaled(information)
+    scatter = weighed_jackknife(steps, spreads, full, WEIGHT_POWER)[:12, :12]
+    for rival in chosen.rivals:
+        both = solution.camera.before(rival.camera), solution.target.before(rival.target)
+        scatter += np.outer(step := np.concatenate(both), step)
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
         return scatter
@@ -703,12 +716,3 @@ def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Rema
             f"instead of {before:.1f} px; the calibration's camera is that one"
         )
     ]
-
-
-def _reordered(result: HandEyeCalibration, back: Any) -> HandEyeCalibration:
-    return dataclasses.replace(
-        result,
-        errors=result.errors[back],
-        leave_one_out=result.leave_one_out[back],
-        used=tuple(result.used[i] for i in back),
-    )

@@ -85,8 +85,9 @@ class HandEyeCalibration(storage.SavedCalibration):
             if there is none. It is the error to expect in picking.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
             along those of its target, m) and of ``target_pose``, from the scatter of the solutions
-            without each pose. A given lens is taken as exact unless it was adjusted; the error of a
-            lens calibrated from the same views is included. NaN with fewer than 5 poses.
+            without each pose; where another candidate is as likely, its difference is included. A
+            given lens is taken as exact unless it was adjusted; the error of a lens calibrated from
+            the same views is included. NaN with fewer than 5 poses.
         robot_sigmas: standard deviations of each axis of the robot's poses, as given or estimated;
             None if the poses were taken as exact.
         robot_poses: ``T_base_flange``, as given.

@@ -192,21 +192,22 @@ def stray_remarks(outliers: Sequence[Stray], names: Sequence[str], done: str) ->
             "or something is taken for "
             f"it; it {done} there"
         )
-    rare = [outlier for outlier in outliers if outlier.ident not in often]
-    if rare:
+    rest = [outlier for outlier in outliers if outlier.ident not in often]
+    if rest:
         each = [
             f"{outlier.ident} in {names[outlier.number]} ({outlier.off:.3g} pixels)"
-            for outlier in rare
+            for outlier in rest
         ]
-        more = (
-            f", and {len(each) - MAX_POINTS_IN_MESSAGE} more"
-            if len(each) > MAX_POINTS_IN_MESSAGE
-            else ""
-        )
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:MAX_POINTS_IN_MESSAGE])}{more}: each {done}"
+            f"{_listed(each, ', ')}: each {done}"
         )
+
+
+def _listed(texts: Sequence[str], separator: str) -> str:
+    more = len(texts) - MAX_POINTS_IN_MESSAGE
+    first = separator.join(texts[:MAX_POINTS_IN_MESSAGE])
+    return f"{first}, and {more} more" if more > 0 else first
 
 
 def without_strays(
@@ -274,14 +275,9 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(group) for group in groups.values() if len(group) > 1]
     if copies:
-        more = (
-            f", and {len(copies) - MAX_POINTS_IN_MESSAGE} more"
-            if len(copies) > MAX_POINTS_IN_MESSAGE
-            else ""
-        )
         yield Code.COINCIDENT.remark(
             "views that are the same to the last digit: "
-            f"{'; '.join(copies[:MAX_POINTS_IN_MESSAGE])}{more}: "
+            f"{_listed(copies, '; ')}: "
             "they count as often as they are there, and errors come out too small"
         )
 

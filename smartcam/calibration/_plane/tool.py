@@ -1,4 +1,4 @@
-"""Measure a tool: its tip from touches of one point, its axis from turns in front of a camera.
+"""Measure a tool: its tip from touches of one point.
 
 A wrong tip moves every touch by the same vector *in the flange's frame*. That cancels only as long
 as the flange always has the same orientation: an error of 1 mm is 2 mm between two touches that are
@@ -15,13 +15,10 @@ from smartcam.calibration._views import as_list
 from smartcam.geometry._inside import Code, as_motion
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Sequence
 
     from smartcam.geometry import Transform
     from smartcam.geometry._inside import Array
-    from smartcam.models import Localization
 
 _MIN_ORIENTATION_SPREAD: Final = 0.17
 """Least spread of the orientations: that of two touches 20 degrees apart."""
@@ -66,7 +63,15 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
     ]
     if len(flanges) < 2:
         raise Code.TOO_FEW.unexpected("tool tip: expected two touches or more", 2, len(flanges))
-    _check_same([flange.label for flange in flanges], "tool tip: expected poses")
+    label = flanges[0].label
+    for flange in flanges:
+        if flange.label != label:
+            raise Code.WRONG_FRAME.refusal(
+                f"tool tip: expected poses of one and the same frame, got {label} and "
+                f"{flange.label}",
+                label,
+                flange.label,
+            )
     turns = np.array([flange.rotation for flange in flanges])
     places = np.array([flange.translation for flange in flanges])
     mean_turn, mean_place = turns.mean(axis=0), places.mean(axis=0)
@@ -86,69 +91,3 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
     touched = turns @ tip + places
     point = touched.mean(axis=0)
     return ToolTip(tip, point, touched - point, None if seen == 3 else axes[2])
-
-
-class RotationCentre(NamedTuple):
-    """The point that a held part turns about, in the camera's coordinates.
-
-    Attributes:
-        centre: (2,), in the camera's unit.
-        arm: (2,), from the centre to the part's origin when its theta is 0, in the camera's unit.
-        residuals: (N, 2), offset of each localization from the circle at its angle.
-    """
-
-    centre: Array
-    arm: Array
-    residuals: Array
-
-
-def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
-    """Return the centre about which a tool turned a part that it held in front of the camera.
-
-    Least squares of ``p_i = centre + R(theta_i) arm``, with the angles measured by the camera, so
-    the sense in which the robot counts angles does not matter. The tool's axis must be at a right
-    angle to the camera's plane.
-
-    Args:
-        parts: localizations of one part, one at each turn, in the camera's frame.
-
-    Raises:
-        CalibrationError: ``TOO_FEW``: fewer than two parts; ``WRONG_FRAME``: parts in different
-            frames; ``INSUFFICIENT_ROTATION``: turned by less than 20 degrees.
-    """
-    poses = [part.pose for part in parts]
-    if len(poses) < 2:
-        raise Code.TOO_FEW.unexpected(
-            "rotation centre: expected two localizations or more", 2, len(poses)
-        )
-    _check_same([pose.header.frame_id for pose in poses], "rotation centre: expected localizations")
-    # as complex numbers, for which a turn is a product
-    places = np.array([complex(pose.position.x, pose.position.y) for pose in poses])
-    turns = np.exp(1j * np.array([pose.orientation.theta for pose in poses]))
-    centred = turns - turns.mean()
-    spread = float(np.sqrt(np.mean(np.abs(centred) ** 2)))
-    if not spread > _MIN_ORIENTATION_SPREAD:
-        raise Code.INSUFFICIENT_ROTATION.refusal(
-            f"rotation centre: expected angles that differ, got a spread of {spread:.3g}, which "
-            f"must be above {_MIN_ORIENTATION_SPREAD:g}",
-            _MIN_ORIENTATION_SPREAD,
-            spread,
-        )
-    arm = np.vdot(centred, places) / np.vdot(centred, centred)
-    centre = places.mean() - arm * turns.mean()
-    return RotationCentre(_plane(centre), _plane(arm), _plane(places - centre - arm * turns))
-
-
-def _check_same(frames: Sequence[str], label: str) -> None:
-    others = [frame for frame in frames if frame != frames[0]]
-    if others:
-        raise Code.WRONG_FRAME.refusal(
-            f"{label} of one and the same frame, got {frames[0]} and {others[0]}",
-            frames[0],
-            others[0],
-        )
-
-
-def _plane(numbers: NDArray[np.complex128] | np.complex128) -> Array:
-    """Return complex numbers (...) as points (..., 2)."""
-    return np.array(numbers, dtype=np.complex128)[..., None].view(np.float64)

@@ -163,8 +163,9 @@ def _sheet(
 
 def _share(distance: Floats, grain: Floats) -> Floats:
     """Return the part of a sample that lies on the positive side of an edge."""
-    share: Floats = np.clip(distance / grain + np.float32(0.5), 0, 1)
-    return share
+    share: Floats = distance / grain
+    share += np.float32(0.5)
+    return share.clip(0, 1, out=share)
 
 
 def _rectangle(sheet: _Samples, outline: Array) -> Floats:
@@ -201,10 +202,11 @@ def _squares(sheet: _Samples, outline: Array, side: float) -> Floats:
 
 def _turns(place: Floats, grain: Floats, least: float, side: float) -> Floats:
     """Return 1 in the first stripe after ``least``, -1 in the next, and so on."""
-    part = np.mod((place - np.float32(least)) / np.float32(side), np.float32(2))
-    inside = np.minimum(part, 1 - part)
-    inside[part > 1.5] = part[part > 1.5] - 2  # the edge of the next such stripe is nearer
-    return 2 * _share(np.float32(side) * inside, grain) - 1
+    # a wave of triangles: 1/2 in the middle of a stripe, 0 at its edges, -1/2 in the next middle
+    wave = (place - np.float32(least)) * np.float32(0.5 / side) + np.float32(0.25)
+    wave -= np.floor(wave)
+    inside = np.float32(side) * (np.float32(0.5) - 2 * np.abs(wave - np.float32(0.5)))
+    return 2 * _share(inside, grain) - 1
 
 
 def _disc(sheet: _Samples, middle: Array, diameter: float) -> Floats:

@@ -219,7 +219,8 @@ def bounded(text: str) -> bytes:
         ValueError: the message could not be read again.
     """
     data = text.encode()
-    if len(data) > min(MAX_MESSAGE_BYTES, MAX_VALUES):  # a shorter message has fewer values
+    size = len(data)
+    if size > MAX_VALUES or size > MAX_MESSAGE_BYTES:  # a shorter message has fewer values
         count_values(data)
     return data
 

@@ -52,34 +52,53 @@ class FrameTexts:
     def __init__(self) -> None:
         # text before and after the data, by the kind of frame. The dialect is kept as well, since
         # its id in memory could otherwise be reused
-        self._texts: dict[tuple[object, ...], tuple[str, str, object]] = {}
+        self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
+        # of the last frame: time, camera, dialect, sender, id, bytes of the payload, those before
+        # its data, and the text before and after that
+        self._last: tuple[Any, ...] = (None, None, None, None, None, 0, b"", "", "")
 
     def text(self, raw: RawFrame) -> tuple[str, str]:
         """Return a frame's text, as from :func:`frame_text`, and its data as hex.
 
         The data is "" if the frame has no data or is a frame of the client.
         """
-        frame, dialect = raw.frame, raw.dialect
+        at, camera, dialect, sender, frame = raw
         if isinstance(frame, TraceEntry):
             return frame_text(frame), body_of(frame)
-        begins, payload = dialect.data_begins(raw.sender, frame.message_id), frame.payload
-        if begins is None or len(payload) <= begins or raw.sender is not Sender.CAMERA:
+        message_id, payload = frame
+        known_at, name, known_dialect, known_sender, known_id, size, head, front, end = self._last
+        if (
+            at is known_at
+            and camera is name
+            and dialect is known_dialect
+            and sender is known_sender
+            and message_id == known_id
+            and len(payload) == size
+            and payload.startswith(head)
+        ):  # came together with the last one, and differs only in its data
+            data = payload[len(head) :].hex()
+            return f"{front}{data}{end}", data
+        begins = dialect.data_begins(sender, message_id)
+        if begins is None or len(payload) <= begins or sender is not Sender.CAMERA:
             entry = raw.entry()
             return frame_text(entry), body_of(entry)
-        kind = raw.camera, id(dialect), frame.message_id, payload[:begins], len(payload)
-        data, known = payload[begins:].hex(), self._texts.get(kind)
+        kind = camera, id(dialect), message_id, payload[:begins], len(payload)
+        data, known = payload[begins:].hex(), self._known.get(kind)
         if known is None:
             entry = raw.entry()
             text = frame_text(entry)
-            before = f'{{"at":{text_of(raw.at)}'
+            before = f'{{"at":{text_of(at)}'
             behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
             if text.startswith(before) and text.endswith(data + behind):
-                if len(self._texts) >= MAX_CACHED_FRAME_TEXTS:
-                    self._texts.clear()
+                if len(self._known) >= MAX_CACHED_FRAME_TEXTS:
+                    self._known.clear()
                 front = text[len(before) : len(text) - len(data) - len(behind)]
-                self._texts[kind] = front, behind, dialect
+                self._known[kind] = front, behind, dialect
             return text, body_of(entry)
-        return f'{{"at":{text_of(raw.at)}{known[0]}{data}{known[1]}', data
+        front, end = f'{{"at":{text_of(at)}{known[0]}', known[1]
+        about = at, camera, dialect, sender, message_id, len(payload), payload[:begins]
+        self._last = (*about, front, end)
+        return f"{front}{data}{end}", data
 
 
 def body_of(entry: TraceEntry) -> str:

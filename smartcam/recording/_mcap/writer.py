@@ -21,6 +21,7 @@ _ATTACHMENT_INDEX, _SUMMARY_OFFSET, _DATA_END = 0x0A, 0x0E, 0x0F
 
 _HEAD = struct.Struct("<BQ")  # opcode, length of the record's content
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_pack_head, _MESSAGE_BEGINS = _MESSAGE_HEAD.pack, _MESSAGE_HEAD.size
 _MESSAGE_FIELDS = _MESSAGE_HEAD.size - _HEAD.size
 _CHUNK_FIELDS = struct.Struct("<QQQI")
 _COUNT = struct.Struct("<HQ")
@@ -98,7 +99,8 @@ class McapWriter:
             packs: whether the message should be compressed; a chunk with a message that should not
                 be is written uncompressed.
         """
-        self._packs = self._packs and packs
+        if not packs:
+            self._packs = False
         places = self._places.get(channel)
         if places is None:
             if not self._places:
@@ -108,12 +110,12 @@ class McapWriter:
             self._first = at
         elif at > self._last:
             self._last = at
-        size = len(data)
-        head = _MESSAGE_HEAD.pack(_MESSAGE, _MESSAGE_FIELDS + size, channel, sequence, at, at)
-        places += (at, self._size)
+        size, before = len(data), self._size
+        head = _pack_head(_MESSAGE, _MESSAGE_FIELDS + size, channel, sequence, at, at)
+        places += (at, before)
         self._parts += (head, data)
-        self._size += _MESSAGE_HEAD.size + size
-        if self._size > self._chunk_size:
+        self._size = before = before + _MESSAGE_BEGINS + size
+        if before > self._chunk_size:
             self.end_chunk()
 
     def add_metadata(self, name: str, facts: Mapping[str, str]) -> None:

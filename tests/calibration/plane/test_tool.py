@@ -1,8 +1,6 @@
-"""The tip of a tool from touches of one point; its axis from turns in front of the camera."""
+"""The tip of a tool from touches of one point."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from smartcam.calibration import ToolOffset, Transform, fit_tool_tip
-from smartcam.calibration._plane.tool import fit_rotation_centre
 from tests.calibration.inside import Poses
-from tests.calibration.plane.planekit import part
 from tests.geometry.rigid import (
-    angles,
-    localization,
     refused,
     rotation_about,
     transforms,
@@ -100,42 +94,8 @@ def test_tool_tip_without_turns_is_refused() -> None:
         fit_tool_tip([touching(DOWN), touching(DOWN @ yaw(np.radians(10)))])
 
 
-def turned(angles: list[float], centre: complex = 0.1 + 0.05j, arm: complex = 0.02 - 0.01j) -> Any:
-    """Return a held part, seen at each angle."""
-    places = [centre + arm * np.exp(1j * angle) for angle in angles]
-    return [localization(p.real, p.imag, a) for p, a in zip(places, angles, strict=True)]
-
-
-@given(angles, st.floats(0.4, 5.8))
-def test_rotation_centre_of_two_turns_is_exact(first: float, turn: float) -> None:
-    found = fit_rotation_centre(turned([first, first + turn]))
-    np.testing.assert_allclose(found.centre, [0.1, 0.05], atol=1e-12)
-    np.testing.assert_allclose(found.arm, [0.02, -0.01], atol=1e-12)
-    np.testing.assert_allclose(found.residuals, np.zeros((2, 2)), atol=1e-12)
-
-
-def test_rotation_centre_residuals_show_a_bad_sight() -> None:
-    parts = turned([0, 1, 2, 3, 4, 5])
-    parts[3] = localization(0.1, 0.05, 3)
-    lengths = np.linalg.norm(fit_rotation_centre(parts).residuals, axis=1)
-    assert int(np.argmax(lengths)) == 3
-
-
-def test_rotation_centre_of_a_part_that_hardly_turned_is_refused() -> None:
-    with refused("TOO_FEW", "two localizations or more, got 1"):
-        fit_rotation_centre(turned([0.3]))
-    with refused("INSUFFICIENT_ROTATION", "a spread of 0.0998"):
-        fit_rotation_centre(turned([0.3, 0.5]))
-
-
 def test_tool_tip_of_poses_in_different_frames_is_refused() -> None:
     first, second = touching(DOWN), touching(np.eye(3))
     other = Transform("cell", "flange", second.rotation, second.translation)
     with refused("WRONG_FRAME", "got T_base_flange and T_cell_flange"):
         fit_tool_tip([first, other])
-
-
-def test_rotation_centre_of_sights_in_different_frames_is_refused() -> None:
-    sights = [part(0.1, 0.0), part(0.0, 0.1, 1.5, frame="other")]
-    with refused("WRONG_FRAME", "expected localizations of one and the same frame"):
-        fit_rotation_centre(sights)

@@ -14,9 +14,9 @@ from tests.client.proofs.interleavings import FRAMED, ROWS, Variant, table, visi
 PROMISES = Path(__file__).parents[3] / "results" / "promises.md"
 
 SHORT = (
+    Variant(name="two calls", sensors=1, depth=14),
     Variant(name="sensor", sensors=1, results=(0, 1, 2), depth=60, triggers=1),
     Variant(name="sensor, preset", sensors=2, preset=True, depth=60, triggers=1),
-    Variant(name="two calls", sensors=1, depth=14),
     Variant(name="two wanted", sensors=1, triggers=1, results=(1, 2, 3), wanted=2, depth=60),
     Variant(name="number", sensors=1, number="own", bits=8, depth=14),
     Variant(name="number of the user's", sensors=1, number="given", depth=14),
