@@ -268,7 +268,7 @@ async def _detections(plan: Plan, pair: Pair) -> list[Comparison]:
         assert bytes(store.serialize_cdr(message, DETECTIONS)) == data
         publisher = node.publisher(topic, DETECTIONS)
         pair.far("hear", topic=topic, kind=DETECTIONS)
-        while not publisher.heard:  # noqa: ASYNC110 - of what nothing tells
+        while not publisher.has_subscribers:  # noqa: ASYNC110 - of what nothing tells
             await asyncio.sleep(0.01)
 
         def timed(work: Callable[[], object]) -> float:

@@ -95,7 +95,7 @@ class _TakenPlace:
     peer: str  # address of the peer, without a port
     since: float  # time at which the connection came, or last had a session
     within: float  # seconds that the connection may stay from then on
-    what: str  # name of the missing thing, for the log
+    missing: str  # name of the missing thing, for the log
     deadline: float
 
 
@@ -110,7 +110,7 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        what: name of the missing thing, which the log gives as the reason for closing.
+        label: name of the missing thing, which the log gives as the reason for closing.
         own: name of a session in the log, "a session".
 
     Attributes:
@@ -123,12 +123,12 @@ class Places(Generic[G]):
         most: int,
         *,
         within: float = HANDSHAKE_TIMEOUT,
-        what: str = "no session",
+        label: str = "no session",
         own: str = "a session",
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._within, self._what, self._own = within, what, own
+        self._within, self._missing, self._session_text = within, label, own
         self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
@@ -150,17 +150,22 @@ class Places(Generic[G]):
         if len(crowd) < self.most:
             crowd = []
             if not is_loopback(peer):
-                theirs = [one for one, place in self._places.items() if place.peer == peer]
-                if len(theirs) >= share_of(self.most):
-                    crowd, taken = theirs, f"{len(theirs)} others of {peer} are open"
+                places_of_peer = [
+                    occupant for occupant, place in self._places.items() if place.peer == peer
+                ]
+                if len(places_of_peer) >= share_of(self.most):
+                    crowd, taken = (
+                        places_of_peer,
+                        f"{len(places_of_peer)} others of {peer} are open",
+                    )
         if crowd:
             self.crowded_out += 1
-            one = next((one for one in crowd if not one.settled), None)
-            if one is None:
-                return f"{taken}, and each has {self._own}"
-            self._send_away(one, f"{taken}, it was without {self._own} for longest")
+            evicted = next((occupant for occupant in crowd if not occupant.settled), None)
+            if evicted is None:
+                return f"{taken}, and each has {self._session_text}"
+            self._send_away(evicted, f"{taken}, it was without {self._session_text} for longest")
         self._places[occupant] = _TakenPlace(
-            peer, now, self._within, self._what, now + self._within
+            peer, now, self._within, self._missing, now + self._within
         )
         return ""
 
@@ -175,31 +180,38 @@ class Places(Generic[G]):
             place.since = now
             self._places[occupant] = place
 
-    def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
+    def expect(self, occupant: G, within: float | None, label: str, now: float) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: name of the missing thing, for the log.
+            label: name of the missing thing, for the log.
             now: the moment.
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.within, place.what = math.inf if within is None else within, what
+            place.within, place.missing = math.inf if within is None else within, label
             place.deadline = now + place.within
 
     def waits_longest(self) -> tuple[float, G] | None:
         """Return the connection that has had no session for longest, and since when; None: none."""
-        found = next((one for one in self._places.items() if not one[0].settled), None)
-        return None if found is None else (found[1].since, found[0])
+        longest_waiting = next(
+            (
+                occupant_and_place
+                for occupant_and_place in self._places.items()
+                if not occupant_and_place[0].settled
+            ),
+            None,
+        )
+        return None if longest_waiting is None else (longest_waiting[1].since, longest_waiting[0])
 
     def make_room(self, why: str) -> None:
         """Close the connection that has had no session for longest."""
-        found = self.waits_longest()
-        if found is not None:
+        longest_waiting = self.waits_longest()
+        if longest_waiting is not None:
             self.crowded_out += 1
-            self._send_away(found[1], why)
+            self._send_away(longest_waiting[1], why)
 
     def end_overdue(self, now: float) -> None:
         """End connections whose time is over; a connection with a session gets new time."""
@@ -209,7 +221,7 @@ class Places(Generic[G]):
             if occupant.settled:
                 place.deadline = now + place.within
             else:
-                self._send_away(occupant, f"{place.what} within {place.within:g} s")
+                self._send_away(occupant, f"{place.missing} within {place.within:g} s")
 
     def next_deadline(self) -> float:
         """Return when :meth:`end_overdue` is to be called next; infinity: never."""
@@ -320,15 +332,15 @@ class Acceptor(Generic[G]):
         """Put a connection last in the line to make room: it was served, or its session ended."""
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
-    def expect(self, occupant: G, within: float | None, what: str) -> None:
+    def expect(self, occupant: G, within: float | None, label: str) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: name of the missing thing, for the log.
+            label: name of the missing thing, for the log.
         """
-        self.places.expect(occupant, within, what, asyncio.get_running_loop().time())
+        self.places.expect(occupant, within, label, asyncio.get_running_loop().time())
         self._set_timer()
 
     def _set_timer(self) -> None:
@@ -391,10 +403,10 @@ class Acceptor(Generic[G]):
             else:
                 self._admit(connection)
 
-    def _warn_once(self, what: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Log that nothing can be accepted; once, until accepting works again."""
         if not self._scarce:
-            self._log.warning("! %s", what)
+            self._log.warning("! %s", text)
         self._scarce = True
 
     def _admit(self, connection: socket.socket) -> None:
@@ -452,11 +464,15 @@ def _is_last(connection: socket.socket, reserve: int) -> bool:
 def _make_room() -> bool:
     """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
-    open_here = [one.places for one in _here.acceptors if one.loop is loop]
-    waiting = [(found[0], one) for one in open_here if (found := one.waits_longest()) is not None]
+    open_here = [acceptor.places for acceptor in _here.acceptors if acceptor.loop is loop]
+    waiting = [
+        (longest_waiting[0], acceptor)
+        for acceptor in open_here
+        if (longest_waiting := acceptor.waits_longest()) is not None
+    ]
     if not waiting:
         return False
-    _, places = min(waiting, key=lambda one: one[0])
+    _, places = min(waiting, key=lambda time_and_acceptor: time_and_acceptor[0])
     places.make_room("the process has too few file descriptors left")
     return True
 
@@ -474,8 +490,8 @@ async def listening(host: str, port: int, *, local: bool = False) -> socket.sock
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(RESOLVE_TIMEOUT):
-        found = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
-    family, _, _, _, address = found[0]
+        addresses = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
+    family, _, _, _, address = addresses[0]
     if local and not is_loopback(str(address[0])):
         raise ValueError(f"{host} is {address[0]} here, which needs a token")
     listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)

@@ -65,9 +65,9 @@ def load(name: str, use: str = "") -> Any:
     Raises:
         MissingExtraError: the package is not installed, or it is OpenCV 5.0.0.
     """
-    there = sys.modules.get(name)
-    if there is not None and there is _LOADED.get(name):
-        return there  # import_module takes longer to look it up than a small picture takes
+    loaded = sys.modules.get(name)
+    if loaded is not None and loaded is _LOADED.get(name):
+        return loaded  # import_module takes longer to look it up than a small picture takes
     try:
         module = importlib.import_module(name)
     except ImportError as exc:

@@ -41,21 +41,21 @@ def _amount(units: Mapping[str, int], least: float, most: float, example: str) -
     text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
 
     def read(given: object) -> float:
-        found: float | None = None
+        value: float | None = None
         if isinstance(given, str):
             parts = text.fullmatch(given.strip().lower())
             if parts is not None and parts[2] in known:
-                found = float(parts[1]) * known[parts[2]]
+                value = float(parts[1]) * known[parts[2]]
         elif isinstance(given, (int, float)) and not isinstance(given, bool):
-            found = float(given)
-        if found is None:
+            value = float(given)
+        if value is None:
             raise ValueError(
                 f"expected a number with a unit, such as {example!r}; units are "
                 f"{', '.join(units)}; got {given!r:.60}"
             )
-        if not least <= found <= most:
-            raise ValueError(f"expected {least:g} to {most:g} {next(iter(units))}, got {found:g}")
-        return found
+        if not least <= value <= most:
+            raise ValueError(f"expected {least:g} to {most:g} {next(iter(units))}, got {value:g}")
+        return value
 
     return PlainValidator(read)
 
@@ -70,16 +70,16 @@ Age = Annotated[float, _amount(SECONDS, MIN_AGE_SECONDS, MAX_AGE_SECONDS, "1 h")
 
 
 def _patterns(given: object) -> tuple[str, ...]:
-    found: list[str] = []
-    for one in cast("list[object]", given) if isinstance(given, (list, tuple)) else [given]:
-        if not isinstance(one, str) or _PATTERN.fullmatch(one) is None:
+    names: list[str] = []
+    for place in cast("list[object]", given) if isinstance(given, (list, tuple)) else [given]:
+        if not isinstance(place, str) or _PATTERN.fullmatch(place) is None:
             raise ValueError(
-                f"expected a camera's name, or a pattern such as line1/**; got {one!r:.80}"
+                f"expected a camera's name, or a pattern such as line1/**; got {place!r:.80}"
             )
-        found.append(one)
-    if not 1 <= len(found) <= MAX_PATTERNS:
-        raise ValueError(f"{len(found)} patterns, expected 1 to {MAX_PATTERNS}")
-    return tuple(found)
+        names.append(place)
+    if not 1 <= len(names) <= MAX_PATTERNS:
+        raise ValueError(f"{len(names)} patterns, expected 1 to {MAX_PATTERNS}")
+    return tuple(names)
 
 
 _ONE = {"type": "string", "pattern": f"^{_PATTERN.pattern}$"}
@@ -92,7 +92,9 @@ Patterns = Annotated[
 
 def chosen(patterns: Sequence[str], camera: str) -> bool:
     """Return True if one of the patterns matches the camera's name."""
-    return any(_matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in patterns)
+    return any(
+        _matches(pattern.split("/"), camera.split("/"), "**", _part_fits) for pattern in patterns
+    )
 
 
 def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
@@ -111,8 +113,8 @@ def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits
 
 def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
     """Add to places in a pattern the places after parts that may match nothing."""
-    for place, one in enumerate(pattern):
-        if place in places and one == many:
+    for place, part in enumerate(pattern):
+        if place in places and part == many:
             places = places | {place + 1}
     return places
 

@@ -21,25 +21,25 @@ class KnowsForks(Protocol):
         """Start anew in a fork: no other thread runs there; do not wait."""
 
 
-_notified: weakref.WeakSet[Any] = weakref.WeakSet()
+_objects_to_notify: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-def tell_of_forks(one: KnowsForks) -> None:
+def notify_of_forks(notified: KnowsForks) -> None:
     """Notify an object of each fork, in the fork, as long as the object lives."""
-    _notified.add(one)
+    _objects_to_notify.add(notified)
 
 
-def _tell_all() -> None:
-    for one in tuple(_notified):
-        one.forked()
+def _notify_all() -> None:
+    for notified in tuple(_objects_to_notify):
+        notified.forked()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_tell_all)
+    os.register_at_fork(after_in_child=_notify_all)
 
 
 if TYPE_CHECKING:
-    from functools import cached_property as cached_property  # for modules that import it from here
+    from functools import cached_property as cached_property  # other modules import it from here
 elif sys.version_info >= (3, 12):
     from functools import cached_property
 else:

@@ -59,7 +59,7 @@ def records_html(value: Any) -> str:
     kind: Any = type(records[0])
     units = kind._units  # noqa: SLF001 - of records, as their fields
     names = [f"{name} [{units[name]}]" if name in units else name for name in kind._fields]
-    return _table(names, ([_cell(one) for one in record] for record in records))
+    return _table(names, ([_cell(cell) for cell in record] for record in records))
 
 
 def _cell(value: object) -> str:
@@ -82,8 +82,8 @@ def _table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     head = f"<tr>{_cells('th', names)}</tr>" if names else ""
     body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in listed[:MAX_ROWS])
     more = len(listed) - MAX_ROWS
-    rest = f"<p>and {more} more</p>" if more > 0 else ""
-    return f"<table>{head}{body}</table>{rest}"
+    more_text = f"<p>and {more} more</p>" if more > 0 else ""
+    return f"<table>{head}{body}</table>{more_text}"
 
 
 def _cells(kind: str, texts: Iterable[str]) -> str:

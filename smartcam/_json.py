@@ -51,7 +51,9 @@ _PART = (
 
 def object_text(fields: Mapping[str, object]) -> str:
     """Return the text of an object."""
-    return f"{{{','.join([f'{_quoted(name)}:{text_of(one)}' for name, one in fields.items()])}}}"
+    return (
+        f"{{{','.join([f'{_quoted(name)}:{text_of(field)}' for name, field in fields.items()])}}}"
+    )
 
 
 def bytes_text(data: bytes) -> str:
@@ -103,7 +105,7 @@ def _container_text(value: object) -> str:
         if text is not None:
             return text
     elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
-        return f"{{{','.join([f'{_quoted(str(name))}:{one}' for name, one in value.items()])}}}"
+        return f"{{{','.join([f'{_quoted(str(name))}:{item}' for name, item in value.items()])}}}"
     elif _is_table(value):
         text = _table_text(value)
         if text is not None:
@@ -126,8 +128,8 @@ def _table_text(table: Any) -> str | None:
         return None
     form, texts, numbers = row
     found: list[str] = []
-    for one in table.tolist():
-        fields = [*one]
+    for values in table.tolist():
+        fields = [*values]
         total = 0.0
         for place in numbers:
             total += fields[place]
@@ -144,16 +146,16 @@ def _row_form(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None
     """Return the form of a row, the places of its texts and floats; None for other columns."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
-        one.kind not in _FORMS or (one.kind == "f" and one.itemsize > MAX_FLOAT_BYTES)
-        for one in kinds
+        kind.kind not in _FORMS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)
+        for kind in kinds
     ):
         return None
     fields = zip(dtype.names, kinds, strict=True)
     form = ",".join(
-        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[one.kind]}" for name, one in fields]
+        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[field.kind]}" for name, field in fields]
     )
-    texts = tuple(place for place, one in enumerate(kinds) if one.kind == "S")
-    floats = tuple(place for place, one in enumerate(kinds) if one.kind == "f")
+    texts = tuple(place for place, kind in enumerate(kinds) if kind.kind == "S")
+    floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")
     return f"{{{form}}}", texts, floats
 
 
@@ -189,14 +191,14 @@ def plain(value: Any) -> Any:
     if kind in _PLAIN:
         return value
     if kind is list or kind is tuple:
-        return value if _PLAIN.issuperset(map(type, value)) else [plain(one) for one in value]
+        return value if _PLAIN.issuperset(map(type, value)) else [plain(item) for item in value]
     if kind is dict:
-        return {str(name): plain(one) for name, one in value.items()}
+        return {str(name): plain(item) for name, item in value.items()}
     if issubclass(kind, tuple) and hasattr(value, "_asdict"):
         fields: dict[str, Any] = value._asdict()
         if _PLAIN.issuperset(map(type, fields.values())):
             return fields
-        return {name: plain(one) for name, one in fields.items()}
+        return {name: plain(field) for name, field in fields.items()}
     if _is_table(value):
         rows = _rows(value)
         if rows is not None:

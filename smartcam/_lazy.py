@@ -21,9 +21,9 @@ def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
             name, too, below its parent's name and a dot, or below ``""``. A key that begins
             with ``smartcam.`` is a module of another room.
     """
-    homes = {name: module for module, found in names.items() for name in found.split()}
-    own = vars(sys.modules[door])
-    package: str = own["__package__"]
+    homes = {name: module for module, words in names.items() for name in words.split()}
+    door_names = vars(sys.modules[door])
+    package: str = door_names["__package__"]
 
     def resolve(name: str) -> Any:
         if name not in homes:
@@ -32,8 +32,8 @@ def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
         is_module = not home or home.endswith(".")
         place = home if home.startswith("smartcam.") else f"{package}.{home}"
         module = importlib.import_module(f"{place}{name if is_module else ''}")
-        value = own[name] = module if is_module else getattr(module, name)
+        value = door_names[name] = module if is_module else getattr(module, name)
         return value
 
-    own["__dir__"] = lambda: sorted({*own, *homes})
+    door_names["__dir__"] = lambda: sorted({*door_names, *homes})
     return resolve

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, LocalProtocolError, ResponseTimeoutError
 
 if TYPE_CHECKING:
@@ -178,21 +178,21 @@ class _ThreadCall:
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
-            self._succeed(got)
+            self._succeed(outcome)
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
         """Run a coroutine; the waiting thread goes on without another turn of the loop."""
         if sys.version_info < (3, 12) and self._task is not None:
             self._task.remove_done_callback(self._end_unbegun)  # it would take another turn
         try:
-            got = await work
+            outcome = await work
         except asyncio.CancelledError:
             self._fail(LocalProtocolError("cancelled: the thread of the event loop has ended"))
             raise
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
-            self._succeed(got)
+            self._succeed(outcome)
 
     def _end_unbegun(self, _: asyncio.Task[None]) -> None:
         """End a coroutine that was cancelled before its task's first step; asyncio does not."""
@@ -233,7 +233,7 @@ class LoopThread:
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
         self._forked = False
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def start(self) -> None:
         """Start the thread; do nothing if it runs."""

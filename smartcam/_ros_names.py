@@ -58,7 +58,7 @@ def full_name(namespace: str, node: str) -> str:
     return f"{namespace.rstrip('/')}/{node}"
 
 
-def resolve(name: str, namespace: str, node: str, what: str = "topic") -> str:
+def resolve(name: str, namespace: str, node: str, kind: str = "topic") -> str:
     """Return the absolute name of a topic or a service.
 
     Args:
@@ -66,12 +66,12 @@ def resolve(name: str, namespace: str, node: str, what: str = "topic") -> str:
             (``~/a``).
         namespace: namespace of the node.
         node: name of the node.
-        what: kind of the thing named, for error texts.
+        kind: kind of the thing named, for error texts.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    checked = _checked(name, what)
+    checked = _checked(name, kind)
     if checked.startswith("/"):
         return checked
     if checked.startswith("~"):
@@ -89,10 +89,10 @@ def as_name(text: str) -> str:
     return "/".join(f"_{part}" if part[:1].isdigit() else part for part in parts)
 
 
-def _checked(name: str, what: str) -> str:
+def _checked(name: str, kind: str) -> str:
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name) or "__" in name:
         raise ConfigurationError(
-            f"ROS {what} {name!r:.120}: expected parts of letters, digits and _ joined by /, none "
+            f"ROS {kind} {name!r:.120}: expected parts of letters, digits and _ joined by /, none "
             "beginning with a digit, without __"
         )
     return name

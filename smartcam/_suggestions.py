@@ -51,8 +51,8 @@ def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | Non
 
     ``meant``: known words by their other names, such as ``float`` for ``real32``.
     """
-    found = (meant or {}).get(word) or closest(word, known)
-    return f"; did you mean {found!r}?" if found else ""
+    meant_word = (meant or {}).get(word) or closest(word, known)
+    return f"; did you mean {meant_word!r}?" if meant_word else ""
 
 
 def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | None:
@@ -66,12 +66,12 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
     """
     if len(word) > MAX_WORD_CHARACTERS:
         return None
-    short = (one for one in known if len(one) <= MAX_WORD_CHARACTERS)
+    short = (candidate for candidate in known if len(candidate) <= MAX_WORD_CHARACTERS)
     words = dict.fromkeys(itertools.islice(short, MAX_KNOWN_WORDS))
     scores = _scores_by_parts(word, words)
-    for one, score in _scores_by_edits(word, words).items():
-        scores[one] = max(score, scores.get(one, 0.0))
-    close = (one for one in words if scores.get(one, -1.0) >= least)
+    for candidate, score in _scores_by_edits(word, words).items():
+        scores[candidate] = max(score, scores.get(candidate, 0.0))
+    close = (word for word in words if scores.get(word, -1.0) >= least)
     return max(close, key=scores.__getitem__, default=None)
 
 
@@ -85,8 +85,8 @@ def hint(item: ErrorDetails, known: Iterable[str]) -> str:
         case "extra_forbidden":
             names = list(dict.fromkeys(known))
             suggestion = did_you_mean(str(item["loc"][-1]), names)
-            some = names and len(names) <= MAX_NAMED_WORDS
-            return suggestion or (f"; known are {', '.join(sorted(names))}" if some else "")
+            few = names and len(names) <= MAX_NAMED_WORDS
+            return suggestion or (f"; known are {', '.join(sorted(names))}" if few else "")
         case "union_tag_invalid":
             return did_you_mean(str(context["tag"]), _quoted(str(context["expected_tags"])))
         case "literal_error" | "enum":
@@ -105,28 +105,31 @@ def _quoted(text: str) -> list[str]:
 def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
     """Return the known words that are a few edits away, with their scores."""
     by_fold: dict[str, str] = {}
-    for one in known:
-        by_fold.setdefault(one.lower(), one)
+    for candidate in known:
+        by_fold.setdefault(candidate.lower(), candidate)
     folded, scores = word.lower(), {}
-    for one in difflib.get_close_matches(folded, by_fold, n=MAX_CANDIDATES):
-        score = _likeness(folded, one)
+    for match in difflib.get_close_matches(folded, by_fold, n=MAX_CANDIDATES):
+        score = _likeness(folded, match)
         if score:
-            scores[by_fold[one]] = score
+            scores[by_fold[match]] = score
     return scores
 
 
 def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
-    """Return the known words whose parts explain those of a word, with their scores."""
+    """Return the known words whose parts explain a word's parts, with their scores."""
     parts = _parts(word)
-    of_known = {one: _parts(one)[:MAX_PARTS] for one in known}
+    of_known = {candidate: _parts(candidate)[:MAX_PARTS] for candidate in known}
     every = dict.fromkeys(itertools.chain.from_iterable(of_known.values()))
-    near = [(len(part), _near(part, every)) for part in parts[:MAX_PARTS]]
+    lengths_and_scores = [(len(part), _parts_near(part, every)) for part in parts[:MAX_PARTS]]
     letters = sum(map(len, parts)) or 1
     scores = {}
-    for one, own in of_known.items():
-        explained = sum(n * max((like.get(p, 0.0) for p in own), default=0.0) for n, like in near)
+    for candidate, own_parts in of_known.items():
+        explained = sum(
+            n * max((like.get(p, 0.0) for p in own_parts), default=0.0)
+            for n, like in lengths_and_scores
+        )
         if explained >= MIN_EXPLAINED_SHARE * letters:
-            scores[one] = WEIGHT_OF_PARTS * explained / letters
+            scores[candidate] = WEIGHT_OF_PARTS * explained / letters
     return scores
 
 
@@ -136,13 +139,15 @@ def _parts(word: str) -> list[str]:
     return [part.lower() for part in re.split(r"[\W_]+", spaced) if part]
 
 
-def _near(part: str, every: Iterable[str]) -> dict[str, float]:
+def _parts_near(part: str, every: Iterable[str]) -> dict[str, float]:
     """Return the parts that equal a part, begin with it or are a few edits away, with scores."""
-    near = {one: _likeness(part, one) for one in difflib.get_close_matches(part, every, n=10)}
+    scores = {
+        match: _likeness(part, match) for match in difflib.get_close_matches(part, every, n=10)
+    }
     if len(part) >= MIN_PREFIX_LETTERS:
-        begun = (one for one in every if one.startswith(part))
-        near |= {one: max(PREFIX_SCORE, near.get(one, 0.0)) for one in begun}
-    return near
+        begun = (candidate for candidate in every if candidate.startswith(part))
+        scores |= {candidate: max(PREFIX_SCORE, scores.get(candidate, 0.0)) for candidate in begun}
+    return scores
 
 
 def _likeness(one: str, other: str) -> float:

@@ -288,15 +288,15 @@ async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
     face, wanted = call.face, call.request.application_id or None
     spec = _spec_of_localizations(face, wanted)
     application, value = await face.trigger(wanted, spec, call.timeout)
-    found = localizations_of(value)
+    localizations = localizations_of(value)
     pixels = in_pixels(_interpreter_of(spec, application)) and not face.is_calibrated(application)
-    if found is None or pixels:
+    if localizations is None or pixels:
         raise InterpretationError(
             f"{face.name}: expected localizations in metres, got {value!r:.80}; "
             "a trigger without these services gives what the layout says",
             expected="localizations",
         )
-    return {"localizations": found}
+    return {"localizations": localizations}
 
 
 def _spec_of_localizations(face: ThesisFace, application: int | None) -> Any:
@@ -306,19 +306,19 @@ def _spec_of_localizations(face: ThesisFace, application: int | None) -> Any:
         return "localizations"
     if not reading.by_application:
         return _with_poses(reading, None)
-    asked = {application, face.application} - {None}
-    return {one: _with_poses(reading, one) for one in {*reading.applications, *asked}}
+    named = {application, face.application} - {None}
+    return {name: _with_poses(reading, name) for name in {*reading.applications, *named}}
 
 
 def _with_poses(reading: Interpretation, application: int | None) -> Any:
-    own = reading.interpreter(application)
-    return "localizations" if own is None or without_poses(own) is not None else own
+    own_spec = reading.interpreter(application)
+    return "localizations" if own_spec is None or without_poses(own_spec) is not None else own_spec
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:
     """Return the interpreter of an application; None if the thesis' own fields are read."""
-    one = spec.get(application) if isinstance(spec, dict) else spec
-    return None if isinstance(one, str) else one
+    own_spec = spec.get(application) if isinstance(spec, dict) else spec
+    return None if isinstance(own_spec, str) else own_spec
 
 
 THESIS: Final[dict[str, ThesisService]] = {

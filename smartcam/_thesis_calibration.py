@@ -155,13 +155,13 @@ class CalibrationCall(NamedTuple):
         Raises:
             ConfigurationError: no folder for them is set.
         """
-        found = self.face.calibrations
-        if found is None:
+        calibrations = self.face.calibrations
+        if calibrations is None:
             raise ConfigurationError(
                 f"{self.face.name}: there is no folder for calibrations; expected "
                 "calibrations: FOLDER in the fleet file of its agent, and to be asked there"
             )
-        return found
+        return calibrations
 
 
 class WizardService(NamedTuple):
@@ -192,8 +192,8 @@ async def _perform(call: CalibrationCall) -> dict[str, Any]:
     with from_part("calibration", "the calibration services need"):
         from smartcam.calibration._inside import StepRequest
     request = call.request
-    asked = StepRequest(*(getattr(request, name) for name in StepRequest._fields))
-    return await call.calibrations.perform(asked, call.face.camera(call.timeout))
+    step_request = StepRequest(*(getattr(request, name) for name in StepRequest._fields))
+    return await call.calibrations.perform(step_request, call.face.camera(call.timeout))
 
 
 async def _export(call: CalibrationCall) -> dict[str, Any]:
@@ -225,10 +225,10 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
         reading: interpretation of the camera's results; None if their contents are not known.
         application: the active application; None if that is not known.
     """
-    own = None if reading is None else reading.interpreter(application)
-    if own is None or without_poses(own) is not None:
+    interpretation = None if reading is None else reading.interpreter(application)
+    if interpretation is None or without_poses(interpretation) is not None:
         return "localizations", "m"
-    return own, "px" if in_pixels(own) else "m"
+    return interpretation, "px" if in_pixels(interpretation) else "m"
 
 
 def checked_localizations(value: object, camera: str) -> list[Localization]:
@@ -237,12 +237,12 @@ def checked_localizations(value: object, camera: str) -> list[Localization]:
     Raises:
         InterpretationError: the value is not valid.
     """
-    found = localizations_of(value)
-    if found is None:
+    localizations = localizations_of(value)
+    if localizations is None:
         raise InterpretationError(
             f"{camera}: expected localizations, got {value!r:.80}", expected="localizations"
         )
-    return found
+    return localizations
 
 
 CALIBRATION: Final[dict[str, WizardService]] = {

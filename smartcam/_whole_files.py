@@ -124,8 +124,8 @@ def _replace(path: Path, body: bytes, backups: int) -> None:
 def _clear(path: Path) -> None:
     """Remove temporary files for this path whose writer was killed."""
     stale = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}\.tmp")
-    with os.scandir(path.parent) as found:
-        names = [one.name for one in found if stale.fullmatch(one.name)]
+    with os.scandir(path.parent) as entries:
+        names = [entry.name for entry in entries if stale.fullmatch(entry.name)]
     for name in names:
         path.with_name(name).unlink(missing_ok=True)
 

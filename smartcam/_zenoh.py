@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from smartcam._extras import load
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
     ConfigurationError,
@@ -88,7 +88,7 @@ MAX_WAITING_QUERIES = 4096
 CALLBACKS_PER_TURN = 64
 """Callbacks that run in one turn of the event loop."""
 
-PATIENT_TURN = 8
+PATIENT_CALLBACKS_PER_TURN = 8
 """Patient callbacks that run after the others in one turn of the event loop.
 
 A flood of patient callbacks delays other work only by the time of these few.
@@ -141,7 +141,7 @@ class BusLink:
 
     def settings(self, timeout: float) -> dict[str, Any]:
         """Return the engine's settings by their paths."""
-        found: dict[str, Any] = {
+        settings: dict[str, Any] = {
             "mode": self.mode,
             "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
@@ -163,10 +163,10 @@ class BusLink:
             "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE_TIME))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
-            found[f"transport/link/tx/queue/size/{queue}"] = 16
+            settings[f"transport/link/tx/queue/size/{queue}"] = 16
         if self.certificates is not None:
             tls = f"{self.certificates.rstrip('/')}/"
-            found |= {
+            settings |= {
                 "transport/link/tls/root_ca_certificate": f"{tls}ca.pem",
                 "transport/link/tls/enable_mtls": True,
                 "transport/link/tls/connect_certificate": f"{tls}cert.pem",
@@ -175,14 +175,16 @@ class BusLink:
                 "transport/link/tls/listen_private_key": f"{tls}key.pem",
                 "transport/link/tls/verify_name_on_connect": True,
             }
-        return found
+        return settings
 
 
 def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
     """Return endpoints to listen on, with a free port in place of port 0."""
     return tuple(
-        f"{one.removesuffix(':0')}:{_free_port(one)}" if one.endswith(":0") else one
-        for one in endpoints
+        f"{endpoint.removesuffix(':0')}:{_free_port(endpoint)}"
+        if endpoint.endswith(":0")
+        else endpoint
+        for endpoint in endpoints
     )
 
 
@@ -193,8 +195,8 @@ def _free_port(endpoint: str) -> int:
     ports = random.SystemRandom().sample(PORTS, 100)
     for port in ports:
         try:
-            with socket.socket(family) as found:
-                found.bind((host, port))
+            with socket.socket(family) as sock:
+                sock.bind((host, port))
         except OSError as exc:
             if exc.errno in {errno.EADDRINUSE, errno.EACCES}:
                 continue
@@ -211,22 +213,22 @@ def _end_lingering(ports: frozenset[int]) -> None:
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
     except OSError:
-        return  # Windows, where nothing waits
+        return  # Windows, on which nothing has to wait
     for number in numbers:
         try:
-            found = socket.socket(fileno=number)
+            sock = socket.socket(fileno=number)
         except OSError:
             continue  # a file, or closed by now
         try:
-            if found.family in INTERNET and ports & {
-                found.getsockname()[1],
-                found.getpeername()[1],
+            if sock.family in INTERNET and ports & {
+                sock.getsockname()[1],
+                sock.getpeername()[1],
             }:
-                found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
         except OSError:
             pass  # the socket has no peer
         finally:
-            found.detach()
+            sock.detach()
 
 
 @functools.cache
@@ -246,7 +248,7 @@ class _EngineUse:
     def __init__(self) -> None:
         self.begun: bool = False
         self.in_a_fork: bool = False
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def forked(self) -> None:
         """Note in a fork that the engine's threads do not run there."""
@@ -262,29 +264,29 @@ class ZenohSession:
     Args:
         link: endpoints and certificates that the session uses.
         more: further settings of the engine, by their paths.
-        what: name of the bus in texts.
+        bus_text: name of the bus in texts.
     """
 
     def __init__(
         self,
         link: BusLink,
         more: Mapping[str, Any] | None = None,
-        what: str = "the fleet's bus",
+        bus_text: str = "the fleet's bus",
     ) -> None:
-        self._link, self._more, self._what = link, dict(more or {}), what
+        self._link, self._more, self._bus_text = link, dict(more or {}), bus_text
         self._zenoh = engine()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
-        # bytes received, counted by all threads; and those of them that were handled
+        # bytes received, counted by all threads; and the number of handled bytes
         self._bytes = self._patient_bytes = 0
         self._taken_bytes = self._taken_patient_bytes = 0
         self._woken = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
-        self._told_dropped = False
+        self._reported_dropped = False
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         self._reopening = False
@@ -303,9 +305,9 @@ class ZenohSession:
         """
         if _use.in_a_fork:
             raise LocalProtocolError(
-                f"{self._what}: this process is a fork of one in which the engine's threads run, "
-                "and it has none of them: start it by another method, such as multiprocessing's "
-                "'spawn', or before the first session"
+                f"{self._bus_text}: this process is a fork of one in which the engine's threads "
+                "run, and it has none of them: start it by another method, such as "
+                "multiprocessing's 'spawn', or before the first session"
             )
         _use.begun = True
         self._loop = asyncio.get_running_loop()
@@ -342,7 +344,7 @@ class ZenohSession:
                 return
         logger.warning(
             "%s ! no router at %s yet: ends behind it can be reached once it runs",
-            self._what,
+            self._bus_text,
             self._link.place,
         )
 
@@ -356,7 +358,7 @@ class ZenohSession:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
                 raise ConfigurationError(
-                    f"{self._what}: the engine refuses {path}: {value!r}"
+                    f"{self._bus_text}: the engine refuses {path}: {value!r}"
                 ) from exc
         opening = self._loop.run_in_executor(None, zenoh.open, config)
         try:
@@ -380,7 +382,7 @@ class ZenohSession:
         session, self._session = self._session, None
         if session is not None:
             self._reopening = True
-            old = [one.lose() for one in tuple(self._declared)]
+            old = [declared.lose() for declared in tuple(self._declared)]
             closing = self._loop.run_in_executor(
                 None, _lose, session, old, self._link.mode != "client"
             )
@@ -388,19 +390,19 @@ class ZenohSession:
                 async with asyncio.timeout(CLOSE_TIMEOUT):
                     await asyncio.shield(closing)
         if not self._reopening:
-            raise ConfigurationError(f"{self._what} is not open")
+            raise ConfigurationError(f"{self._bus_text} is not open")
         await self._open(timeout)
-        for number, one in enumerate(tuple(self._declared)):
+        for number, declared in enumerate(tuple(self._declared)):
             if number % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
-            one.again()
+            declared.again()
         self._reopening = False
 
     def _end_lingering(self) -> None:
         """Close lingering connections now, and again before a new one can outlast its lease."""
         self._look = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
         endpoints = (*self._link.listen, *self._link.connect)
-        ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
+        ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in endpoints)
         self._loop.run_in_executor(None, _end_lingering, ports)
 
     async def _why(self, error: Exception) -> str:
@@ -416,7 +418,7 @@ class ZenohSession:
 
     def _failed(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
-        text = f"{self._what}: cannot {doing} {self._link.place}: {why}"
+        text = f"{self._bus_text}: cannot {doing} {self._link.place}: {why}"
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
@@ -431,8 +433,8 @@ class ZenohSession:
             bell.close()
         if session is None:
             return
-        for one in tuple(self._declared):
-            one.close()
+        for declared in tuple(self._declared):
+            declared.close()
         closing = self._loop.run_in_executor(
             None, _end, session, self._threads(), self._link.mode != "client"
         )
@@ -494,7 +496,7 @@ class ZenohSession:
                 raise
             except BaseException:
                 logger.exception(_NOT_TAKEN, self._link.place)
-        for _ in range(min(PATIENT_TURN, len(patient))):
+        for _ in range(min(PATIENT_CALLBACKS_PER_TURN, len(patient))):
             if not patient:
                 break
             call, arguments, size = patient.popleft()
@@ -519,8 +521,8 @@ class ZenohSession:
             waiting = self._bytes - self._taken_bytes
         if waiting + size <= MAX_WAITING_BYTES:
             return False
-        if not self._told_dropped:
-            self._told_dropped = True
+        if not self._reported_dropped:
+            self._reported_dropped = True
             logger.warning(
                 "%s ! this program does not read: %d bytes wait; more is dropped",
                 self._link.place,
@@ -561,15 +563,15 @@ class ZenohSession:
         with self._lock:
             self._replying -= 1
 
-    def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
+    def declare(self, declared: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; the declaration is closed with this session."""
         made = None if self._reopening else how(self.session)
-        self._declared[one] = None
+        self._declared[declared] = None
         return made
 
-    def forget(self, one: ZenohDeclared) -> None:
+    def forget(self, declared: ZenohDeclared) -> None:
         """Remove a closed end from those that the session closes."""
-        self._declared.pop(one, None)
+        self._declared.pop(declared, None)
 
     @property
     def session(self) -> Any:
@@ -579,7 +581,7 @@ class ZenohSession:
             ConfigurationError: the session is not open.
         """
         if self._session is None:
-            raise ConfigurationError(f"{self._what} is not open")
+            raise ConfigurationError(f"{self._bus_text} is not open")
         return self._session
 
     @property
@@ -652,14 +654,14 @@ class ZenohDeclared:
         self._by_dropping = by_dropping
         self._end = end
         self._closed = False
-        self._it: Any = None
+        self._declaration: Any = None
         self._how: Callable[[Any], Any] = _nothing
         self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
         """Declare the object that ``how`` makes with the engine's session."""
         self._how = how
-        self._it = self._end.declare(self, how)
+        self._declaration = self._end.declare(self, how)
         return self
 
     def when_lost(self, call: Callable[[], None]) -> Self:
@@ -669,15 +671,15 @@ class ZenohDeclared:
 
     def lose(self) -> Any:
         """Prepare for the end of the session; return the object to keep until then."""
-        it, self._it = self._it, None
+        declared, self._declaration = self._declaration, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
-        return None if self._by_dropping else it
+        return None if self._by_dropping else declared
 
     def again(self) -> None:
         """Declare the key again at the present session."""
-        if not self._closed and self._it is None:
-            self._it = self._how(self._end.session)
+        if not self._closed and self._declaration is None:
+            self._declaration = self._how(self._end.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call back, unless it was closed meanwhile."""
@@ -689,9 +691,9 @@ class ZenohDeclared:
         if not self._closed:
             self._closed = True
             self._end.forget(self)
-            it, self._it = self._it, None
-            if not self._by_dropping and it is not None:
-                quietly(it.undeclare)
+            declared, self._declaration = self._declaration, None
+            if not self._by_dropping and declared is not None:
+                quietly(declared.undeclare)
 
 
 def _lose(session: Any, declared: list[Any], router: bool) -> None:
@@ -721,8 +723,8 @@ def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     engine's thread while holding the interpreter lock, and that thread may wait for the lock to
     call another session of this process.
     """
-    for one in threads:
-        one.shutdown()
+    for thread in threads:
+        thread.shutdown()
     if router:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
@@ -755,10 +757,10 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
     ``ended`` is called when no more calls will come.
     """
 
-    def called(it: Any) -> None:
+    def called(declaration: Any) -> None:
         if not _thread.known:
             keep_thread()
-        call(it)
+        call(declaration)
 
     return engine().handlers.Callback(called, ended, indirect=False)
 

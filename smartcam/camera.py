@@ -102,7 +102,7 @@ class FrameRequest(NamedTuple):
 
     Attributes:
         encoding: name of the encoding.
-        quality: quality of JPEGs; None for that of the agent.
+        quality: quality of JPEGs; None for the agent's default.
     """
 
     encoding: str
@@ -114,7 +114,7 @@ class StreamRequest(NamedTuple):
 
     Attributes:
         encoding: name of the encoding.
-        quality: quality of JPEGs; None for that of the agent.
+        quality: quality of JPEGs; None for the agent's default.
         bitrate: bits per second; None for no limit.
         latency: seconds; None for no limit.
         decode: whether encoded frames are decoded here.
@@ -151,7 +151,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._counters = ClientCounters()
         self._listeners = self._make_listeners()
         self._default_spec: object = settings.interpret_as
-        self._default = self._interpretation(self._default_spec, own=True)
+        self._default = self._interpretation(self._default_spec, of_camera=True)
         self._usual_trigger = TriggerRequest(self._default, None, 1, wait=True)
 
     # ------------------------------------------------------------------ for each kind of camera
@@ -619,20 +619,21 @@ class Camera(abc.ABC, Generic[ValueT]):
         interpretation = (
             self._default if interpret_as is None else self._interpretation(interpret_as)
         )
-        who = self.settings.name
+        caller = self.settings.name
         if application is not None:
-            application = check_application(self._named(application), who=who)
+            application = check_application(self._named(application), caller=caller)
         wait = (
-            when_busy is WAIT or check_choice(when_busy, "when_busy", (WAIT, "refuse"), who) == WAIT
+            when_busy is WAIT
+            or check_choice(when_busy, "when_busy", (WAIT, "refuse"), caller) == WAIT
         )
         wanted = 1
         if results_per_trigger is not None:
             wanted = check_integer(
-                results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, who
+                results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, caller
             )
-        data = None if input is None else check_bytes(input, "input", who)
+        data = None if input is None else check_bytes(input, "input", caller)
         if timeout is not DEFAULT_TRIGGER_TIMEOUT:
-            timeout = check_seconds(timeout, "timeout", who)
+            timeout = check_seconds(timeout, "timeout", caller)
         request = self._usual_trigger
         if (
             data is not None
@@ -671,7 +672,9 @@ class Camera(abc.ABC, Generic[ValueT]):
         Cancellation: safe; the camera may be in either application, and stopped.
         Source: SC manual p. 34 (published).
         """
-        application = check_application_or_name(self._named(application, file=True), who=self.name)
+        application = check_application_or_name(
+            self._named(application, file=True), caller=self.name
+        )
         limit = self._limit(timeout, self.settings.switch_timeout)
         await self._switch_application(application, limit)
 
@@ -686,7 +689,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: the client's supervisor finishes the return; the next call waits for it.
         """
-        return self._in_application(check_application(self._named(application), who=self.name))
+        return self._in_application(check_application(self._named(application), caller=self.name))
 
     def _named(self, application: object, *, file: bool = False) -> object:
         """Return the id of an application's name; anything else as it is.
@@ -1070,7 +1073,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
-        message_id = check_message_id(message_id, who=self.name)
+        message_id = check_message_id(message_id, caller=self.name)
         payload = check_bytes(payload, "payload", self.name)
         if answered is not None:
             answered = check_flag(answered, "answered", self.name)
@@ -1132,12 +1135,12 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._default = self._interpretation(spec)
         self._default_spec = spec
 
-    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+    def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         """Return the interpretation of results by ``spec``.
 
         Args:
             spec: as ``interpret_as``.
-            own: whether ``spec`` is the camera's own setting, next to its calibration.
+            of_camera: whether ``spec`` is the camera's own setting, next to its calibration.
 
         Raises:
             ConfigurationError: ``spec`` is not valid, or does not fit the calibration.
@@ -1150,7 +1153,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         lenient, y_down = self.settings.lenient, self.settings.y_down
         calibration = self.settings.calibration
         made = Interpretation(
-            spec, lenient=lenient, y_down=y_down, calibration=calibration, own=own
+            spec, lenient=lenient, y_down=y_down, calibration=calibration, own=of_camera
         )
         if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
             self._interpretations[spec] = made

@@ -92,8 +92,8 @@ class SmartCamera(Camera[ValueT]):
     def _make_state(self) -> CameraState:
         return CameraState(self.settings.name, self.settings.application, self._listeners)
 
-    def _go_to(self, address: Address) -> None:
-        """Use another address than that of the settings; only before the client is opened."""
+    def _use_address(self, address: Address) -> None:
+        """Use another address than the settings' one; only before the client is opened."""
         self.settings: CameraSettings = replace(self.settings, address=address)
         self._supervisor.use_settings(self.settings)
 

@@ -258,7 +258,7 @@ class CommandRejectedError(SmartCamError):
 
 
 class UnsupportedError(SmartCamError):
-    """This dialect or device cannot do it."""
+    """The dialect or the device does not support the request."""
 
 
 class NotAllowedError(SmartCamError, PermissionError):
@@ -291,8 +291,8 @@ class CalibrationError(SmartCamError, ValueError):
 
     Attributes:
         code: kind of the mistake, in one word: ``TOO_FEW``, ``COLLINEAR``, ``MIRRORED``, ...
-        expected: what was expected.
-        got: what came.
+        expected: the expected value, or a text.
+        got: the actual value.
     """
 
     def __init__(
@@ -470,8 +470,8 @@ class InterpretationError(SmartCamError, ValueError):
     Attributes:
         field: name of the field, or "" if the whole container is meant.
         offset: byte offset in the container's data.
-        expected: what was expected there.
-        got: what came.
+        expected: the expected value there.
+        got: the actual value.
     """
 
     def __init__(

@@ -124,7 +124,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 def as_status(word: int) -> Status:
     """Return the status of a word; for the receiving path, since ``Status(word)`` is slow."""
-    known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
+    known = Status._value2member_map_.get(word)  # texts of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
 
@@ -141,7 +141,7 @@ def _cut(value: object) -> str:
 
 
 def _html() -> Any:
-    return importlib.import_module("smartcam._html")  # for notebooks only
+    return importlib.import_module("smartcam._html")  # used only by notebooks
 
 
 class Position(NamedTuple):
@@ -196,8 +196,8 @@ class PoseSigma(NamedTuple):
         y: along the frame's y axis, in the unit of ``x``.
         theta: error of the rotation about the pose's z axis, radians.
         correlation_xy: correlation of the errors of x and y, -1 to 1.
-        correlation_xt: correlation of those of x and theta.
-        correlation_yt: correlation of those of y and theta.
+        correlation_xt: correlation of the errors of x and theta.
+        correlation_yt: correlation of the errors of y and theta.
         z: along the frame's z axis, metres; None if not known: a camera sees no height.
     """
 
@@ -258,7 +258,7 @@ class _EstimatedPose(Pose):
         return {**super()._asdict(), "sigma": self.sigma}
 
     def __repr__(self) -> str:
-        return f"Pose({', '.join(f'{name}={one!r}' for name, one in self._asdict().items())})"
+        return f"Pose({', '.join(f'{name}={value!r}' for name, value in self._asdict().items())})"
 
 
 class Localization(NamedTuple):
@@ -435,7 +435,7 @@ class StatusChanged(CameraEvent):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ApplicationChanged(CameraEvent):
-    """Another application is active than the client knew."""
+    """The active application is another one than in the client's last information."""
 
     application: int
     previous: int | None

@@ -184,9 +184,9 @@ class Observers:
 
     def _take(self, observers: Iterable[Observer]) -> None:
         self._all = check_all(observers, "observers", "a list of observers")
-        for one in self._all:
-            if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
-                raise wrong_argument("observers", "objects of classes of Observer", one)
+        for observer in self._all:
+            if not all(callable(getattr(observer, hook, None)) for hook in _HOOKS):
+                raise wrong_argument("observers", "objects of classes of Observer", observer)
         self._on_state = self._overriding("on_state")
         seen = self._looking_at("on_results", "on_result")
         self._on_result = [(hook, name == "on_results") for hook, name in seen]
@@ -263,12 +263,12 @@ class Observers:
         self, camera: str, error: SmartCamError, triggered_at: datetime | None = None
     ) -> None:
         """Report an error to all observers."""
-        for one in self._all:
-            self._call(one.on_error, camera, error, triggered_at)
+        for observer in self._all:
+            self._call(observer.on_error, camera, error, triggered_at)
 
     def _overriding(self, name: str) -> tuple[Callable[..., None], ...]:
         """Return this method of the observers that override it, in order."""
-        hooks = [_own_hook(one, name) for one in self._all]
+        hooks = [_own_hook(observer, name) for observer in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
     def _looking_at(self, *names: str) -> Iterator[tuple[Callable[..., None], str]]:
@@ -276,11 +276,13 @@ class Observers:
 
         The method that is overridden last counts; the first one of those that a class overrides.
         """
-        for one in self._all:
-            own = [(name, hook) for name in names if (hook := _own_hook(one, name)) is not None]
-            depths = [_depth(one, name) for name, _ in own]
-            if own:
-                name, hook = own[depths.index(min(depths))]
+        for observer in self._all:
+            hooks = [
+                (name, hook) for name in names if (hook := _own_hook(observer, name)) is not None
+            ]
+            depths = [_depth(observer, name) for name, _ in hooks]
+            if hooks:
+                name, hook = hooks[depths.index(min(depths))]
                 yield hook, name
 
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
@@ -303,4 +305,4 @@ def _depth(observer: Observer, name: str) -> int:
     if name in getattr(observer, "__dict__", ()):
         return -1
     classes = type(observer).__mro__
-    return next((at for at, one in enumerate(classes) if name in vars(one)), len(classes))
+    return next((at for at, kind in enumerate(classes) if name in vars(kind)), len(classes))

@@ -97,7 +97,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
     given = _given_options(request)
     protocol = given.get("protocol", PROTOCOL)
-    options = {key: one for key, one in given.items() if key not in OWN or key in TO_CAMERA}
+    options = {key: value for key, value in given.items() if key not in OWN or key in TO_CAMERA}
     application = given.get("application")
     if application is not None:
         options = {**emulated_class(protocol).state_options(application, running=True), **options}
@@ -107,7 +107,7 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
-    """Emulated cameras by name: two, or those of a scenario; otherwise like emulated_camera."""
+    """Emulated cameras by name: two, or a scenario's cameras; otherwise like emulated_camera."""
     from smartcam.testing import ThreadedFleet
 
     given = _given_options(request)
@@ -154,7 +154,7 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> C
         "application": given.get("application"),
         **given.get("connect", {}),
     }
-    given = {key: one for key, one in options.items() if one is not None}
+    given = {key: value for key, value in options.items() if value is not None}
     client = _made(lambda: connect(emulated_camera.url, **given))
     request.node.stash[_CLIENT] = client
     return client
@@ -208,8 +208,8 @@ def _options(given: dict[str, Any]) -> frozenset[str]:
 def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:
     """Return a scenario's path: beside the test, below the project's root, or as given."""
     folders = (request.path.parent, request.config.rootpath)
-    found = (folder / given for folder in folders)
-    return next((path for path in found if path.exists()), Path(given))
+    paths = (folder / given for folder in folders)
+    return next((path for path in paths if path.exists()), Path(given))
 
 
 # ---------------------------------------------------------------------- opening the client

@@ -43,11 +43,11 @@ class Registry:
 
     Args:
         group: entry-point group, as in ``[project.entry-points."smartcam.interpreters"]``.
-        builtins: name to ``module:attribute`` of those that smartcam brings.
+        builtins: name to ``module:attribute`` of the plug-ins in smartcam.
         aliases: other accepted names of built-ins.
 
     Attributes:
-        revision: number that changes with what is registered, or looked for anew.
+        revision: number that changes when a plug-in is registered, or a search begins anew.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Registry:
         self.revision: int = 0
         self._builtins = builtins
         self._aliases = aliases or {}
-        self._found: dict[str, list[EntryPoint]] | None = None
+        self._points_found: dict[str, list[EntryPoint]] | None = None
         self._loaded: dict[str, object] = {}
         self._registered: dict[str, object] = {}
 
@@ -73,8 +73,8 @@ class Registry:
 
     def __contains__(self, name: object) -> bool:
         """Return True if ``name`` is known, as a name or an alias."""
-        own = (self._builtins, self._aliases, self._registered)
-        return any(name in one for one in own) or name in self._entry_points()
+        registries = (self._builtins, self._aliases, self._registered)
+        return any(name in registry for registry in registries) or name in self._entry_points()
 
     def register(self, name: str, plugin: object) -> None:
         """Register a plug-in for this process, without a package that provides it.
@@ -97,29 +97,29 @@ class Registry:
         """
         name = self._aliases.get(name, name)
         if name not in self._loaded:
-            own = self._registered.get(name)
-            self._loaded[name] = self._load(name) if own is None else own
+            registered = self._registered.get(name)
+            self._loaded[name] = self._load(name) if registered is None else registered
         return self._loaded[name]
 
     def refresh(self) -> None:
         """Forget found and loaded plug-ins, but not registered ones; later calls search again."""
-        self._found = None
+        self._points_found = None
         self._loaded.clear()
         self.revision += 1
 
     def _entry_points(self) -> dict[str, list[EntryPoint]]:
-        if self._found is None:
-            self._found = {}
+        if self._points_found is None:
+            self._points_found = {}
             for point in _points(self.group):
-                self._found.setdefault(point.name, []).append(point)
-            for name in self._builtins.keys() & self._found.keys():
+                self._points_found.setdefault(point.name, []).append(point)
+            for name in self._builtins.keys() & self._points_found.keys():
                 _log.warning(
                     "%s: the name %s is smartcam's own, that of %s is left out",
                     self.group,
                     shown(name),
-                    " and ".join(_distribution(point) for point in self._found.pop(name)),
+                    " and ".join(_distribution(point) for point in self._points_found.pop(name)),
                 )
-        return self._found
+        return self._points_found
 
     def _load(self, name: str) -> object:
         if name in self._builtins:  # without a slow look at the installed packages
@@ -154,31 +154,33 @@ def _distribution(point: EntryPoint) -> str:
 
 def _points(group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group; for a distribution found twice, the first one's."""
-    found = [(one, _entry_points_text(one)) for one in _distributions()]
-    if not any(text is None or group in text for _, text in found):
+    found_distributions = [
+        (distribution, _entry_points_text(distribution)) for distribution in _distributions()
+    ]
+    if not any(text is None or group in text for _, text in found_distributions):
         return  # the usual case; names are slow to read
     seen: set[str] = set()
-    for one, text in found:
+    for candidate, text in found_distributions:
         try:
-            name = _key(one)
+            name = _key(candidate)
             wanted = name not in seen and (text is None or group in text)
-            points = list(one.entry_points.select(group=group)) if wanted else []
-            seen.add(name or str(id(one)))
+            points = list(candidate.entry_points.select(group=group)) if wanted else []
+            seen.add(name or str(id(candidate)))
         except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
             _log.warning(
                 "%s: the entry points of %s cannot be read, they are left out: %r",
                 group,
-                getattr(one, "_path", None) or "a distribution",
+                getattr(candidate, "_path", None) or "a distribution",
                 exc,
             )
         else:
             yield from points
 
 
-def _entry_points_text(found: Distribution) -> str | None:
+def _entry_points_text(distribution: Distribution) -> str | None:
     """Return the text of a distribution's entry points, None if it cannot be read in this way."""
     try:
-        return found.read_text("entry_points.txt") or ""
+        return distribution.read_text("entry_points.txt") or ""
     except Exception:  # noqa: BLE001 - anything may stand in other people's files
         return None
 
@@ -192,16 +194,16 @@ def _distributions() -> Iterator[Distribution]:
         _log.warning("installed distributions cannot be listed to their end: %r", exc)
 
 
-def _key(found: Distribution) -> str:
+def _key(distribution: Distribution) -> str:
     """Return a distribution's normalized name; its folder's name is fastest, if known."""
-    known: str | None = getattr(found, "_normalized_name", None)
-    return known or _name_of(found).lower()
+    known: str | None = getattr(distribution, "_normalized_name", None)
+    return known or _name_of(distribution).lower()
 
 
-def _name_of(found: Distribution) -> str:
+def _name_of(distribution: Distribution) -> str:
     """Return a distribution's name; "" if its metadata cannot be read."""
     try:
-        name: str | None = found.metadata["Name"]
+        name: str | None = distribution.metadata["Name"]
     except Exception:  # noqa: BLE001 - anything may stand in other people's files
         return ""
     return name or ""

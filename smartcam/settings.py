@@ -78,7 +78,7 @@ class Address(NamedTuple):
         user = query = ""
         if self.parameters or self.quirks:
             named = [quote(value, safe="") for key, value in self.parameters if key == USER]
-            user = "".join(f"{one}@" for one in named)
+            user = "".join(f"{part}@" for part in named)
             pairs = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
             query = urlencode(
                 [(key, value) for key, value in pairs if value and key not in {USER, PASSWORD}],
@@ -129,7 +129,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     url = check_text(url, "camera address")
     if model is not None:
         model = check_text(model, "camera model", least=1, most=200)
-    if "@" in url:  # with a password, which must not be kept
+    if "@" in url:  # the URL has a password, which must not be kept
         return _read_address(url, model)
     return _known_address(url, model, PROTOCOLS.revision)
 
@@ -147,7 +147,7 @@ def _read_address(url: str, model: str | None) -> Address:
         parts = urlsplit(full)
         host, port = parts.hostname, parts.port
     except ValueError as exc:
-        if shown != url and "'" in str(exc):  # its text quotes the URL, and so the password
+        if shown != url and "'" in str(exc):  # the error's text quotes the URL, and so the password
             raise ConfigurationError(
                 f"camera address {shown!r} is no URL; in a password each of / ? # [ ] stands as "
                 "%2F %3F %23 %5B %5D"
@@ -254,15 +254,15 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         for protocol in known_protocols():
             if scheme in protocol.schemes:
                 return protocol, url
-        schemes = [one for protocol in known_protocols() for one in protocol.schemes]
+        schemes = [scheme for protocol in known_protocols() for scheme in protocol.schemes]
         if is_fleet(url):
-            own = " or ".join(f"{one}://" for one in schemes)
+            own_schemes = " or ".join(f"{scheme}://" for scheme in schemes)
             raise UnsupportedError(
                 f"{masked(url)} is of a fleet, whose agent has the session with the camera: this "
-                f"wants the camera's own address, which begins with {own}"
+                f"wants the camera's own address, which begins with {own_schemes}"
             )
         schemes += FLEET_SCHEMES
-        known = ", ".join(f"{one}://" for one in schemes)
+        known = ", ".join(f"{scheme}://" for scheme in schemes)
         raise ConfigurationError(
             f"camera address {masked(url)!r}: unknown scheme {scheme!r}; known are {known}"
             f"{did_you_mean(scheme, schemes)}"
@@ -288,7 +288,7 @@ def known_protocols() -> Iterator[Protocol]:
             if info.origin == "built-in":
                 raise
             continue  # a broken plug-in is only left out
-        if hasattr(protocol, "schemes"):  # so is one that provides something else
+        if hasattr(protocol, "schemes"):  # so is a plug-in that provides something else
             yield protocol
 
 
@@ -354,7 +354,7 @@ class CameraSettings:
         """Validate the options of ``connect()``.
 
         Raises:
-            ConfigurationError: names the option, what came and what was expected.
+            ConfigurationError: names the option, the given value and the expected one.
         """
         return cls.of(parse_address(url, model=model), options)
 
@@ -363,7 +363,7 @@ class CameraSettings:
         """Validate options for an address.
 
         Raises:
-            ConfigurationError: names the option, what came and what was expected.
+            ConfigurationError: names the option, the given value and the expected one.
         """
         usual = address.path or f"{address.host}:{address.port}"
         try:
@@ -422,10 +422,10 @@ def _as_usual(option: str, value: Any) -> Any:
 
 
 def _validated(given: dict[str, Any]) -> dict[str, Any]:
-    """Return options as pydantic's model reads them, which judges all that is unusual.
+    """Return options as pydantic's model reads them, which judges unusual values.
 
     Raises:
-        ConfigurationError: names the option, what came and what was expected.
+        ConfigurationError: names the option, the given value and the expected one.
     """
     from pydantic import ValidationError
 
@@ -447,17 +447,18 @@ def with_ids(options: dict[str, Any]) -> dict[str, Any]:
     names = options.get("application_names")
     if not isinstance(names, Mapping) or not names:
         return options
-    found = dict(options)
-    if isinstance(found.get("application"), str):
-        found["application"] = id_of(found["application"], names)
+    options_by_id = dict(options)
+    if isinstance(options_by_id.get("application"), str):
+        options_by_id["application"] = id_of(options_by_id["application"], names)
     for option in ("interpret_as", "calibration"):
-        given: Any = found.get(option)
+        given: Any = options_by_id.get(option)
         if isinstance(given, Mapping):
             each: Mapping[Any, Any] = given
-            found[option] = {
-                id_of(key, names) if isinstance(key, str) else key: one for key, one in each.items()
+            options_by_id[option] = {
+                id_of(key, names) if isinstance(key, str) else key: value
+                for key, value in each.items()
             }
-    return found
+    return options_by_id
 
 
 def id_of(application: str, names: Mapping[str, int]) -> int:
@@ -474,11 +475,11 @@ def id_of(application: str, names: Mapping[str, int]) -> int:
     )
 
 
-def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
+def validated(kind: type[M], given: M | Mapping[str, Any], label: str) -> M:
     """Return ``given`` as a model; a mapping has its fields.
 
     Raises:
-        ConfigurationError: a field is wrong; the text begins with ``what`` and names the field.
+        ConfigurationError: a field is wrong; the text begins with ``label`` and names the field.
     """
     from pydantic import ValidationError
 
@@ -486,7 +487,7 @@ def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
         return kind.model_validate(dict(given) if isinstance(given, Mapping) else given)
     except ValidationError as exc:
         text = validation_text(exc, kind.model_fields)
-        raise ConfigurationError(f"{what}: {text}") from exc
+        raise ConfigurationError(f"{label}: {text}") from exc
 
 
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:

@@ -35,7 +35,7 @@ class Overflow(enum.Enum):
     items."""
 
 
-_OVERFLOWS = [one.value for one in Overflow]
+_OVERFLOWS = [overflow.value for overflow in Overflow]
 
 
 def _weightless(_item: object) -> int:
@@ -68,25 +68,25 @@ class Queue(Generic[T]):
         max_queue_bytes: int = sys.maxsize,
         size_of: Callable[[T], int] = _weightless,
     ) -> None:
-        who = f"{name}()"
+        caller = f"{name}()"
         self._name = name
-        self._max_queue = check_integer(max_queue, "max_queue", 1, who=who)
-        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, who=who)
-        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, who))
-        self._min_interval = check_seconds(min_interval, "min_interval", who)
+        self._max_queue = check_integer(max_queue, "max_queue", 1, caller=caller)
+        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, caller=caller)
+        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, caller))
+        self._min_interval = check_seconds(min_interval, "min_interval", caller)
         self._size_of = size_of
         self._items: collections.deque[T | SmartCamError] = collections.deque()
         self._ready = asyncio.Event()
         self._ended = False
         self._end_error: SmartCamError | None = None
-        self._kept: object = None
+        self._last_item: object = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
-        # Bytes are counted when items come; only then are those of taken items subtracted, so that
+        # Bytes are counted, and the bytes of taken items subtracted, when items come, so that
         # taking costs nothing. A parcel came together: number of its last item, items, bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
-        self._bytes = 0  # of all parcels, of which some may be of items that are gone
+        self._bytes = 0  # bytes of all parcels, some of which may belong to dropped items
         self._missed = 0
         self.since: float = -math.inf  # time of the subscription, on the clock of the items
         self._evicted = 0  # dropped items that were queued before: only these have numbers
@@ -110,7 +110,7 @@ class Queue(Generic[T]):
     def keep(self, source: object) -> None:
         """Keep a reference to the items' source, for a program that keeps the stream alone."""
         if not self._ended:
-            self._kept = source
+            self._last_item = source
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
@@ -218,7 +218,7 @@ class Queue(Generic[T]):
         if not self._ended:
             self._ended = True
             self._end_error = error
-            self._kept = None
+            self._last_item = None
         self._ready.set()
 
     # ------------------------------------------------------------------ inside

@@ -141,11 +141,6 @@ TIMES = {
 UNITS = {"Milliseconds": "MS", "Microseconds": "US", "Nanoseconds": "NS"}
 """Ends of the names of constants that count times in another unit, by the unit."""
 
-UNNAMED_TIMES = {
-    *("_cli", "conformance", "fleet", "ros1", "ros2", "web"),
-}
-"""Rooms in which some times still have names that do not say so; a room that is mended goes."""
-
 
 class Named(NamedTuple):
     """A constant, and the text that explains it."""
@@ -153,13 +148,6 @@ class Named(NamedTuple):
     module: str
     name: str
     text: str
-
-    @property
-    def room(self) -> str:
-        """The entry of :data:`UNNAMED_TIMES` for the constant's module, "" without one."""
-        inside = self.module.removeprefix("smartcam.")
-        found = [room for room in UNNAMED_TIMES if f"{inside}.".startswith(f"{room}.")]
-        return found[0] if found else ""
 
     @property
     def says_its_unit(self) -> bool:
@@ -188,9 +176,8 @@ def target_of(node: ast.stmt) -> str:
 
 
 def test_names_of_times_say_that_they_are_times() -> None:
-    wrong = [one for one in named_constants() if not one.says_its_unit]
-    assert [f"{one.module}.{one.name}: {one.text}" for one in wrong if not one.room] == []
-    assert {one.room for one in wrong} - {""} == UNNAMED_TIMES
+    wrong = [named for named in named_constants() if not named.says_its_unit]
+    assert [f"{named.module}.{named.name}: {named.text}" for named in wrong] == []
 
 
 COUNTED = re.compile(
@@ -269,3 +256,68 @@ def plain_functions() -> Iterator[Text]:
 def test_functions_begin_with_a_verb() -> None:
     found = [one for one in plain_functions() if HAPPENING.match(one.text)]
     assert not found, "\n".join(map(str, found))
+
+
+ENTRY_NAMES = re.compile(r"^    ((?:\*{0,2}\w+)(?:, \*{0,2}\w+)*): ", re.MULTILINE)
+"""Names in front of the explanations of a section."""
+
+
+def explained_arguments(node: ast.AST) -> set[str]:
+    """Return the names that the section ``Args`` of a docstring explains."""
+    if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return set()
+    sections = re.split(r"^(?=\w+:$)", ast.get_docstring(node) or "", flags=re.MULTILINE)
+    text = "".join(section for section in sections if section.startswith("Args:"))
+    names = {name.strip(" *") for match in ENTRY_NAMES.findall(text) for name in match.split(",")}
+    return names - {"None"}
+
+
+def arguments_of(node: ast.AST) -> set[str] | None:
+    """Return the arguments of a function, or of a class' own initializer; None without one."""
+    if isinstance(node, ast.ClassDef):
+        return next(
+            (
+                arguments_of(part)
+                for part in node.body
+                if isinstance(part, ast.FunctionDef) and part.name in {"__init__", "__new__"}
+            ),
+            None,
+        )
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        return {part.arg for part in ast.walk(node.args) if isinstance(part, ast.arg)}
+    return None
+
+
+def test_explained_arguments_exist() -> None:
+    found = [
+        f"{module}:{node.lineno}: {', '.join(sorted(explained - names))}"  # type: ignore[attr-defined]
+        for module, tree in package().items()
+        for node in statements(tree)
+        if (explained := explained_arguments(node))
+        and (names := arguments_of(node)) is not None
+        and not explained <= names
+    ]
+    assert not found, "\n".join(found)
+
+
+UNNAMED = {"one", "found", "came", "it", "said", "told", "heard", "mine", "theirs"}
+"""Names of loop variables that do not name the thing that they hold."""
+
+
+def loop_variables(tree: ast.AST) -> Iterator[ast.Name]:
+    """Yield the variables of loops and comprehensions, pairs such as ``one, other`` left out."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.For | ast.AsyncFor | ast.comprehension):
+            names = [part for part in ast.walk(node.target) if isinstance(part, ast.Name)]
+            if not {"one", "other"} <= {name.id for name in names}:
+                yield from names
+
+
+def test_loop_variables_name_what_they_hold() -> None:
+    found = [
+        f"{module}:{name.lineno}: {name.id}"
+        for module, tree in package().items()
+        for name in loop_variables(tree)
+        if name.id in UNNAMED
+    ]
+    assert not found, "\n".join(found)

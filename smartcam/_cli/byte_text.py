@@ -26,11 +26,11 @@ def bytes_of_text(text: str) -> bytes:
         ValueError: the text has no known form.
     """
     lines = [line for line in text.splitlines() if line.strip()]
-    found = [_DUMP_LINE.fullmatch(line) for line in lines]
-    if len(lines) > 1 and found[-1] is None and _LAST_OFFSET.fullmatch(lines[-1]):
-        found.pop()
-    dump = [one for one in found if one is not None]
-    if dump and len(dump) == len(found) and int(dump[0][1], 16) == 0:
+    matches = [_DUMP_LINE.fullmatch(line) for line in lines]
+    if len(lines) > 1 and matches[-1] is None and _LAST_OFFSET.fullmatch(lines[-1]):
+        matches.pop()
+    dump = [match for match in matches if match is not None]
+    if dump and len(dump) == len(matches) and int(dump[0][1], 16) == 0:
         return _dumped(dump)
     plain = re.sub(r"[\s\"']", "", text)
     if _ESCAPES.fullmatch(plain):

@@ -182,7 +182,7 @@ async def _run(
     parameters: dict[str, Any] = {} if feature is None else {"feature": feature}
     if sources.target is not None and started in {"sheet", "hand-eye"}:
         parameters["target"] = sources.described
-    named = next(one for one in (check, called, started) if one is not None)
+    named = next(name for name in (check, called, started) if name is not None)
     try:
         service = _service(folder, sources)
         try:
@@ -305,7 +305,7 @@ class _Sources:
             sheet_wizard,
         )
 
-        found: list[Wizard] = []
+        wizards_found: list[Wizard] = []
         connect: dict[str, Any] | None = None
         if self.url is not None:
             with self.options.camera(self.url):  # raises for a wrong address or option
@@ -314,7 +314,7 @@ class _Sources:
                 name: getattr(self.options, name)
                 for name in ("application", "interpret_as", "y_down")
             }
-            found = [
+            wizards_found = [
                 plane_wizard(
                     localize=self.localize,
                     save_to=folder.calibration,
@@ -338,7 +338,7 @@ class _Sources:
         }
         known = None if lens is None else lens.covariance
         sheet = sheet_wizard(**pictures, lens_covariance=known, connect=connect)
-        return [*found, sheet, hand_eye_wizard(**pictures)]
+        return [*wizards_found, sheet, hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
         from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -347,19 +347,21 @@ class _Sources:
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
-                if camera.settings.y_down != options.y_down:  # a fleet's agent knows it
+                if (
+                    camera.settings.y_down != options.y_down
+                ):  # the fleet's agent has the calibration
                     raise ConfigurationError(
                         f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
                         "the calibration is mirrored"
                     )
                 result = await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
-        found = result.value
-        if not isinstance(found, list) or not all(isinstance(one, Localization) for one in found):
+        value = result.value
+        if not isinstance(value, list) or not all(isinstance(part, Localization) for part in value):
             raise ConfigurationError(
                 f"--interpret-as {options.interpret_as}: expected localizations, "
-                f"got {type(found).__name__}"
+                f"got {type(value).__name__}"
             )
-        return found
+        return value
 
     def _taking(self) -> dict[str, Any]:
         """Return the wizard's arguments for the source of its pictures."""

@@ -61,10 +61,10 @@ class GroupWithDefault(ListedGroup):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
-        own = not args or args[0] not in self.commands
-        if own and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
+        is_file = not args or args[0] not in self.commands
+        if is_file and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
             self._check_host(ctx, *args[:2])
-        return super().parse_args(ctx, [DEFAULT, *args] if own else args)
+        return super().parse_args(ctx, [DEFAULT, *args] if is_file else args)
 
     def _check_host(self, ctx: click.Context, word: str, after: str = "-") -> None:
         """Refuse a word that is more probably a command, or a wizard, than the name of a host."""
@@ -88,8 +88,8 @@ class GroupWithDefault(ListedGroup):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command, and the arguments that are left for it."""
-        name, command, rest = super().resolve_command(ctx, args)
-        return (None if name == DEFAULT else name), command, rest
+        name, command, arguments = super().resolve_command(ctx, args)
+        return (None if name == DEFAULT else name), command, arguments
 
 
 def _svg(_context: object, _option: object, path: str | None) -> str | None:
@@ -151,22 +151,24 @@ async def compare(
             f"{a} and {b}: expected as many cameras in both, got {len(first.lenses)} and "
             f"{len(second.lenses)}"
         )
-    found = [
-        compare_lenses(one, other, distance=distance)
-        for one, other in zip(first.lenses, second.lenses, strict=True)
+    comparisons = [
+        compare_lenses(lens, other, distance=distance)
+        for lens, other in zip(first.lenses, second.lenses, strict=True)
     ]
-    for name, comparison in zip(first.names, found, strict=True):
+    for name, comparison in zip(first.names, comparisons, strict=True):
         options.show(_data(name, comparison), _text(name, comparison))
-    neighbours = zip(first.transforms, second.transforms, itertools.pairwise(found), strict=True)
-    for one, other, pair in neighbours:
-        turn, shift = rig_difference(one, other, *pair)
-        between = f"{one.target} to {one.source}"
+    neighbours = zip(
+        first.transforms, second.transforms, itertools.pairwise(comparisons), strict=True
+    )
+    for first_lens, other, pair in neighbours:
+        turn, shift = rig_difference(first_lens, other, *pair)
+        between = f"{first_lens.target} to {first_lens.source}"
         value = {"between": between, "turn_deg": math.degrees(turn), "shift_mm": 1e3 * shift}
         text = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
         options.show(value, text)
     if svg is not None:
-        _draw(svg, first.names, found, f"{a} and {b}")
-    if any(one.same is False for one in found):
+        _draw(svg, first.names, comparisons, f"{a} and {b}")
+    if any(comparison.same is False for comparison in comparisons):
         raise SystemExit(DIFFERENT)
 
 
@@ -187,17 +189,20 @@ async def compare(
 )
 @click.option(
     "--what",
+    "drawing",
     type=click.Choice(["views", "scene", "uncertainty", "plane"]),
     help="What to draw.  [default: views; of a plane the plane]",
 )
 @distance_option
 @runs(*OUTPUT)
-async def draw(file: str, output: str, what: Any, distance: float | None, options: Options) -> None:
+async def draw(
+    file: str, output: str, drawing: Any, distance: float | None, options: Options
+) -> None:
     """Draw a calibration."""
     from smartcam.calibration._inside import draw_file
 
     with naming(file):
-        drawn = draw_file(file, what, distance)
+        drawn = draw_file(file, drawing, distance)
     _write(output, drawn)
     options.show({"file": output}, output)
 
@@ -209,30 +214,30 @@ def _read(path: str, unit: LengthUnit | None) -> StoredLenses:
         return read_lenses(path, unit=unit)
 
 
-def _data(name: str, one: LensComparison) -> dict[str, Any]:
-    turn, shift = _motion(one)
+def _data(name: str, comparison: LensComparison) -> dict[str, Any]:
+    turn, shift = _motion(comparison)
     return {
         "camera": name,
-        "same": one.same,
-        "ratio": one.ratio,
-        "chance": one.chance,
-        "distance_m": one.distance,
-        "difference_px": _numbers(one.observed),
-        "predicted_px": None if one.predicted is None else _numbers(one.predicted),
+        "same": comparison.same,
+        "ratio": comparison.ratio,
+        "chance": comparison.chance,
+        "distance_m": comparison.distance,
+        "difference_px": _numbers(comparison.observed),
+        "predicted_px": None if comparison.predicted is None else _numbers(comparison.predicted),
         "turn_deg": turn,
         "shift_mm": shift,
     }
 
 
-def _text(name: str, one: LensComparison) -> str:
-    rows = [_row("difference", one.observed)]
-    if one.predicted is not None:
-        rows.append(_row("from noise", one.predicted))
-    turn, shift = _motion(one)
-    where = "at infinity" if one.distance is None else f"at {one.distance:g} m"
+def _text(name: str, comparison: LensComparison) -> str:
+    rows = [_row("difference", comparison.observed)]
+    if comparison.predicted is not None:
+        rows.append(_row("from noise", comparison.predicted))
+    turn, shift = _motion(comparison)
+    where = "at infinity" if comparison.distance is None else f"at {comparison.distance:g} m"
     return "\n".join(
         [
-            f"{name}: {one.verdict}",
+            f"{name}: {comparison.verdict}",
             table_text(("", *COLUMNS), rows),
             f"  pixels, of a coordinate, {where}; after a turn of {turn:.3g} degrees and a shift "
             f"of {shift:.3g} mm",
@@ -242,30 +247,35 @@ def _text(name: str, one: LensComparison) -> str:
 
 def _numbers(figures: MapFigures) -> dict[str, float | None]:
     """Return the figures for JSON, which knows no NaN."""
-    return {name: one if math.isfinite(one) else None for name, one in figures._asdict().items()}
+    return {
+        name: figure if math.isfinite(figure) else None
+        for name, figure in figures._asdict().items()
+    }
 
 
 def _row(name: str, figures: MapFigures) -> list[object]:
     return [
         name,
-        *(round(float(f"{one:.3g}"), 6) if math.isfinite(one) else "-" for one in figures),
+        *(round(float(f"{figure:.3g}"), 6) if math.isfinite(figure) else "-" for figure in figures),
     ]
 
 
-def _motion(one: LensComparison) -> tuple[float, float]:
-    cosine = (float(one.motion.rotation.trace()) - 1.0) / 2.0
+def _motion(comparison: LensComparison) -> tuple[float, float]:
+    cosine = (float(comparison.motion.rotation.trace()) - 1.0) / 2.0
     turn = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
-    return turn, 1e3 * math.hypot(*one.motion.translation)
+    return turn, 1e3 * math.hypot(*comparison.motion.translation)
 
 
-def _draw(path: str, names: Sequence[str], found: Sequence[LensComparison], title: str) -> None:
+def _draw(
+    path: str, names: Sequence[str], comparisons: Sequence[LensComparison], title: str
+) -> None:
     from smartcam.calibration import draw_uncertainty
 
-    for name, one in zip(names, found, strict=True):
+    for name, comparison in zip(names, comparisons, strict=True):
         file = Path(path)
-        if len(found) > 1:
+        if len(comparisons) > 1:
             file = file.with_stem(f"{file.stem}-{name}")
-        _write(str(file), draw_uncertainty(one, title=f"{title}: {name}"))
+        _write(str(file), draw_uncertainty(comparison, title=f"{title}: {name}"))
 
 
 def _write(path: str, drawn: str) -> None:

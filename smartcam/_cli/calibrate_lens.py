@@ -45,8 +45,8 @@ class Collecting:
         """Add a view if the target is still, and at a new place; return whether it was added."""
         last, self._last = self._last, view
         still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
-        far = MIN_NEW_VIEW_SHARE * view.size[0]
-        if not still or any(_apart(one, view) < far for one in self.views):
+        least_distance = MIN_NEW_VIEW_SHARE * view.size[0]
+        if not still or any(_apart(earlier, view) < least_distance for earlier in self.views):
             return False
         self.views.append(view)
         return True
@@ -56,15 +56,15 @@ class Collecting:
         self._last = None
 
 
-def _apart(one: TargetView, other: TargetView) -> float:
+def _apart(first: TargetView, other: TargetView) -> float:
     """Return the distance of common points in pixels, root of the mean square."""
     import numpy as np
 
-    _, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
-    if not len(here):
+    _, index, other_index = np.intersect1d(first.ids, other.ids, return_indices=True)
+    if not len(index):
         return np.inf
-    off = one.points[here] - other.points[there]
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
+    distances = first.points[index] - other.points[other_index]
+    return float(np.sqrt((distances**2).sum(axis=1).mean()))
 
 
 def _output(_context: object, _option: object, file: str) -> str:
@@ -130,7 +130,7 @@ async def lens(
     """Calibrate a lens."""
     from smartcam.calibration import calibrate_intrinsics
 
-    sources = [one for one in pictures if is_source(one)]
+    sources = [picture for picture in pictures if is_source(picture)]
     if sources and len(pictures) > 1:
         raise click.UsageError("expected files and folders, or one URL")
     if not sources and (options.count or options.seconds):
@@ -143,13 +143,13 @@ async def lens(
                 views = await _from_source(source, described, options)
         else:
             views = await _from_files(pictures, described, options)
-        found = await asyncio.to_thread(
+        calibration = await asyncio.to_thread(
             calibrate_intrinsics, views, distortion_model=model, sheet=sheet
         )
-        await asyncio.to_thread(_save, output, found)
+        await asyncio.to_thread(_save, output, calibration)
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
-    options.show(_value(output, found), _text(output, found))
+    options.show(_value(output, calibration), _text(output, calibration))
 
 
 def read_target(path: str) -> Target:
@@ -196,18 +196,18 @@ async def _from_files(
 
 
 def _files(pictures: Sequence[str]) -> Iterator[Path]:
-    """Yield the named files, and those of folders in the order of their numbers."""
+    """Yield the named files, and the files of folders in the order of their numbers."""
     from smartcam._natural import natural
     from smartcam.calibration._inside import SUFFIXES
 
-    for one in map(Path, pictures):
-        if not one.is_dir():
-            yield one
+    for path in map(Path, pictures):
+        if not path.is_dir():
+            yield path
             continue
-        inside = [file for file in one.iterdir() if file.suffix.lower() in SUFFIXES]
+        inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
         if not inside:
             raise ConfigurationError(
-                f"{one}: expected pictures ({', '.join(sorted(SUFFIXES))}), found none"
+                f"{path}: expected pictures ({', '.join(sorted(SUFFIXES))}), found none"
             )
         yield from sorted(inside, key=lambda file: natural(file.name))
 
@@ -268,42 +268,46 @@ def _report_once(error: CalibrationError, reported: set[str]) -> None:
 def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
     points = 0 if view is None else len(view.ids)
     value = {"picture": name, "used": view is not None, "points": points, "reason": why}
-    found = "; ".join([f"{points} points", *(one.text for one in view.warnings)]) if view else ""
-    options.show(value, f"{name}: {found or f'not used: {why}'}")
+    seen_text = (
+        "; ".join([f"{points} points", *(warning.text for warning in view.warnings)])
+        if view
+        else ""
+    )
+    options.show(value, f"{name}: {seen_text or f'not used: {why}'}")
 
 
-def _save(output: str, found: IntrinsicCalibration) -> None:
+def _save(output: str, calibration: IntrinsicCalibration) -> None:
     from smartcam.calibration.formats import write_camera_info
 
     if Path(output).suffix.lower() == ".json":
-        found.save(output)
+        calibration.save(output)
     else:
-        write_camera_info(output, found.camera)
+        write_camera_info(output, calibration.camera)
 
 
-def _value(output: str, found: IntrinsicCalibration) -> dict[str, Any]:
+def _value(output: str, calibration: IntrinsicCalibration) -> dict[str, Any]:
     """Return the calibration as values for JSON."""
-    matrix = found.camera.matrix
+    matrix = calibration.camera.matrix
     return {
         "file": output,
-        "views": len(found.views),
-        "held_out_px": found.held_out,
-        "rms_px": found.rms,
+        "views": len(calibration.views),
+        "held_out_px": calibration.held_out,
+        "rms_px": calibration.rms,
         "lens": {
             "fx": matrix[0, 0],
             "fy": matrix[1, 1],
             "cx": matrix[0, 2],
             "cy": matrix[1, 2],
         },
-        "deviations": found.deviations,
-        "distortion": found.camera.distortion.tolist(),
-        "lacking": list(found.coverage.lacking),
-        "remarks": [f"{one.code}: {one.text}" for one in found.warnings],
+        "deviations": calibration.deviations,
+        "distortion": calibration.camera.distortion.tolist(),
+        "lacking": list(calibration.coverage.lacking),
+        "remarks": [f"{warning.code}: {warning.text}" for warning in calibration.warnings],
     }
 
 
-def _text(output: str, found: IntrinsicCalibration) -> str:
-    value = _value(output, found)
+def _text(output: str, calibration: IntrinsicCalibration) -> str:
+    value = _value(output, calibration)
     rows = [
         (name, round(number, 3), round(value["deviations"].get(name, 0.0), 3))
         for name, number in value["lens"].items()
@@ -313,8 +317,8 @@ def _text(output: str, found: IntrinsicCalibration) -> str:
         table_text(("", "pixels", "sigma"), rows),
     ]
     if value["lacking"]:
-        lines.append(f"  lacking: {', '.join(_LACKING[one] for one in value['lacking'])}")
-    lines += [f"  {one}" for one in value["remarks"]]
+        lines.append(f"  lacking: {', '.join(_LACKING[region] for region in value['lacking'])}")
+    lines += [f"  {remark}" for remark in value["remarks"]]
     return "\n".join(lines)
 
 

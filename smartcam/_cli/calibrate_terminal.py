@@ -87,7 +87,10 @@ def _resumed_text(resumed: Mapping[str, Any]) -> str:
         "was touched or seen then counts as it was: begin anew if camera, marks or sheet may have "
         "been moved since."
     )
-    rows = [f"  {number}. {_done_text(one)}" for number, one in enumerate(resumed["done"], 1)]
+    rows = [
+        f"  {number}. {_done_text(step_done)}"
+        for number, step_done in enumerate(resumed["done"], 1)
+    ]
     return "\n".join(["", *textwrap.wrap(text, WIDTH), *rows])
 
 
@@ -134,9 +137,9 @@ async def _do(session: WizardSession, command: str, token: str) -> dict[str, Any
 
 async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
     try:
-        asked = json.loads(line)
-        token = asked.get("token", session.token)
-        answers, command = asked.get("answers"), asked.get("do")
+        request = json.loads(line)
+        token = request.get("token", session.token)
+        answers, command = request.get("answers"), request.get("do")
     except (ValueError, RecursionError, AttributeError) as exc:
         raise ConfigurationError(
             f'a line of input: expected {{"answers": {{...}}}}, got {line[:64]!r}'
@@ -160,14 +163,14 @@ async def _from_prompts(
     """Ask for a step's answers, one by one, until it is left; earlier answers are defaults."""
     token, can = view["token"], view["can"]
     answers = dict(view["defaults"])
-    wanted = [one.name for one in step.inputs]
+    wanted = [field.name for field in step.inputs]
     while view["token"] == token:
-        for one in step.inputs:
-            if one.name in wanted:
-                value = await _answer(one, answers, can, lines)
+        for field in step.inputs:
+            if field.name in wanted:
+                value = await _answer(field, answers, can, lines)
                 if isinstance(value, _Instead):
                     return await _do(session, value.name, token)
-                answers[one.name] = value
+                answers[field.name] = value
         if not step.inputs:
             typed = await _typed(f"{step.button}: press Enter", can, lines)
             if isinstance(typed, _Instead):
@@ -183,22 +186,22 @@ async def _from_prompts(
 
 
 async def _answer(
-    one: Input, answers: Mapping[str, Any], can: Collection[str], lines: Lines
+    field: Input, answers: Mapping[str, Any], can: Collection[str], lines: Lines
 ) -> Any | _Instead:
     """Return an answer that the step accepts, or a command; ask again after a wrong one."""
-    schema = one.schema()
-    prompt = _prompt(schema, answers.get(one.name))
+    schema = field.schema()
+    prompt = _prompt(schema, answers.get(field.name))
     while True:
         text = await _typed(prompt, can, lines)
         if isinstance(text, _Instead):
             return text
-        if not text and one.name in answers:
-            return answers[one.name]
+        if not text and field.name in answers:
+            return answers[field.name]
         try:
-            return one.checked(_value(schema, text))
+            return field.checked(_value(schema, text))
         except ValueError as exc:
             wrong = f"{text!r}: expected yes or no" if schema["type"] == "boolean" else exc
-            click.echo(f"! {one.label}: {wrong}")
+            click.echo(f"! {field.label}: {wrong}")
 
 
 async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Instead:
@@ -211,7 +214,7 @@ async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Inst
             return text
         if command in can:
             return _Instead(command)
-        click.echo(f"! :{command}: expected one of {', '.join(f':{one}' for one in can)}")
+        click.echo(f"! :{command}: expected one of {', '.join(f':{command}' for command in can)}")
 
 
 # ---------------------------------------------------------------------- texts
@@ -220,7 +223,7 @@ async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Inst
 def _prompt(schema: Mapping[str, Any], default: Any) -> str:
     unit = f", {schema['x-unit']}" if "x-unit" in schema else ""
     shown = "" if default in {None, ""} else f" [{_default_text(default)}]"
-    rows = [f"    {one['const']}: {one['title']}\n" for one in schema.get("oneOf", ())]
+    rows = [f"    {choice['const']}: {choice['title']}\n" for choice in schema.get("oneOf", ())]
     head = f"{schema['title']}{unit}"
     return f"{head}\n{''.join(rows)}  answer{shown}" if rows else f"{head}{shown}"
 
@@ -247,7 +250,7 @@ def _value(schema: Mapping[str, Any], text: str) -> Any:
 
 
 def _step_text(view: Mapping[str, Any], picture: Path | None = None) -> str:
-    commands = ", ".join(f":{one}" for one in view["can"])
+    commands = ", ".join(f":{command}" for command in view["can"])
     about = f" of about {view['of']}" if view["of"] else ""
     head = f"Step {view['number']}{about}: {view['title']}  ({commands})"
     lines = ["", head, *_verdict_lines(view)]
@@ -295,8 +298,8 @@ def _end_text(view: Mapping[str, Any]) -> str:
     result = dict(view["result"])
     use, remarks = result.pop("use", {}), result.pop("remarks", [])
     rows = [f"  {name}: {_result_text(value)}" for name, value in result.items()]
-    for one in remarks:
-        rows += _note_lines(one if isinstance(one, str) else ": ".join(one))
+    for remark in remarks:
+        rows += _note_lines(remark if isinstance(remark, str) else ": ".join(remark))
     for name, text in use.items():
         rows += ["", _USES[name], "", text.rstrip("\n")]
     return "\n".join(["", "done", *_verdict_lines(view), *rows])

@@ -30,7 +30,7 @@ def install(shell: str) -> str:
     """Add the missing lines to the shell's file, and return a report.
 
     Args:
-        shell: name of the shell; "": that of the variable SHELL.
+        shell: name of the shell; "": the shell of the variable SHELL.
 
     Raises:
         click.UsageError: the shell is unknown, or its file cannot be written.
@@ -70,8 +70,8 @@ def _file_of(shell: str) -> Path:
 def _append(path: Path, lines: list[str]) -> int:
     """Append the lines that a file lacks; return their number."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
-    there = text.splitlines()
-    lacking = [line for line in lines if line not in there]
+    rc_lines = text.splitlines()
+    lacking = [line for line in lines if line not in rc_lines]
     if lacking:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as stream:

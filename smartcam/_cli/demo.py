@@ -101,18 +101,18 @@ async def _localize(camera: smartcam.Camera, emulator: EmulatedCamera, steps: St
     rows: list[tuple[object, ...]] = []
     for part in result.value:
         piece, position = truth[part.feature_id], part.pose.position
-        found, true = part.pose.orientation.theta, piece.theta
-        off = 1e3 * math.hypot(position.x - piece.x, position.y - piece.y)
+        measured, true = part.pose.orientation.theta, piece.theta
+        distance = 1e3 * math.hypot(position.x - piece.x, position.y - piece.y)
         rows.append(
             (
                 part.feature_id,
                 position.x,
                 position.y,
-                math.degrees(found),
+                math.degrees(measured),
                 piece.x,
                 piece.y,
                 math.degrees(math.remainder(true, 2 * math.pi)),
-                f"{off:.2f} mm",
+                f"{distance:.2f} mm",
             )
         )
     head = ("part", "x", "y", "theta", "true x", "true y", "true theta", "off by")

@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 SHARED = "line1/cam1"
 CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
-"""For each agent, the line of its cameras and their number."""
+"""Line of the cameras and their number, for each agent."""
 
 BY_ROBOT, BY_HAND = 9, 3
 """Triggers of two programs at the same time."""
 
-PATIENCE_TIMEOUT = 30.0
+STEP_TIMEOUT = 30.0
 """Seconds for any step; only a failure takes as long."""
 
-SOON_TIMEOUT = 0.3
+RESERVED_TIMEOUT = 0.3
 """Seconds that a program waits for a camera that another program has reserved."""
 
 
@@ -47,7 +47,7 @@ async def demo(options: Options) -> None:
     steps = Steps(options)
     (endpoint,) = with_ports(["tcp/127.0.0.1:0"])
     url = f"fleet://{endpoint.partition('/')[2]}"
-    async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * PATIENCE_TIMEOUT):
+    async with contextlib.AsyncExitStack() as stack, asyncio.timeout(4 * STEP_TIMEOUT):
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         agents: dict[str, Process] = {}
         for name, place in (("north", "listen"), ("south", "connect")):
@@ -88,7 +88,7 @@ async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
     )
     try:
         for _ in range(cameras):
-            async with asyncio.timeout(PATIENCE_TIMEOUT):
+            async with asyncio.timeout(STEP_TIMEOUT):
                 line = await process.stdout.readline() if process.stdout is not None else b""
             if not line:
                 raise ConnectionLostError(f"the agent of {file.name} did not start")
@@ -98,7 +98,7 @@ async def _agent(file: Path, cameras: int) -> AsyncGenerator[Process]:
             with contextlib.suppress(ProcessLookupError):
                 process.terminate()
         try:
-            async with asyncio.timeout(PATIENCE_TIMEOUT):
+            async with asyncio.timeout(STEP_TIMEOUT):
                 await process.wait()
         except TimeoutError:
             process.kill()
@@ -109,12 +109,12 @@ def _show_fleet(fleet: Fleet, steps: Steps) -> None:
     cameras = fleet.cameras()
     steps.step(f"The whole fleet by one URL, {len(cameras)} cameras:", agents=fleet.agents())
     rows = [
-        (one.name, *fleet.agents(one.name), one.active_application, str(one.status))
-        for one in cameras
+        (camera.name, *fleet.agents(camera.name), camera.active_application, str(camera.status))
+        for camera in cameras
     ]
     steps.detail(
         table_text(("camera", "agent", "application", "status"), rows),
-        cameras=[one.url for one in cameras],
+        cameras=[camera.url for camera in cameras],
     )
 
 
@@ -128,12 +128,12 @@ async def _share(
     statuses, recorded = dashboard.statuses(), recorder.results()
 
     async def trigger(camera: smartcam.Camera, times: int) -> list[int]:
-        return [(await camera.trigger(timeout=PATIENCE_TIMEOUT)).number for _ in range(times)]
+        return [(await camera.trigger(timeout=STEP_TIMEOUT)).number for _ in range(times)]
 
     async def record() -> list[int]:
         return [(await anext(recorded)).number for _ in range(BY_ROBOT + BY_HAND)]
 
-    async with asyncio.timeout(PATIENCE_TIMEOUT), asyncio.TaskGroup() as group:
+    async with asyncio.timeout(STEP_TIMEOUT), asyncio.TaskGroup() as group:
         recording = group.create_task(record())
         moving = group.create_task(trigger(robot, BY_ROBOT))
         pressing = group.create_task(trigger(dashboard, BY_HAND))
@@ -159,21 +159,23 @@ async def _reserve(camera: FleetCamera[Any], other: smartcam.Camera, steps: Step
     steps.step(
         f"One program has {SHARED} for itself; the dashboard's trigger waits, and says for whom:"
     )
-    async with camera.reserve(PATIENCE_TIMEOUT):
+    async with camera.reserve(STEP_TIMEOUT):
         try:
-            await other.trigger(timeout=SOON_TIMEOUT)
+            await other.trigger(timeout=RESERVED_TIMEOUT)
         except SmartCamError as exc:
             steps.detail(f"   {exc}", error=type(exc).__name__, reason=str(exc))
-    result = await other.trigger(timeout=PATIENCE_TIMEOUT)
+    result = await other.trigger(timeout=STEP_TIMEOUT)
     steps.detail(f"   and when it is given back: result {result.number}", number=result.number)
 
 
 async def _trigger_all(fleet: Fleet, steps: Steps) -> None:
     loop = asyncio.get_running_loop()
     begin = loop.time()
-    outcomes = await fleet.trigger(timeout=PATIENCE_TIMEOUT)
+    outcomes = await fleet.trigger(timeout=STEP_TIMEOUT)
     taken = loop.time() - begin
-    results: list[Result] = [one for one in outcomes.values() if not isinstance(one, SmartCamError)]
+    results: list[Result] = [
+        outcome for outcome in outcomes.values() if not isinstance(outcome, SmartCamError)
+    ]
     steps.step(
         f"All cameras triggered at once: {len(results)} results of {len(outcomes)} cameras after "
         f"{1e3 * taken:.0f} ms, each inspection about {1e3 * (results[0].latency or 0):.0f} ms",
@@ -189,7 +191,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Ste
     begin = loop.time()
     agent.kill()
     left: list[str] = []
-    async with asyncio.timeout(PATIENCE_TIMEOUT):
+    async with asyncio.timeout(STEP_TIMEOUT):
         while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS_OF_AGENT["south"][1]:
             left.append(type(await anext(events)).__name__)
     gone = left.count("CameraLeft")
@@ -199,7 +201,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, steps: Ste
         gone=gone,
         left=len(fleet),
     )
-    result = await robot.trigger(timeout=PATIENCE_TIMEOUT)
+    result = await robot.trigger(timeout=STEP_TIMEOUT)
     steps.detail(f"   the robot goes on: result {result.number}", number=result.number)
 
 
@@ -212,7 +214,7 @@ async def _drain(events: Any) -> None:
 async def _end(agent: Process, robot: smartcam.Camera, steps: Steps) -> None:
     gone = robot.events()
     agent.terminate()
-    async with asyncio.timeout(PATIENCE_TIMEOUT):
+    async with asyncio.timeout(STEP_TIMEOUT):
         while not isinstance(await anext(gone), smartcam.Disconnected):
             pass
         await agent.wait()

@@ -117,11 +117,11 @@ async def inspect(options: Options, folder: Path, seed: int) -> None:
     parts: list[dict[str, Any]] = []
     for part in PARTS:
         picture = await asyncio.to_thread(Picture.read, folder / "pictures" / f"{part.name}.png")
-        found = await asyncio.to_thread(check.inspect, picture)
+        inspection = await asyncio.to_thread(check.inspect, picture)
         with naming(f"--folder {folder}"):
-            await asyncio.to_thread(_draw, folder / "seen" / f"{part.name}.png", found)
-        wrong = [name for name, one in found.findings.items() if not one.ok]
-        milliseconds = 1e3 * sum(found.seconds.values())
+            await asyncio.to_thread(_draw, folder / "seen" / f"{part.name}.png", inspection)
+        wrong = [name for name, finding in inspection.findings.items() if not finding.ok]
+        milliseconds = 1e3 * sum(inspection.seconds.values())
         rows.append(
             (part.name, part.fault or "none", ", ".join(wrong) or "none", f"{milliseconds:.1f} ms")
         )
@@ -146,8 +146,8 @@ def _write(folder: Path, seed: int) -> None:
     (folder / "cell.yaml").write_text(CELL, encoding="utf-8")
 
 
-def _draw(path: Path, found: Inspection) -> None:
-    _save(path, found.drawn()[:, :, ::-1])
+def _draw(path: Path, inspection: Inspection) -> None:
+    _save(path, inspection.drawn()[:, :, ::-1])
 
 
 def _save(path: Path, pixels: NDArray[Any]) -> None:

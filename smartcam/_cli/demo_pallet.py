@@ -2,8 +2,8 @@
 
 A part and a mark are taught from drawn pictures. The robot touches the mark at nine places, and
 these pairs give the calibration. Then the tool ``locate`` gives each part's pose in the
-robot's frame, and its uncertainty. The robot's actions are compared with the truth, which a
-real cell does not know.
+robot's frame, and its uncertainty. The robot's actions are compared with the true poses,
+which are unknown in a real cell.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ async def _run(demo: _Demo) -> None:
         empty = (await camera.trigger(timeout=timeout)).value
         reason = empty.reason or f"{len(empty.locate)} found"
         steps.step(f"Triggered once more: {reason}.", reason=reason, left=len(table.parts))
-    errors = [one.error for one in placed]
-    beside = [one.off_place for one in placed if one.taken]
+    errors = [part.error for part in placed]
+    beside = [part.off_place for part in placed if part.taken]
     steps.detail(
         f"   error {1e3 * _rms(errors):.3f} mm rms, predicted {1e3 * _rms(expected):.3f} mm; "
         f"{len(beside)} of {len(pattern)} places filled, parts lie {1e3 * _rms(beside):.2f} mm rms "
@@ -146,8 +146,8 @@ async def _run(demo: _Demo) -> None:
         places=len(pattern),
     )
     steps.step(
-        f"Models, calibration, cell file and pictures stand in {demo.folder}. Try on them what you "
-        "change:"
+        f"Models, calibration, cell file and pictures are in {demo.folder}. Try changed settings "
+        "on the pictures:"
     )
     cell, to = demo.folder / CELL_FILE, demo.folder / "judged"
     steps.detail(f"   smartcam inspect {cell} desk/camera 1 {to}")
@@ -248,22 +248,24 @@ def _palletize(
     """Move every part that was found to the next place, and print the errors."""
     rows: list[tuple[object, ...]] = []
     for part in value.locate:
-        number = sum(one.taken for one in placed)
+        number = sum(part.taken for part in placed)
         if number == len(pattern):
             break
-        found = (part.x, part.y, part.theta)
+        pose = (part.x, part.y, part.theta)
         sigma = math.hypot(part.sigma_x, part.sigma_y)
-        one = demo.robot.palletize(found, grip, pattern, number)
-        placed.append(one)
+        palletized = demo.robot.palletize(pose, grip, pattern, number)
+        placed.append(palletized)
         expected.append(sigma)
         rows.append(
             (
                 *(f"{1e3 * length:.2f}".rjust(8) for length in (part.x, part.y)),
-                *(f"{1e3 * length:.3f}" for length in (one.error, sigma)),
-                f"{math.degrees(one.turned):+.3f}",
+                *(f"{1e3 * length:.3f}" for length in (palletized.error, sigma)),
+                f"{math.degrees(palletized.turned):+.3f}",
                 f"{math.degrees(part.sigma_theta):.3f}",
-                "/".join(str(1 + count) for count in pattern.at(number)) if one.taken else "missed",
-                f"{1e3 * one.off_place:.2f}",
+                "/".join(str(1 + count) for count in pattern.at(number))
+                if palletized.taken
+                else "missed",
+                f"{1e3 * palletized.off_place:.2f}",
             )
         )
     demo.steps.step(

@@ -94,11 +94,11 @@ class SimulatedRobot:
 
         pose = part.pose
         gripper = Transform.from_quaternion("robot", "part", pose.position, pose.orientation)
-        found = self.table.inverse() @ gripper
-        x, y, z = found.translation.tolist()
+        pose_on_table = self.table.inverse() @ gripper
+        x, y, z = pose_on_table.translation.tolist()
         true = self._scene.pieces[part.feature_id]
         error = math.dist((x, y, z), (true.x, true.y, 0.0))
-        heading = math.atan2(found.rotation[1, 0], found.rotation[0, 0])
+        heading = math.atan2(pose_on_table.rotation[1, 0], pose_on_table.rotation[0, 0])
         turned = math.remainder(heading - true.theta, math.tau)
         taken = error < GRIP
         if taken:

@@ -100,7 +100,7 @@ KINDS: Final[dict[str, tuple[PaintedShape, ...]]] = {
 
 def radius_of(kind: str) -> float:
     """Return the distance of the farthest edge of a part from its own frame's origin, metres."""
-    return max(float(np.linalg.norm(one.corners, axis=1).max()) for one in KINDS[kind])
+    return max(float(np.linalg.norm(shape.corners, axis=1).max()) for shape in KINDS[kind])
 
 
 class TablePart(NamedTuple):
@@ -205,11 +205,11 @@ class DrawnTable:
         ``taught``: the part as it lay in the picture that was taught; ``reference``: the place of
         the model's reference there, pixels. A real cell does not know this true pose.
         """
-        there = self._on_table(*reference)
+        at = self._on_table(*reference)
         ahead = self._on_table(reference[0] + 1.0, reference[1])
-        angle = math.atan2(ahead[1] - there[1], ahead[0] - there[0]) - taught.pose.theta
+        angle = math.atan2(ahead[1] - at[1], ahead[0] - at[0]) - taught.pose.theta
         cos, sin = math.cos(taught.pose.theta), math.sin(taught.pose.theta)
-        x, y = there[0] - taught.pose.x, there[1] - taught.pose.y
+        x, y = at[0] - taught.pose.x, at[1] - taught.pose.y
         return TablePose(cos * x + sin * y, cos * y - sin * x, angle)
 
     def _on_table(self, u: float, v: float) -> tuple[float, float]:
@@ -287,8 +287,10 @@ class TableRobot:
         self._true = self._level("table", 0.0)
         self._pallet = self._level("pallet", 0.8)
 
-    def _level(self, name: str, far: float) -> Transform:
-        x, y, z, turn = self._random.uniform([far - 0.2, -0.4, 0, -3], [far + 0.2, 0.4, 0.3, 3])
+    def _level(self, name: str, distance: float) -> Transform:
+        x, y, z, turn = self._random.uniform(
+            [distance - 0.2, -0.4, 0, -3], [distance + 0.2, 0.4, 0.3, 3]
+        )
         cos, sin = math.cos(turn), math.sin(turn)
         rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         return Transform("robot", name, rotation, np.array([x, y, z]))
@@ -307,42 +309,42 @@ class TableRobot:
 
     def palletize(
         self,
-        found: tuple[float, float, float],
+        pose: tuple[float, float, float],
         grip: TablePose,
         pattern: PlacePattern,
         number: int,
     ) -> Placed:
         """Pick the part that is nearest to a found pose, and put it onto a place of the pallet.
 
-        ``found``: x and y (metres) and heading of the part's reference in the robot's frame;
+        ``pose``: x and y (metres) and heading of the part's reference in the robot's frame;
         ``grip``: the true pose of the reference in the part's frame.
         """
-        off, part = min(
-            ((self._off(one, found, grip), one) for one in self._table.parts),
+        offset, part = min(
+            ((self._off(part, pose, grip), part) for part in self._table.parts),
             key=lambda pair: abs(pair[0][0]),
         )
-        error, turned = abs(off[0]), off[1]
+        error, turned = abs(offset[0]), offset[1]
         if error > GRIP:
-            return Placed(found[0], found[1], error, turned, False, math.nan)
+            return Placed(pose[0], pose[1], error, turned, False, math.nan)
         self._table.parts.remove(part)
         row, column, layer = pattern.at(number)
         true = self._pallet.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
         # the part keeps its place in the gripper, and moves along with it
         place = pattern[number]
-        held = place.rotation[:2, :2] @ _turned([off[0].real, off[0].imag], -found[2])
+        held = place.rotation[:2, :2] @ _turned([offset[0].real, offset[0].imag], -pose[2])
         off_place = float(np.linalg.norm(place.translation[:2] + held - true[:2]))
-        return Placed(found[0], found[1], error, turned, True, off_place)
+        return Placed(pose[0], pose[1], error, turned, True, off_place)
 
     def _off(
-        self, part: TablePart, found: tuple[float, float, float], grip: TablePose
+        self, part: TablePart, located: tuple[float, float, float], grip: TablePose
     ) -> tuple[complex, float]:
         """Return the offset of a part's reference from a pose, and the angle it is turned by."""
         pose = part.pose
         x, y = _turned([grip.x, grip.y], pose.theta).tolist()
-        there = self._true.apply([pose.x + x, pose.y + y, 0.0])
+        at = self._true.apply([pose.x + x, pose.y + y, 0.0])
         heading = pose.theta + grip.theta + math.atan2(*self._true.rotation[1::-1, 0])
-        off = complex(there[0] - found[0], there[1] - found[1])
-        return off, math.remainder(found[2] - heading, math.tau)
+        offset = complex(at[0] - located[0], at[1] - located[1])
+        return offset, math.remainder(located[2] - heading, math.tau)
 
 
 def _turned(place: Any, angle: float) -> Array:

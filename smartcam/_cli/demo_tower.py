@@ -34,7 +34,7 @@ PERSON: Final = {2: "add", 4: "remove"}
 OVERVIEW: Final = (0.38, 0.0, 0.75)
 """Place from which the camera sees the whole table, metres."""
 
-NEAR: Final = 0.25
+MEASURING_HEIGHT: Final = 0.25
 """Metres above the table at which the camera measures a block's pose."""
 
 ABOVE: Final = 0.45
@@ -145,7 +145,7 @@ class Seen(NamedTuple):
     """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # blocks that lie on the table
-    reached: list[BlockPose]  # those within reach of the gripper
+    reached: list[BlockPose]  # blocks within reach of the gripper
     block: BlockPose  # block to take
     top: BlockPose  # block on top of the tower
 
@@ -159,14 +159,14 @@ def _look(table: TowerTable, colours: ColourRange) -> Seen:
     overview = table.look(OVERVIEW)
     depth = SpatialFilter(delta=EDGE)(overview.depth[0])
     blocks = loose_blocks(overview, depth, colours)
-    reached = [one for one in blocks if REACH[0] <= math.hypot(one.x, one.y) <= REACH[1]]
+    reached = [block for block in blocks if REACH[0] <= math.hypot(block.x, block.y) <= REACH[1]]
     if not reached:
         raise FrameFormatError(
             f"{ARM}: expected a block within {REACH[0]:g} to {REACH[1]:g} m of the robot, got "
             f"{len(blocks)} that are not: nothing to pick",
             source=ARM,
         )
-    rough = min(reached, key=lambda one: math.hypot(one.x, one.y))
+    rough = min(reached, key=lambda block: math.hypot(block.x, block.y))
     block = measured_block(table, rough, colours)
     return Seen(blocks, reached, block, measured_top(table, *tower_place(overview, depth)))
 
@@ -219,10 +219,10 @@ def loose_blocks(
         FrameFormatError: there is no block of the colour; the error describes the largest region.
     """
     lying: list[BlockPose] = []
-    for one in _regions(sight, colours):
-        height = sight.camera[2] - region_depth(depth, one.mask).median
-        if abs(height - BLOCK[2]) < EDGE:  # it is not on the tower
-            lying.append(_pose(sight, one, height))
+    for region in _regions(sight, colours):
+        height = sight.camera[2] - region_depth(depth, region.mask).median
+        if abs(height - BLOCK[2]) < EDGE:  # the block is not on the tower
+            lying.append(_pose(sight, region, height))
     if not lying:
         raise _nothing(sight, colours)
     return lying
@@ -234,11 +234,11 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
     Raises:
         FrameFormatError: the block is not there.
     """
-    sight = table.look((rough.x, rough.y, NEAR), maps=0)
-    found = [_pose(sight, one, BLOCK[2]) for one in _regions(sight, colours)]
-    if not found:
+    sight = table.look((rough.x, rough.y, MEASURING_HEIGHT), maps=0)
+    poses = [_pose(sight, region, BLOCK[2]) for region in _regions(sight, colours)]
+    if not poses:
         raise _nothing(sight, colours)
-    block = min(found, key=lambda one: math.dist(one[:2], rough[:2]))
+    block = min(poses, key=lambda pose: math.dist(pose[:2], rough[:2]))
     beside = math.dist(block[:2], rough[:2])
     if beside > BLOCK[1] / 2:
         raise FrameFormatError(
@@ -268,9 +268,9 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     """
     sight = table.look((x, y, ABOVE), MAPS)
     average, smooth = TemporalFilter(delta=EDGE), SpatialFilter(delta=EDGE)
-    depth = smooth([average(one) for one in sight.depth][-1])
+    depth = smooth([average(depth) for depth in sight.depth][-1])
     middle = (sight.rgb.shape[1] / 2, sight.rgb.shape[0] / 2)
-    high = min(_high(sight, depth), key=lambda one: math.dist(one.centre, middle))
+    high = min(_high(sight, depth), key=lambda region: math.dist(region.centre, middle))
     level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of the region
     upper = high.mask & (np.abs(depth - level) < EDGE)
     top = find_regions(upper)[0]
@@ -303,14 +303,14 @@ def _area(sight: TableSight) -> tuple[float, float]:
 def _high(sight: TableSight, depth: NDArray[np.float32]) -> list[ColourRegion]:
     """Return the regions that are higher than one block, the largest first."""
     mask = (depth > 0) & (sight.camera[2] - depth > BLOCK[2] + EDGE)
-    found = find_regions(mask, area=(_area(sight)[0], math.inf))
-    if not found:
+    regions = find_regions(mask, area=(_area(sight)[0], math.inf))
+    if not regions:
         raise FrameFormatError(
             f"{ARM}: expected a tower, got nothing that is higher than a block of "
             f"{1e3 * BLOCK[2]:g} mm",
             source=ARM,
         )
-    return found
+    return regions
 
 
 def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -324,18 +324,22 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
     x, y = to_robot(sight.camera, *region.centre, height)
-    way = AXES @ (math.cos(region.orientation), math.sin(region.orientation), 0.0)
-    return BlockPose(x, y, math.remainder(math.atan2(way[1], way[0]), math.pi), height)
+    direction = AXES @ (math.cos(region.orientation), math.sin(region.orientation), 0.0)
+    return BlockPose(x, y, math.remainder(math.atan2(direction[1], direction[0]), math.pi), height)
 
 
 def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that describes the regions of a colour, none of which is a block."""
     least, most = _area(sight)
-    found = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
-    got = f"{len(found)} regions of it, the largest {_shape(found[0])}" if found else "none of it"
+    regions = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
+    actual = (
+        f"{len(regions)} regions of it, the largest {_shape(regions[0])}"
+        if regions
+        else "none of it"
+    )
     return FrameFormatError(
         f"{ARM}: expected a block on the table of the colour {colours.as_json()}, {least:.0f} to "
-        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {got}",
+        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {actual}",
         source=ARM,
     )
 
@@ -347,23 +351,28 @@ def _shape(region: ColourRegion) -> str:
 # ---------------------------------------------------------------------- comparison
 
 
-def _compared(what: str, found: BlockPose, true: WoodenBlock) -> Compared:
-    beside = math.hypot(found.x - true.x, found.y - true.y)
-    turned = math.remainder(found.angle - true.angle, math.pi)
-    return Compared(what, found, beside, turned, found.height - true.top)
+def _compared(label: str, measured: BlockPose, true: WoodenBlock) -> Compared:
+    beside = math.hypot(measured.x - true.x, measured.y - true.y)
+    turned = math.remainder(measured.angle - true.angle, math.pi)
+    return Compared(label, measured, beside, turned, measured.height - true.top)
 
 
 def _text(rows: list[Compared]) -> str:
-    head = ("mm, degrees", *(one.rjust(8) for one in ("x", "y", "angle", "height")))
-    off = [one.rjust(8) for one in ("beside", "turned", "higher", "sigma")]
+    head = ("mm, degrees", *(title.rjust(8) for title in ("x", "y", "angle", "height")))
+    titles = [title.rjust(8) for title in ("beside", "turned", "higher", "sigma")]
     cells: list[tuple[Any, ...]] = []
-    for what, found, beside, turned, higher in rows:
-        places = (1e3 * found.x, 1e3 * found.y, math.degrees(found.angle), 1e3 * found.height)
-        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * found.sigma)
-        known = errors if found.sigma else errors[:2]  # this height was not measured
+    for label, measured, beside, turned, higher in rows:
+        places = (
+            1e3 * measured.x,
+            1e3 * measured.y,
+            math.degrees(measured.angle),
+            1e3 * measured.height,
+        )
+        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * measured.sigma)
+        known = errors if measured.sigma else errors[:2]  # the height was not measured
         shown = [f"{value:8.2f}" for value in (*places, *known)]
-        cells.append((what, *shown, *[""] * (8 - len(shown))))
-    return table_text((*head, *off), cells)
+        cells.append((label, *shown, *[""] * (8 - len(shown))))
+    return table_text((*head, *titles), cells)
 
 
 def _judge(compared: list[Compared], table: TowerTable, steps: Steps) -> None:

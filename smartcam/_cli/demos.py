@@ -26,8 +26,8 @@ class PalletSize(_ParamType):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, int, int]:
         """Return rows, columns and layers."""
-        found = re.fullmatch(r"(\d{1,3})x(\d{1,3})x(\d{1,3})", str(value))
-        rows, columns, layers = map(int, found.groups()) if found else (0, 0, 0)
+        match = re.fullmatch(r"(\d{1,3})x(\d{1,3})x(\d{1,3})", str(value))
+        rows, columns, layers = map(int, match.groups()) if match else (0, 0, 0)
         if not (2 <= rows <= 12 and 2 <= columns <= 12 and 1 <= layers <= 10):
             self.fail(f"expected {self.name} from 2x2x1 to 12x12x10, got {value!r}", param, ctx)
         return rows, columns, layers
@@ -106,8 +106,8 @@ async def demo(
     options: Options,
 ) -> None:
     """Show smartcam's main job with an emulated camera over real TCP."""
-    asked = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
-    given = [name for name, wanted in asked.items() if wanted]
+    options_given = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
+    given = [name for name, wanted in options_given.items() if wanted]
     if len(given) > 1:
         raise click.UsageError(f"{' and '.join(given)} do not go together")
     if plain and not pick:

@@ -29,7 +29,7 @@ def _ranges(
     _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, float, float]]:
     """Return axis, low and high of ``AXIS:LOW:HIGH``; an empty limit is no limit."""
-    found = []
+    ranges = []
     for value in values:
         axis, _, limits = value.partition(":")
         low, colon, high = limits.partition(":")
@@ -39,8 +39,8 @@ def _ranges(
             ends = (math.nan, math.nan)
         if axis not in ("x", "y", "z") or not colon or not ends[0] <= ends[1]:
             raise click.BadParameter(f"expected AXIS:LOW:HIGH, such as z:0.2:1.5, got {value!r}")
-        found.append((axis, *ends))
-    return found
+        ranges.append((axis, *ends))
+    return ranges
 
 
 @click.group(

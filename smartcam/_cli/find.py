@@ -163,34 +163,34 @@ def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
         from smartcam.fleet import load_fleet
     from smartcam.settings import parse_address
 
-    found: dict[str, dict[str, str]] = {}
+    cameras: dict[str, dict[str, str]] = {}
     plan = load_fleet(path).plan()
     for planned in plan:
         if planned.entry.url is not None:
             address = parse_address(planned.entry.url, model=planned.entry.model)
-            found.setdefault(address.host, {})[planned.name] = address.url
-    return found, {planned.name for planned in plan}
+            cameras.setdefault(address.host, {})[planned.name] = address.url
+    return cameras, {planned.name for planned in plan}
 
 
 # ---------------------------------------------------------------------- showing
 
 
 def _show(
-    found: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
+    ports: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
 ) -> None:
     """Print the findings, and the addresses left alone, as a table or as JSON."""
     if options.as_json:
-        for one in found:
-            value = {name: getattr(one, name) for name in one.__dataclass_fields__}
+        for port in ports:
+            value = {name: getattr(port, name) for name in port.__dataclass_fields__}
             value["said"] = value.pop("received")
-            options.show({**value, "greeting": one.greeting, "urls": one.urls}, "")
+            options.show({**value, "greeting": port.greeting, "urls": port.urls}, "")
         for host, cameras in alone.items():
             for name, url in cameras.items():
                 options.show({"host": host, "url": url, "fleet_camera": name}, "")
-    elif found or alone:
+    elif ports or alone:
         rows = [
-            (one.host, str(one.port), ", ".join(one.protocols) or "-", _ms(one), evidence(one))
-            for one in found
+            (port.host, str(port.port), ", ".join(port.protocols) or "-", _ms(port), evidence(port))
+            for port in ports
         ]
         rows += [
             (host, "", "", "", f"not touched: it is {' and '.join(cameras)} of the fleet")
@@ -199,20 +199,20 @@ def _show(
         click.echo(table_text(("host", "port", "protocol", "opened", "what is known"), rows))
 
 
-def _ms(found: FoundPort) -> str:
-    return f"{found.seconds * 1e3:.1f} ms"
+def _ms(port: FoundPort) -> str:
+    return f"{port.seconds * 1e3:.1f} ms"
 
 
-def evidence(found: FoundPort) -> str:
+def evidence(port: FoundPort) -> str:
     """Return a line about the device that answers, or may answer, at an open port."""
-    if found.answer is not None:
-        return f"a camera answers: {found.answer.url}"
-    if found.evidence == "other":
-        heard = f"it says {found.greeting!r:.60}" if found.received else "it does not greet"
-        return f"another service: {heard}"
-    protocols = " or ".join(found.protocols)
-    text = _EVIDENCE[found.evidence].format(protocols=protocols, greeting=found.greeting[:60])
-    return f"{text}; asked: {found.refusal}" if found.refusal else text
+    if port.answer is not None:
+        return f"a camera answers: {port.answer.url}"
+    if port.evidence == "other":
+        greeting = f"it says {port.greeting!r:.60}" if port.received else "it does not greet"
+        return f"another service: {greeting}"
+    protocols = " or ".join(port.protocols)
+    text = _EVIDENCE[port.evidence].format(protocols=protocols, greeting=port.greeting[:60])
+    return f"{text}; asked: {port.refusal}" if port.refusal else text
 
 
 def summary(search: CameraSearch) -> str:
@@ -228,31 +228,31 @@ def summary(search: CameraSearch) -> str:
     return text
 
 
-def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
+def fleet_lines(ports: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
     """Return lines for a fleet file; devices that are no camera, or did not answer, are comments.
 
     ``taken``: names that the fleet uses already.
     """
     names, lines = set(taken), ["cameras:"]
     live = False
-    for one in found:
-        for nth, url in enumerate(one.urls):
-            name = _fresh(one, names)
-            sure = nth == 0 and not one.refusal
+    for port in ports:
+        for nth, url in enumerate(port.urls):
+            name = _fresh(port, names)
+            sure = nth == 0 and not port.refusal
             live = live or sure
             line = f'{name}: {{url: "{url}"}}'
             if sure:
                 names.add(name)
-            lines.append(f"  {'' if sure else '# '}{line}  # {evidence(one)}")
+            lines.append(f"  {'' if sure else '# '}{line}  # {evidence(port)}")
     if not live:
         lines[0] = "# cameras: none was found"
     return lines
 
 
-def _fresh(found: FoundPort, taken: set[str]) -> str:
+def _fresh(port: FoundPort, taken: set[str]) -> str:
     """Return a name for a camera, made from its address."""
-    host = re.sub(r"[^a-z0-9]", "-", found.host.lower())
-    base = f"found/{host}-{found.port}"
+    host = re.sub(r"[^a-z0-9]", "-", port.host.lower())
+    base = f"found/{host}-{port.port}"
     names = itertools.chain((f"found/{host}", base), (f"{base}-{n}" for n in itertools.count(2)))
     return next(name for name in names if name not in taken)
 

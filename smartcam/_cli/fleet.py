@@ -76,33 +76,33 @@ async def list_(url: str, pattern: str, options: Options) -> None:
     async with _opened(url, options) as opened:
         _require_cameras(opened)
         known = await opened.status(pattern)
-        found = [_camera(opened, name, known.get(name)) for name in opened.names(pattern)]
+        cameras = [_camera(opened, name, known.get(name)) for name in opened.names(pattern)]
         warning = opened.warning
     if warning:
         click.echo(f"{tinted('error', 'warning:')} {warning}", err=True)
     if options.as_json:
-        for value in found:
+        for value in cameras:
             options.show(value, "")
         return
-    if not found:
+    if not cameras:
         click.echo(f"no camera of the fleet is {pattern}")
         return
     head = ("camera", "agent", "application", "status", "url")
-    click.echo(table_text(head, [_row(value) for value in found]))
-    for value in found:
+    click.echo(table_text(head, [_row(value) for value in cameras]))
+    for value in cameras:
         if value["reason"] is not None:
             click.echo(value["reason"])
 
 
 def _camera(opened: Fleet, name: str, known: CameraSummary | None) -> dict[str, Any]:
     """Return the state of a fleet's camera as values for JSON."""
-    there = known is not None and known.connected
+    is_connected = known is not None and known.connected
     return {
         "camera": name,
         "agents": opened.agents(name) if known is None else [known.agent],
-        "connected": there,
-        "application": known.application if known is not None and there else None,
-        "status": known.status if known is not None and there else None,
+        "connected": is_connected,
+        "application": known.application if known is not None and is_connected else None,
+        "status": known.status if known is not None and is_connected else None,
         "url": opened.url_of(name),
         "reason": _reason(name, known),
     }
@@ -233,16 +233,16 @@ def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
 async def _ask_outlets(url: str, options: Options) -> None:
     """Show the counts of outlets that a fleet's agents report."""
     async with _opened(url, options) as opened:
-        found = await opened.outlets(timeout=options.step(5.0))
+        outlets_met = await opened.outlets(timeout=options.step(5.0))
     if options.as_json:
-        for one in found:
-            account = one._asdict()
+        for outlet in outlets_met:
+            account = outlet._asdict()
             shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
             options.show({**shown, "account": account}, "")
         return
     rows = [
-        (one.agent, one.outlet, *_account_row(one._asdict()), one.trouble or "well")
-        for one in found
+        (outlet.agent, outlet.outlet, *_account_row(outlet._asdict()), outlet.trouble or "well")
+        for outlet in outlets_met
     ]
     head = ("agent", "outlet", "results", "delivered", "spooled", "dropped", "state")
     click.echo(table_text(head, rows) if rows else "no agent has outlets")

@@ -72,14 +72,14 @@ async def certificates(
         make_certificates, folder, wanted, hosts=hosts, lifetime=timedelta(days=days)
     )
     if options.as_json:
-        for one in made:
-            options.show(one._asdict(), "")
+        for files in made:
+            options.show(files._asdict(), "")
         return
     if not made:
         click.echo(f"{folder} has an authority, and no certificates yet: --agent, --viewer, ...")
         return
     head = ("name", "role", "", "until", "how to use it")
-    click.echo(table_text(head, [_row(one) for one in made]))
+    click.echo(table_text(head, [_row(files) for files in made]))
 
 
 def _row(made: MadeCertificate) -> tuple[str, ...]:

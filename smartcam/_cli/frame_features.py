@@ -81,7 +81,7 @@ async def force_address_command(
         if not sys.stdin.isatty():
             raise click.UsageError("it changes the camera's address: confirm with --yes")
         click.confirm(f"give the camera {mac} the address {address}?", abort=True, err=True)
-    found = await force_address(mac, address, gateway=gateway)
-    value: dict[str, Any] = {"url": found.url, "name": found.name, "remark": found.remark}
-    remark = f"\n  {found.remark}" if found.remark else ""
-    options.show(value, f"{found.url}  {found.name}{remark}")
+    answer = await force_address(mac, address, gateway=gateway)
+    value: dict[str, Any] = {"url": answer.url, "name": answer.name, "remark": answer.remark}
+    remark = f"\n  {answer.remark}" if answer.remark else ""
+    options.show(value, f"{answer.url}  {answer.name}{remark}")

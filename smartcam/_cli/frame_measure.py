@@ -84,19 +84,19 @@ class _Stamps:
             await asyncio.wait([self._task])
 
     async def _look(self, frame: Frame, now: float) -> None:
-        found = await asyncio.to_thread(_stamp_of, frame)
-        if found is not None and 0 <= now - found < MAX_LATENCY:
-            self.latencies.append(now - found)
+        stamp = await asyncio.to_thread(_stamp_of, frame)
+        if stamp is not None and 0 <= now - stamp < MAX_LATENCY:
+            self.latencies.append(now - stamp)
 
 
 def _stamp_of(frame: Frame) -> float | None:
     from smartcam.frames._inside import read_stamp
 
     try:
-        found = read_stamp(frame.grey()[:STAMP_ROWS])
+        stamp = read_stamp(frame.grey()[:STAMP_ROWS])
     except FrameSourceError:  # a frame without brightness, or wrong bytes: no stamp
         return None
-    return None if found is None else found[1] / 1e9
+    return None if stamp is None else stamp[1] / 1e9
 
 
 class _Taken:
@@ -107,7 +107,7 @@ class _Taken:
         self._first = self._last = first
         self._intervals: list[float] = []
         self._ages: list[float] = []
-        self._came = 1
+        self._frames_received = 1
         self._delivered = self._skipped = self._lost = 0
         self._note(first)
 
@@ -119,7 +119,7 @@ class _Taken:
             account = reader.statistics()
             if account.skipped == self._skipped and not frame.lost:
                 self._intervals.append(frame.captured - self._last.captured)
-            self._came = account.delivered + account.skipped
+            self._frames_received = account.delivered + account.skipped
             self._delivered, self._skipped = account.delivered, account.skipped
             self._lost = account.lost - lost
             self._last = frame
@@ -137,7 +137,7 @@ class _Taken:
             "frames": self._delivered,
             "lost": self._lost,
             "skipped": self._skipped,
-            "rate": (self._came - 1) / span if span > 0 else None,
+            "rate": (self._frames_received - 1) / span if span > 0 else None,
             "interval_ms": _ms(_mean(self._intervals)),
             "jitter_ms": _ms(_deviation(self._intervals)),
             "longest_ms": _ms(max(self._intervals, default=None)),
@@ -160,7 +160,7 @@ def _deviation(values: Sequence[float]) -> float | None:
     mean = _mean(values)
     if mean is None or len(values) < 2:
         return None
-    return math.sqrt(sum((one - mean) ** 2 for one in values) / (len(values) - 1))
+    return math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:

@@ -24,7 +24,7 @@ RTSP_USER = "smartcam"
 MAX_NAME_LETTERS = 60
 """Largest number of letters of a source's name in a URL, before its number."""
 
-LOOK_INTERVAL = 0.1
+CHECK_INTERVAL = 0.1
 """Seconds between two checks whether a source is open."""
 
 DESCRIPTION_TIMEOUT = 5.0
@@ -52,8 +52,8 @@ def address(_context: object, parameter: click.Parameter, text: str | None) -> A
     host, colon, port = text.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     plain = host[1:-1] if bracketed else host
-    whole = colon and plain and (bracketed or ":" not in host)
-    if not (whole and re.fullmatch(r"[0-9]{1,5}", port) and int(port) <= 65535):
+    is_full = colon and plain and (bracketed or ":" not in host)
+    if not (is_full and re.fullmatch(r"[0-9]{1,5}", port) and int(port) <= 65535):
         raise click.BadParameter(
             f"{text!r}: expected HOST:PORT, such as 127.0.0.1:8554 or [::1]:8554", param=parameter
         )
@@ -63,12 +63,13 @@ def address(_context: object, parameter: click.Parameter, text: str | None) -> A
 def names_of(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
     """Return sources by unique names that fit into a URL."""
     named: dict[str, FrameSource] = {}
-    for one in sources:
+    for source in sources:
         plain = (
-            re.sub(r"[^A-Za-z0-9._~-]+", "-", one.name)[:MAX_NAME_LETTERS].strip("-._~") or "camera"
+            re.sub(r"[^A-Za-z0-9._~-]+", "-", source.name)[:MAX_NAME_LETTERS].strip("-._~")
+            or "camera"
         )
         numbered = (f"{plain}-{number}" for number in range(2, len(sources) + 2))
-        named[next(name for name in (plain, *numbered) if name not in named)] = one
+        named[next(name for name in (plain, *numbered) if name not in named)] = source
     return named
 
 
@@ -98,8 +99,10 @@ def rtsp_urls(
     server: RtspServer, sources: Sequence[FrameSource], password: str | None
 ) -> dict[str, str]:
     """Return the URLs for players, by name."""
-    who = "" if password is None else f"{RTSP_USER}:{password}@"
-    return {name: server.url(name).replace("//", f"//{who}", 1) for name in names_of(sources)}
+    credentials = "" if password is None else f"{RTSP_USER}:{password}@"
+    return {
+        name: server.url(name).replace("//", f"//{credentials}", 1) for name in names_of(sources)
+    }
 
 
 # ---------------------------------------------------------------------- RTP
@@ -125,7 +128,7 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
                 noted, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
-            await asyncio.sleep(LOOK_INTERVAL)
+            await asyncio.sleep(CHECK_INTERVAL)
             continue
         except FrameSourceError as exc:
             if str(exc) != noted:
@@ -136,10 +139,10 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
 async def _first_frame(sender: RtpSender) -> None:
     """Wait for the first frame, but not for long."""
-    for _ in range(round(DESCRIPTION_TIMEOUT / LOOK_INTERVAL)):
+    for _ in range(round(DESCRIPTION_TIMEOUT / CHECK_INTERVAL)):
         if sender.statistics().frames:
             return
-        await asyncio.sleep(LOOK_INTERVAL)
+        await asyncio.sleep(CHECK_INTERVAL)
 
 
 async def _describe(to: str, sdp: str, file: str | None, options: Options, *, again: bool) -> None:

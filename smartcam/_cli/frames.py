@@ -69,7 +69,9 @@ async def list_(scheme: str | None, options: Options) -> None:
 
     known = [info.name for info in FRAMES.available()]
     schemes = known if scheme is None else [scheme]
-    looks = await asyncio.gather(*(_look(one, options.step(FRAME_TIMEOUT)) for one in schemes))
+    looks = await asyncio.gather(
+        *(_look(scheme, options.step(FRAME_TIMEOUT)) for scheme in schemes)
+    )
     shown: set[str] = set()
     searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
     for name, look in zip(schemes, looks, strict=True):
@@ -80,10 +82,10 @@ async def list_(scheme: str | None, options: Options) -> None:
                 raise look
             _show_broken(name, look, options)
             continue
-        for one in look:
-            if one.url not in shown:
-                shown.add(one.url)
-                options.show(_found(one), _found_text)
+        for source in look:
+            if source.url not in shown:
+                shown.add(source.url)
+                options.show(_found(source), _found_text)
     if not shown and not options.as_json:
         click.echo(
             f"nothing found; looked for: {', '.join(searched)}"
@@ -122,11 +124,11 @@ def _show_broken(scheme: str, error: Exception, options: Options) -> None:
     options.show({"scheme": scheme, "error": reason}, f"{scheme}: the search failed: {reason}")
 
 
-def _found(one: FoundSource) -> dict[str, Any]:
+def _found(source: FoundSource) -> dict[str, Any]:
     """Return the name, formats and remark of a found source, as values for JSON."""
     return {
-        "url": one.url,
-        "name": one.name,
+        "url": source.url,
+        "name": source.name,
         "formats": [
             {
                 "format": each.format.name,
@@ -134,17 +136,23 @@ def _found(one: FoundSource) -> dict[str, Any]:
                 "height": each.height,
                 "rates": list(each.rates),
             }
-            for each in one.formats
+            for each in source.formats
         ],
-        "remark": one.remark,
+        "remark": source.remark,
     }
 
 
 def _found_text(value: dict[str, Any]) -> str:
     lines = [f"{value['url']}  {value['name']}"]
-    for one in value["formats"]:
-        rates = f" at {', '.join(f'{rate:g}' for rate in one['rates'])}/s" if one["rates"] else ""
-        lines.append(f"  {one['format']} {one['width']}x{one['height']}{rates}")
+    for pixel_format in value["formats"]:
+        rates = (
+            f" at {', '.join(f'{rate:g}' for rate in pixel_format['rates'])}/s"
+            if pixel_format["rates"]
+            else ""
+        )
+        lines.append(
+            f"  {pixel_format['format']} {pixel_format['width']}x{pixel_format['height']}{rates}"
+        )
     if value["remark"]:
         lines.append(f"  {value['remark']}")
     return "\n".join(lines)
@@ -273,9 +281,9 @@ def _check_free(files: Sequence[str], force: bool) -> None:
     folder = Path(files[0]).parent
     if not folder.is_dir():
         raise ConfigurationError(f"{files[0]}: there is no folder {folder}")
-    there = next((file for file in files if Path(file).exists()), None)
-    if there is not None and not force:
-        raise ConfigurationError(f"{there}: the file exists already; --force replaces it")
+    existing = next((file for file in files if Path(file).exists()), None)
+    if existing is not None and not force:
+        raise ConfigurationError(f"{existing}: the file exists already; --force replaces it")
 
 
 def _write(file: str, data: bytes) -> None:

@@ -40,12 +40,12 @@ class _Amount(_AmountType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", str(value))
-        if found is None or found[2] not in self._units:
+        match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", str(value))
+        if match is None or match[2] not in self._units:
             self.fail(
                 f"{value!r}: expected a number and one of {', '.join(self._units)}", param, ctx
             )
-        return float(found[1]) * self._units[found[2]]
+        return float(match[1]) * self._units[match[2]]
 
 
 @click.command(
@@ -181,8 +181,8 @@ async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Option
         _show(str(path), {"file": str(path), **value}, lost, options)
 
 
-def _show(what: str, value: dict[str, Any], lost: int, options: Options) -> None:
+def _show(label: str, value: dict[str, Any], lost: int, options: Options) -> None:
     value["lost"] = lost
     counts = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
     size = f"; {value['bytes']} bytes" if "bytes" in value else ""
-    options.show(value, f"{what}: {counts}{size}")
+    options.show(value, f"{label}: {counts}{size}")

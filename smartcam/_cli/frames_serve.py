@@ -182,7 +182,7 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
         lines = [f"page: {site.url}", *(f"rtsp: {url}" for url in urls.values())]
         value = {"page": site.url, **({"rtsp": urls} if urls else {})}
         options.show(value, "\n".join(lines))
-        jobs = [_tell_viewers(site, server), tries.watch()]
+        jobs = [_show_viewers(site, server), tries.watch()]
         if players.rtp is not None:
             jobs.append(send_rtp(site.sources[0], players, options))
         await first(jobs, options.seconds)
@@ -212,7 +212,7 @@ class _Tries:
         return tried
 
     def _all_for_good(self) -> bool:
-        wrong = [isinstance(one, PERMANENT_ERRORS) for one in self._first.values()]
+        wrong = [isinstance(error, PERMANENT_ERRORS) for error in self._first.values()]
         return len(wrong) == self._count and all(wrong)
 
     async def check(self) -> None:
@@ -231,7 +231,7 @@ class _Tries:
 # ---------------------------------------------------------------------- viewers
 
 
-async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
+async def _show_viewers(site: FramesSite, server: RtspServer | None) -> None:
     """Report the viewers on a terminal's stderr, whenever they change; until cancelled."""
     if not sys.stderr.isatty():
         await asyncio.Event().wait()
@@ -249,8 +249,8 @@ def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
     played = {} if server is None else server.statistics()
     rows: list[str] = []
     for place, (name, source) in enumerate(names_of(site.sources).items()):
-        who = sorted(one.address for one in site.viewers if one.place == place)
+        addresses = sorted(viewer.address for viewer in site.viewers if viewer.place == place)
         by_rtsp = played[name].viewers if name in played else 0
-        who += [f"{by_rtsp} by RTSP"] if by_rtsp else []
-        rows += [f"{source.name}: {', '.join(who)}"] if who else []
+        addresses += [f"{by_rtsp} by RTSP"] if by_rtsp else []
+        rows += [f"{source.name}: {', '.join(addresses)}"] if addresses else []
     return "; ".join(rows) or "nobody looks"

@@ -92,7 +92,7 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
         make = stack.enter_context(options.cameras(url, reconnect=Backoff()))
         first = make()
         server = await stack.enter_async_context(Gateway(first, settings))
-        stack.callback(_tell_account, server, options)
+        stack.callback(_log_account, server, options)
 
         def show() -> None:
             value = {"gateway": server.address, "camera": url}
@@ -100,10 +100,12 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
 
         with contextlib.suppress(TimeoutError):  # --seconds are over
             async with asyncio.timeout(options.seconds):
-                await _have_open(server, make, show)
+                await _ensure_open(server, make, show)
 
 
-async def _have_open(server: Gateway, make: Callable[[], Camera], show: Callable[[], None]) -> None:
+async def _ensure_open(
+    server: Gateway, make: Callable[[], Camera], show: Callable[[], None]
+) -> None:
     """Keep the camera open, and show the gateway once opening was tried for the first time."""
     from smartcam._cli.live import have_open
 
@@ -148,7 +150,7 @@ def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> Gat
         return file.settings(**given)
     except ValidationError as exc:
         (first, *_) = exc.errors()
-        where = "".join(f"--{one}: " for one in first["loc"][:1]).replace("_", "-")
+        where = "".join(f"--{option}: " for option in first["loc"][:1]).replace("_", "-")
         raise ConfigurationError(where + first["msg"].removeprefix("Value error, ")) from exc
 
 
@@ -175,15 +177,15 @@ async def _emulated(options: Options) -> AsyncIterator[str]:
         yield emulator.url
 
 
-def _tell_account(server: Gateway, options: Options) -> None:
+def _log_account(server: Gateway, options: Options) -> None:
     """Print the account of all requests and parts."""
-    found = server.account
+    account = server.account
     if options.as_json:
-        options.show({"account": dataclasses.asdict(found)}, "")
+        options.show({"account": dataclasses.asdict(account)}, "")
         return
     click.echo(
-        f"requests {found.requests} = answered {found.answered} + errors {found.errors} + "
-        f"abandoned {found.abandoned} + open {found.open}; parts {found.parts} = delivered "
-        f"{found.delivered} + forgotten {found.forgotten} + waiting {found.waiting}",
+        f"requests {account.requests} = answered {account.answered} + errors {account.errors} + "
+        f"abandoned {account.abandoned} + open {account.open}; parts {account.parts} = delivered "
+        f"{account.delivered} + forgotten {account.forgotten} + waiting {account.waiting}",
         err=True,
     )

@@ -55,7 +55,7 @@ async def inspect(
     from smartcam.inspection import load_cell
     from smartcam.layout._inside import ShownUnits
 
-    units = ShownUnits([one for one in (options.units or "").split(",") if one])
+    units = ShownUnits([unit for unit in (options.units or "").split(",") if unit])
     data = from_hex(given, "--input")
     cameras = load_cell(cell)
     if camera not in cameras:
@@ -64,7 +64,7 @@ async def inspect(
             f"{did_you_mean(camera, cameras)}"
         )
     program = cameras[camera].program(which)
-    files = [file for one in pictures for file in picture_files(Path(one))]
+    files = [file for picture in pictures for file in picture_files(Path(picture))]
     folder = None if output is None else Path(output)
     if folder is not None:
         with naming(f"--output {output}"):
@@ -73,7 +73,7 @@ async def inspect(
     rows: list[str] = []
     for number, file in enumerate(files, 1):
         try:
-            found = await asyncio.to_thread(_inspect, program, file, data)
+            inspection = await asyncio.to_thread(_inspect, program, file, data)
         except FrameFormatError as exc:
             failed = exc
             options.show({"file": str(file), "error": str(exc)}, f"{file}: {exc}")
@@ -81,9 +81,9 @@ async def inspect(
         drawn = None if folder is None else folder / f"{number:04}-{file.stem}.png"
         if drawn is not None:
             with naming(f"--output {output}"):
-                await asyncio.to_thread(_write, drawn, found)
-            rows.append(_row(file, found, drawn))
-        options.show(_fields(file, found, drawn), _text(file, found, units))
+                await asyncio.to_thread(_write, drawn, inspection)
+            rows.append(_row(file, inspection, drawn))
+        options.show(_fields(file, inspection, drawn), _text(file, inspection, units))
     if folder is not None:
         title = f"{camera}: {program.name}"
         with naming(f"--output {output}"):
@@ -101,10 +101,10 @@ def picture_files(path: Path) -> Iterator[Path]:
             raise ConfigurationError(f"{path}: there is no such file or folder")
         yield path
         return
-    found = [one for one in path.iterdir() if one.suffix.lower() in SUFFIXES]
-    if not found:
+    files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+    if not files:
         raise ConfigurationError(f"{path}: there is no picture in this folder")
-    yield from sorted(found, key=lambda one: natural(one.name))
+    yield from sorted(files, key=lambda file: natural(file.name))
 
 
 def _inspect(program: Program, file: Path, data: bytes) -> Inspection:
@@ -113,33 +113,34 @@ def _inspect(program: Program, file: Path, data: bytes) -> Inspection:
     return program.inspect(Picture.read(file), input=data)
 
 
-def _write(path: Path, found: Inspection) -> None:
+def _write(path: Path, inspection: Inspection) -> None:
     from smartcam._extras import load
 
-    coded = load("cv2", "inspection needs").imencode(".png", found.drawn()[:, :, ::-1])[1]
+    coded = load("cv2", "inspection needs").imencode(".png", inspection.drawn()[:, :, ::-1])[1]
     path.write_bytes(coded.tobytes())
 
 
-def _fields(file: Path, found: Inspection, drawn: Path | None) -> dict[str, Any]:
+def _fields(file: Path, inspection: Inspection, drawn: Path | None) -> dict[str, Any]:
     return {
         "file": str(file),
-        "ok": found.ok,
-        "reason": found.reason,
-        "value": found.value,
-        "milliseconds": {name: 1e3 * one for name, one in found.seconds.items()},
+        "ok": inspection.ok,
+        "reason": inspection.reason,
+        "value": inspection.value,
+        "milliseconds": {name: 1e3 * seconds for name, seconds in inspection.seconds.items()},
         **({} if drawn is None else {"drawn": str(drawn)}),
     }
 
 
-def _text(file: Path, found: Inspection, units: ShownUnits) -> str:
-    verdict = "ok" if found.ok else "not ok"
-    took = 1e3 * sum(found.seconds.values())
-    return f"{file}: {verdict}, {took:.1f} ms\n{value_text(found.value, units, found.layout)}"
+def _text(file: Path, inspection: Inspection, units: ShownUnits) -> str:
+    verdict = "ok" if inspection.ok else "not ok"
+    took = 1e3 * sum(inspection.seconds.values())
+    text = value_text(inspection.value, units, inspection.layout)
+    return f"{file}: {verdict}, {took:.1f} ms\n{text}"
 
 
-def _row(file: Path, found: Inspection, drawn: Path) -> str:
-    kind = "ok" if found.ok else "not-ok"
-    text = html.escape(f"{file.name}: {found.reason or 'ok'}")
+def _row(file: Path, inspection: Inspection, drawn: Path) -> str:
+    kind = "ok" if inspection.ok else "not-ok"
+    text = html.escape(f"{file.name}: {inspection.reason or 'ok'}")
     link = html.escape(drawn.name, quote=True)
     return f'<figure class="{kind}"><img src="{link}" alt="{text}"><figcaption>{text}</figcaption>'
 

@@ -82,7 +82,7 @@ def _interpreter(info: PluginInfo) -> tuple[object, str]:
     except PluginError as exc:
         return _broken(info, exc)
     except SmartCamError:
-        pass  # it needs a layout
+        pass  # the interpreter needs a layout
     where = "" if info.origin == "built-in" else f" ({info.origin}: {info.target})"
     return {**info._asdict(), "about": about}, f"{info.name:14} {about}{where}"
 

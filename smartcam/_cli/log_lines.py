@@ -26,7 +26,7 @@ MAX_WAITING = 10_000
 MAX_TEXT_CHARACTERS = 1 << 16
 """Largest number of characters of a message, or of an exception's text; the rest is cut."""
 
-FAREWELL = 1.0
+FAREWELL_TIMEOUT = 1.0
 """Seconds that the last lines may take at the end."""
 
 FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
@@ -72,8 +72,14 @@ class JsonLines(logging.Formatter):
             return camera
         cameras = self._cameras()
         given = record.args if isinstance(record.args, tuple) else ()
-        for one in given[:2]:
-            name = one if isinstance(one, str) else str(one) if isinstance(one, Exception) else ""
+        for argument in given[:2]:
+            name = (
+                argument
+                if isinstance(argument, str)
+                else str(argument)
+                if isinstance(argument, Exception)
+                else ""
+            )
             for part in (name, name.partition(": ")[0]):
                 if part and part in cameras:
                     return part
@@ -122,7 +128,7 @@ class LineHandler(logging.Handler):
             self._ending.set()
             with contextlib.suppress(queue.Full):
                 self._lines.put_nowait(None)  # wakes the thread, if it waits
-            self._over.wait(FAREWELL)
+            self._over.wait(FAREWELL_TIMEOUT)
         super().close()
 
     def _write_all(self) -> None:
@@ -168,8 +174,8 @@ def json_log(
     handlers, before = root.handlers[:], root.level
     handler = LineHandler(descriptor, most)
     handler.setFormatter(JsonLines(agent, cameras))
-    for one in handlers:
-        root.removeHandler(one)
+    for old_handler in handlers:
+        root.removeHandler(old_handler)
     root.addHandler(handler)
     root.setLevel(level)
     logging.captureWarnings(True)
@@ -179,6 +185,6 @@ def json_log(
         logging.captureWarnings(False)
         root.removeHandler(handler)
         root.setLevel(before)
-        for one in handlers:
-            root.addHandler(one)
+        for old_handler in handlers:
+            root.addHandler(old_handler)
         handler.close()

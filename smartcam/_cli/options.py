@@ -132,7 +132,7 @@ def runs(
             with importing():
                 from smartcam._cli.running import run
 
-            common = {one.name for one in fields(Options)} & given.keys()
+            common = {field.name for field in fields(Options)} & given.keys()
             options = Options(**{name: given.pop(name) for name in common})
             has_page = "web" in given and given["web"].wanted
             run(
@@ -152,12 +152,12 @@ def runs(
 
 
 @contextmanager
-def naming(what: str) -> Iterator[None]:
+def naming(label: str) -> Iterator[None]:
     """Turn errors of a file in the block into a ConfigurationError that names the file."""
     try:
         yield
     except OSError as exc:
-        raise ConfigurationError(f"{what}: {exc.strerror}") from exc
+        raise ConfigurationError(f"{label}: {exc.strerror}") from exc
 
 
 def from_hex(text: str, where: str) -> bytes:
@@ -205,15 +205,15 @@ class Options:
         """Return the bound of a step, seconds."""
         return default if self.timeout is None else self.timeout
 
-    def check_y_down(self, calibration: AnyCalibration, what: str) -> None:
-        """Raise ConfigurationError if ``--y-down`` differs from that of a calibration.
+    def check_y_down(self, calibration: AnyCalibration, label: str) -> None:
+        """Raise ConfigurationError if ``--y-down`` differs from a calibration's direction of y.
 
-        ``what``: the option that names the calibration.
+        ``label``: the option that names the calibration.
         """
         if calibration.y_down is not None and calibration.y_down != self.y_down:
             made, then = ("with", "give it") if calibration.y_down else ("without", "leave it out")
             raise ConfigurationError(
-                f"{what}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
+                f"{label}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
             )
 
     async def located(self, url: str) -> str:
@@ -280,23 +280,23 @@ class Options:
         if self.y_down or not fleet:
             options["y_down"] = self.y_down
         if self.calibration is not None:
-            what = f"--calibration {self.calibration}"
+            label = f"--calibration {self.calibration}"
             # without "y_down" the camera checks it, since it learns the agent's value
-            calibration, doubt = self._calibrated(what, check_y_down="y_down" in options)
+            calibration, doubt = self._calibrated(label, check_y_down="y_down" in options)
             options["calibration"] = calibration
             if doubt:
-                click.echo(f"{tinted('error', 'warning:')} {what}: {doubt}", err=True)
+                click.echo(f"{tinted('error', 'warning:')} {label}: {doubt}", err=True)
         return options
 
-    def _calibrated(self, what: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
+    def _calibrated(self, label: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
         """Return the calibration, and the reason to doubt it; "" means none."""
         with from_part("calibration", "--calibration needs"):
             from smartcam.calibration import load_calibration
             from smartcam.calibration._inside import doubt_of
-        with naming(what):
+        with naming(label):
             calibration = load_calibration(self.calibration or "")
         if check_y_down:
-            self.check_y_down(calibration, what)
+            self.check_y_down(calibration, label)
         return calibration, doubt_of(calibration)
 
     @contextmanager

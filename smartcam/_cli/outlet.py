@@ -42,10 +42,10 @@ async def outlet(url: str, file: str, options: Options) -> None:
     from smartcam.outlets import Outlets
     from smartcam.outlets._inside import OutletsFile
 
-    found = OutletsFile.load(file)
+    outlets_file = OutletsFile.load(file)
     source = _OutletSource(options)
     outlets = Outlets(
-        found.outlets,
+        outlets_file.outlets,
         Path(file).parent,
         columns=source.columns,
         command=source.command,

@@ -80,12 +80,16 @@ def _show_trial(trial: Trial, options: Options) -> None:
 
 def _show_answers(answers: list[CameraAnswer], options: Options) -> None:
     first, *more = answers
-    lines = [f"status: {first.status}", *(f"also: {one.url}" for one in more), f"use: {first.url}"]
+    lines = [
+        f"status: {first.status}",
+        *(f"also: {answer.url}" for answer in more),
+        f"use: {first.url}",
+    ]
     value = {
         "url": first.url,
         "status": first.status,
         "protocol_version": first.protocol_version,
         "application": first.application,
-        "also": [one.url for one in more],
+        "also": [answer.url for answer in more],
     }
     options.show(value, "\n".join(lines))

@@ -258,7 +258,7 @@ def _jobs(
 
 
 def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
-    """Record facts that a shared camera's frames would show, as far as the agent knows them."""
+    """Record the agent's facts that a recording of frames would contain."""
     from smartcam._client._inside import in_pixels, own_interpreter
 
     dialect = camera.capabilities.dialect
@@ -317,7 +317,7 @@ async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: 
     """Record a result's picture, before another trigger replaces the picture."""
     try:
         image = await camera.read_image()
-    except CommandRejectedError:  # it has none, as the recorded frames show
+    except CommandRejectedError:  # the camera has none, as the recorded frames show
         return
     if recorder.counts.results == results:
         await asyncio.to_thread(recorder.add_image, camera.name, image, result=result)
@@ -550,7 +550,7 @@ async def bag(
     with contextlib.closing(conversion.steps()) as steps:
         for place, _ in enumerate(steps):
             if not place % 32:
-                await asyncio.sleep(0)  # a place where it can be cancelled
+                await asyncio.sleep(0)  # a place at which the task can be cancelled
     counts = conversion.counts
     if counts.unread:
         click.echo(

@@ -56,8 +56,8 @@ async def results(
         return
     from smartcam.outlets._inside import StoreQuestion, read_store
 
-    found = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
-    _show(found.rows, found.summary, "", options)
+    stored = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
+    _show(stored.rows, stored.summary, "", options)
 
 
 async def _ask(

@@ -62,27 +62,33 @@ async def ros1(place: str, bridge: str, namespace: str | None, options: Options)
 
 @contextlib.asynccontextmanager
 async def _served(
-    path: str, bridge: str, namespace: str | None, tell: Any
+    path: str, bridge: str, namespace: str | None, report: Any
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet import FleetServer, load_fleet
     from smartcam.fleet._inside import RosSection
     from smartcam.ros1._inside import bridged
 
     file, folder = load_fleet(path), Path(path).parent
-    sections = {one.name: one.entry.ros2 for one in file.plan()}
-    found = {name: one.load_calibration(folder) for name, one in sections.items()}
-    hand_eyes = {name: one.load_hand_eye(folder) for name, one in sections.items()}
+    sections = {planned.name: planned.entry.ros2 for planned in file.plan()}
+    calibrations = {name: section.load_calibration(folder) for name, section in sections.items()}
+    hand_eyes = {name: section.load_hand_eye(folder) for name, section in sections.items()}
     section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_first_attempts()
         async with bridged(
             bridge,
-            tell,
+            report,
             server.address,
             _section(namespace or section.namespace, autostart=section.autostart),
             cameras=sections,
-            calibrations={name: one for name, one in found.items() if one is not None},
-            hand_eyes={name: one for name, one in hand_eyes.items() if one is not None},
+            calibrations={
+                name: calibration
+                for name, calibration in calibrations.items()
+                if calibration is not None
+            },
+            hand_eyes={
+                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
+            },
             wanted=lambda agent, _camera: agent == file.agent_name,
             desks=server.calibrations,
         ) as ros:
@@ -91,7 +97,7 @@ async def _served(
 
 @contextlib.asynccontextmanager
 async def _of_fleet(
-    url: str, bridge: str, namespace: str | None, tell: Any
+    url: str, bridge: str, namespace: str | None, report: Any
 ) -> AsyncIterator[RosbridgeFleet]:
     from smartcam.fleet._inside import FleetAddress
     from smartcam.ros1._inside import bridged
@@ -101,7 +107,7 @@ async def _of_fleet(
         raise ConfigurationError(
             f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
         )
-    async with bridged(bridge, tell, address, _section(namespace or "/")) as ros:
+    async with bridged(bridge, report, address, _section(namespace or "/")) as ros:
         yield ros
 
 

@@ -61,7 +61,7 @@ interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they diffe
 ended by Ctrl-C or SIGTERM."""
 
 
-TAKEN = (
+TAKEN_ADVICE = (
     "Has another client taken it? Most cameras serve one, and the newcomer wins. smartcam doctor "
     "tells more."
 )
@@ -152,9 +152,9 @@ def _one_line(error: Exception) -> str:
     hung_up = (
         isinstance(error, ConnectionLostError)
         and isinstance(cause, ConnectionError)
-        and not isinstance(cause, LinkError)  # such as a lost agent
+        and not isinstance(cause, LinkError)  # an event such as the loss of an agent
     )
-    return f"{text}. {TAKEN}" if hung_up else text
+    return f"{text}. {TAKEN_ADVICE}" if hung_up else text
 
 
 async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.Signals]) -> None:
@@ -168,8 +168,8 @@ async def _with_signals(main: Coroutine[Any, Any, None], ended_by: list[signal.S
 
     def on_signal(number: signal.Signals) -> None:
         ended_by.append(number)
-        for one in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(one)
+        for signal_number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(signal_number)
         if task is not None:
             task.cancel()
 

@@ -126,7 +126,7 @@ class Serving:
             if server.file.outlets is not None:
                 from smartcam.fleet._inside import FleetOutlets
 
-                await stack.enter_async_context(FleetOutlets(server, self._tell_outlet))
+                await stack.enter_async_context(FleetOutlets(server, self._notify_outlet))
             await self._enter(stack)
             stack.callback(notifier.stopping)
             server.reloads.on_reload = self._on_reload
@@ -153,7 +153,7 @@ class Serving:
                 await stack.enter_async_context(self._server)
             except ConnectFailedError as exc:
                 if self._server.file.endpoints[0] or not policy.transient(exc):
-                    raise  # it cannot listen, or would never be accepted
+                    raise  # the site cannot listen, or its token would never be accepted
                 if not warned:
                     self._warn(f"{exc}; it is tried on")
                 warned = True
@@ -167,7 +167,7 @@ class Serving:
         else:
             click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
 
-    def _tell_outlet(self, name: str, why: str) -> None:
+    def _notify_outlet(self, name: str, why: str) -> None:
         if not self._as_lines:  # otherwise it was logged
             text = why or "delivers again"
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
@@ -282,8 +282,8 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
     """Return the recorder of the cameras, which prints a line when it cannot record."""
     from smartcam.recording import FleetRecorder
 
-    def say(trouble: RecordingError | None) -> None:
-        lost = {name: one.lost for name, one in recorder.accounts.items() if one.lost}
+    def show_trouble(trouble: RecordingError | None) -> None:
+        lost = {name: account.lost for name, account in recorder.accounts.items() if account.lost}
         value = {
             "recordings": str(recorder.path),
             "recording": trouble is None,
@@ -302,7 +302,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
         elif not as_lines:
             click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} {text}", err=True)
 
-    recorder = FleetRecorder(server, on_trouble=say)
+    recorder = FleetRecorder(server, on_trouble=show_trouble)
     return recorder
 
 

@@ -215,12 +215,12 @@ class CommandTable(MutableMapping[str, click.Command]):
         self._commands: dict[str, Listed | click.Command] = {**listed}
 
     def __getitem__(self, name: str) -> click.Command:
-        found = self._commands[name]
-        if isinstance(found, Listed):
+        summary = self._commands[name]
+        if isinstance(summary, Listed):
             with importing():
-                module = _module(name, found)
-            found = self._commands[name] = cast("click.Command", getattr(module, name))
-        return found
+                module = _module(name, summary)
+            summary = self._commands[name] = cast("click.Command", getattr(module, name))
+        return summary
 
     def __setitem__(self, name: str, command: click.Command) -> None:
         self._commands[name] = command
@@ -267,7 +267,7 @@ class CommandsByTopic(ListedGroup):
         """Return the commands and options that begin with this text."""
         from click.shell_completion import CompletionItem
 
-        found = [
+        items = [
             # click's help text of the command, without importing the command
             CompletionItem(
                 name, help=click.Command(name, help=LISTED[name].summary).get_short_help_str()
@@ -275,7 +275,7 @@ class CommandsByTopic(ListedGroup):
             for name in self.list_commands(ctx)
             if name.startswith(incomplete)
         ]
-        return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
+        return [*items, *click.Command.shell_complete(self, ctx, incomplete)]
 
 
 def _install_completion(ctx: click.Context, _option: click.Parameter, shell: str | None) -> None:

@@ -164,7 +164,9 @@ async def command(
     async with AsyncExitStack() as stack:
         for server in servers:
             await stack.enter_async_context(server)
-        emulators = [one if isinstance(one, WireCamera) else one.emulator for one in servers]
+        emulators = [
+            server if isinstance(server, WireCamera) else server.emulator for server in servers
+        ]
         address = await _open_page(web, stack, emulators)
         named = scenario is not None or program is not None
         for emulator in emulators:
@@ -242,13 +244,13 @@ def _scenarios(
             )
     if copies == 1:
         return loaded
-    one, *others = loaded
+    first, *others = loaded
     if others:
         raise ConfigurationError(
             f"--cameras {copies}: the scenario {path} has {len(loaded)} cameras already"
         )
     return tuple(
-        one.model_copy(update={"name": f"camera{index + 1}", "seed": one.seed + index})
+        first.model_copy(update={"name": f"camera{index + 1}", "seed": first.seed + index})
         for index in range(copies)
     )
 
@@ -271,7 +273,7 @@ def _quirk(text: str) -> tuple[str, Any]:
     from smartcam.layout._inside import BadYamlError, load
 
     try:
-        return name, load(value, what="--quirk NAME=VALUE")
+        return name, load(value, label="--quirk NAME=VALUE")
     except BadYamlError as exc:
         raise ConfigurationError(f"--quirk {text:.200}: {exc}") from exc
 

@@ -76,7 +76,7 @@ async def teach(
         from smartcam.inspection._inside import Teaching
 
     teaching = Teaching(cell, camera, which)
-    files = [file for one in pictures for file in picture_files(Path(one))]
+    files = [file for picture in pictures for file in picture_files(Path(picture))]
     if changes or learn or save:
         await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
         return
@@ -117,7 +117,9 @@ def _change(
     if learn:
         if not pictures:
             raise click.UsageError("--learn: expected PICTURES of good parts, got none")
-        tools, remarks = learned(tools, {str(file): program.inspect(one) for file, one in pictures})
+        tools, remarks = learned(
+            tools, {str(file): program.inspect(picture) for file, picture in pictures}
+        )
         program = teaching.program(tools)
     for file, picture in pictures:
         _show(str(file), program.inspect(picture), options)
@@ -128,17 +130,17 @@ def _change(
         value["learned"] = remarks
     text = [f"{'saved' if save else 'not saved'}: application {teaching.application}"]
     text += [f"  {key}: {settings}" for key, settings in tools.items()]
-    text += [f"learned {one}" for one in remarks]
+    text += [f"learned {remark}" for remark in remarks]
     options.show(value, "\n".join(text))
 
 
-def _show(file: str, found: Inspection, options: Options) -> None:
+def _show(file: str, inspection: Inspection, options: Options) -> None:
     from smartcam.layout._inside import ShownUnits
 
-    verdict = "ok" if found.ok else f"not ok: {found.reason}"
-    value: dict[str, Any] = {"file": file, "ok": found.ok, "reason": found.reason}
-    value["value"] = found.value
-    text = value_text(found.value, ShownUnits([]), found.layout)
+    verdict = "ok" if inspection.ok else f"not ok: {inspection.reason}"
+    value: dict[str, Any] = {"file": file, "ok": inspection.ok, "reason": inspection.reason}
+    value["value"] = inspection.value
+    text = value_text(inspection.value, ShownUnits([]), inspection.layout)
     options.show(value, f"{file}: {verdict}\n{text}")
 
 
@@ -159,7 +161,7 @@ def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[s
             settings.pop(name, None)
             continue
         try:
-            settings[name] = load(text, what=f"--set {place}")
+            settings[name] = load(text, label=f"--set {place}")
         except BadYamlError as exc:
             raise ConfigurationError(f"--set {place}: {exc}") from exc
     return tools

@@ -108,7 +108,7 @@ def value_text(value: Any, units: ShownUnits, layout: Layout | None) -> str:
     plain, symbols = jsonable(value), units_of(value, layout)
     if isinstance(plain, dict):
         lists = {name: units_of(getattr(value, name, None)) for name in plain}
-        texts = (_field_text(name, one, symbols, units, lists) for name, one in plain.items())
+        texts = (_field_text(name, value, symbols, units, lists) for name, value in plain.items())
         return "\n".join(texts)
     if _is_table(plain):
         return _records_text(plain, symbols, units)
@@ -118,7 +118,7 @@ def value_text(value: Any, units: ShownUnits, layout: Layout | None) -> str:
 
 
 def _is_table(plain: Any) -> bool:
-    return isinstance(plain, list) and bool(plain) and all(isinstance(one, dict) for one in plain)
+    return isinstance(plain, list) and bool(plain) and all(isinstance(item, dict) for item in plain)
 
 
 def _field_text(
@@ -139,7 +139,9 @@ def _field_text(
 def _records_text(rows: list[dict[str, Any]], symbols: Mapping[str, str], units: ShownUnits) -> str:
     """Return a row for each record, with the units in the head."""
     heads = [_head(name, symbols.get(name, ""), units) for name in rows[0]]
-    shown = [[units.shown(one, symbols.get(name, "")) for name, one in row.items()] for row in rows]
+    shown = [
+        [units.shown(value, symbols.get(name, "")) for name, value in row.items()] for row in rows
+    ]
     return table_text(heads, shown)
 
 

@@ -51,12 +51,12 @@ class JsonErrors(click.Command):
         **extra: Any,
     ) -> click.Context:
         """Parse."""
-        with _told_as_json("--json" in args):
+        with _reported_as_json("--json" in args):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run."""
-        with _told_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
+        with _reported_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
             return super().invoke(ctx)
 
 
@@ -85,10 +85,10 @@ MAX_SUMMARY_CHARACTERS = 400
 
 def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:
     """Write the commands of a group with their whole summaries, without hidden ones."""
-    found = [(name, group.commands[name]) for name in group.list_commands(ctx)]
+    commands = [(name, group.commands[name]) for name in group.list_commands(ctx)]
     rows = [
         (name, command.get_short_help_str(MAX_SUMMARY_CHARACTERS))
-        for name, command in found
+        for name, command in commands
         if not command.hidden
     ]
     with formatter.section("Commands"):
@@ -96,7 +96,7 @@ def write_commands(group: click.Group, ctx: click.Context, formatter: click.Help
 
 
 @contextlib.contextmanager
-def _told_as_json(wanted: bool) -> Iterator[None]:
+def _reported_as_json(wanted: bool) -> Iterator[None]:
     try:
         with _options_suggested(), _numbers_explained():
             yield
@@ -153,7 +153,9 @@ def _options_suggested() -> Iterator[None]:
         from smartcam._suggestions import did_you_mean
 
         known = [
-            name for one in exc.ctx.command.params for name in (*one.opts, *one.secondary_opts)
+            name
+            for parameter in exc.ctx.command.params
+            for name in (*parameter.opts, *parameter.secondary_opts)
         ]
         names = [name for name in known if name.startswith("--")]
         end = did_you_mean(exc.option_name, names) or "."

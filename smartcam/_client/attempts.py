@@ -79,8 +79,8 @@ class Try:
         lost = error.__cause__ if isinstance(error, ConnectionLostError) else None
         system = lost if isinstance(lost, OSError) else error
         if timeout and not isinstance(error, SmartCamError):
-            what = f"{self.received} bytes, then silence" if self.received else "silence"
-            self.outcome = f"{what} for {shown_time(waited, coarse=True)}"
+            received_text = f"{self.received} bytes, then silence" if self.received else "silence"
+            self.outcome = f"{received_text} for {shown_time(waited, coarse=True)}"
         elif isinstance(system, OSError) and system.errno is not None and system.errno > 0:
             words = os.strerror(system.errno)  # plainer than "Connect call failed"
             self.outcome = str(system) if words.startswith("Unknown error") else words  # Winsock's
@@ -96,8 +96,10 @@ class Try:
             error = error.__cause__
         if not isinstance(error, OSError):
             return False
-        found = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
-        return not found.isdisjoint(numbers)
+        error_numbers = (
+            {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
+        )
+        return not error_numbers.isdisjoint(numbers)
 
     def __str__(self) -> str:
         """One line for an error text."""
@@ -117,66 +119,66 @@ _NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOW
 
 REASONS: tuple[Reason, ...] = (
     Reason(
-        lambda one: isinstance(one.error, (socket.gaierror, UnicodeError)),
+        lambda attempt: isinstance(attempt.error, (socket.gaierror, UnicodeError)),
         "the name {host!r} does not resolve: {outcome}",
         "Look for a slip in the name, or give the camera's IP address. Names need a DNS server, or "
         "an entry in this machine's hosts file.",
     ),
     Reason(
-        lambda one: isinstance(one.error, (CommandRejectedError, SessionRefusedError)),
+        lambda attempt: isinstance(attempt.error, (CommandRejectedError, SessionRefusedError)),
         "{where} refuses: {outcome}",
         "Address and dialect are right. Look at the password, and for another client.",
     ),
     Reason(
-        lambda one: one.failed_with(errno.ECONNREFUSED),
+        lambda attempt: attempt.failed_with(errno.ECONNREFUSED),
         "nothing listens at {where}: {outcome}",
         "Look at the port ({default} by default), and whether the camera's process interface is "
         "switched on{interface}. A camera that has just been switched on needs about half a "
         "minute.",
     ),
     Reason(
-        lambda one: one.failed_with(*_NO_WAY),
+        lambda attempt: attempt.failed_with(*_NO_WAY),
         "there is no way to {where}: {outcome}",
         "Look at the address, at this machine's network and mask, the cable and the camera's "
         "power: both must be in one network, or have a route.",
     ),
     Reason(
-        lambda one: not one.opened and isinstance(one.error, TimeoutError),
+        lambda attempt: not attempt.opened and isinstance(attempt.error, TimeoutError),
         "nobody answers at {where}, not even with a refusal: {outcome}",
         "Wrong address, no power, another network, or a firewall that drops what comes. Does the "
         "camera answer a ping from this machine?",
     ),
     Reason(
-        lambda one: not one.opened,
+        lambda attempt: not attempt.opened,
         "no connection to {where}: {outcome}",
         "Look at the address, this machine's network and the camera's.",
     ),
     Reason(
-        lambda one: one.hung_up,
+        lambda attempt: attempt.hung_up,
         "{where} takes the connection and hangs up without a word: {outcome}",
         "It may serve another client and refuse newcomers: end the other one. Or it is no "
         "camera, or something else listens at this port.",
     ),
     Reason(
-        lambda one: isinstance(one.error, ProtocolError),
+        lambda attempt: isinstance(attempt.error, ProtocolError),
         "what {where} answers is no camera's language: {outcome}",
         "Something else listens there, or a camera with a dialect that smartcam does not know. "
         "smartcam probe shows every byte.",
     ),
     Reason(
-        lambda one: one.received > 0,
+        lambda attempt: attempt.received > 0,
         "{where} answers, and no session comes of it: {step}: {outcome}",
         "Something else listens there, or the camera's answers get lost. smartcam probe shows "
         "every byte.",
     ),
     Reason(
-        lambda one: one.transport == Transport.UDP.value,
+        lambda attempt: attempt.transport == Transport.UDP.value,
         "nothing comes back from {where}: {outcome}; UDP does not tell whether anybody is there",
         "Look at address, cable and power, whether the camera's process interface is at {port} "
         "({default} by default){interface}, and for another client or dialect.",
     ),
     Reason(
-        lambda one: True,
+        lambda attempt: True,
         "{where} takes the connection and says nothing: {step}: {outcome}",
         "Look whether the camera's process interface is at {port} ({default} by default)"
         "{interface}, and for another client or dialect.",
@@ -187,18 +189,20 @@ REASONS: tuple[Reason, ...] = (
 
 def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
     """Return the reason why attempts failed, and the attempt that shows it."""
-    return next((reason, one) for reason in REASONS for one in tries if reason.fits(one))
+    return next(
+        (reason, attempt) for reason in REASONS for attempt in tries if reason.fits(attempt)
+    )
 
 
-def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
+def words(attempt: Try, address: Address, protocol: Protocol) -> dict[str, str]:
     """Return the words for the placeholders in a reason's texts."""
     names = [transport.value for transport in protocol.schemes.values()]
-    this, others = one.transport.upper(), [name for name in names if name != one.transport]
+    this, others = attempt.transport.upper(), [name for name in names if name != attempt.transport]
     return {
         "where": f"{address.host}:{address.port} ({this})",
         "host": address.host,
-        "outcome": one.outcome,
-        "step": one.step,
+        "outcome": attempt.outcome,
+        "step": attempt.step,
         "port": str(address.port),
         "default": str(protocol.default_port),
         "interface": f" and set to {this}, not to {others[0].upper()}" if others else "",
@@ -207,5 +211,5 @@ def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
 
 def explain(tries: Sequence[Try], address: Address, protocol: Protocol) -> str:
     """Return one cause and one cure for attempts that failed."""
-    reason, one = reason_for(tries)
-    return f"{reason.text}. {reason.cure}".format(**words(one, address, protocol))
+    reason, attempt = reason_for(tries)
+    return f"{reason.text}. {reason.cure}".format(**words(attempt, address, protocol))

@@ -20,7 +20,7 @@ _RUNNING_OR_BUSY = int(Status.RUNNING | Status.BUSY)
 
 
 class Wanted(NamedTuple):
-    """The application and run state that the program wants.
+    """The application and run state that the program has set.
 
     Attributes:
         application: the application that was named, None without one.
@@ -95,7 +95,7 @@ class CameraState:
         self.statuses_received += 1
         self.status, self.endian = status, report.endian
         self.bits = self._last_status = bits
-        if bits & _RUNNING_OR_BUSY == _BUSY:  # it loads an application
+        if bits & _RUNNING_OR_BUSY == _BUSY:  # the camera loads an application
             self._loaded_by_us = False
         elif (
             was is not None
@@ -166,7 +166,7 @@ class CameraState:
         self.active_in_doubt = False
 
     def want(self, wanted: Wanted) -> None:
-        """Note the application and run state that the program wants."""
+        """Note the application and run state that the program has set."""
         self.wanted: Wanted = wanted
         self.expected: int | None = None if self.shared else wanted.application
 

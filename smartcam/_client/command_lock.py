@@ -111,7 +111,7 @@ class CommandLock:
         self._jobs = jobs
         before, self._to_restore = self._to_restore, None
         if before is not None:
-            self._start_job("going_back", self._go_back(before))
+            self._start_job("going_back", self._restore_earlier(before))
         elif restore:
             self._start_job("restoring", self._restore())
 
@@ -222,13 +222,13 @@ class CommandLock:
         if self._jobs is None or self._waits.end is not None:
             self._restore_later(before)
             return None
-        return self._start_job("going_back", self._go_back(before))
+        return self._start_job("going_back", self._restore_earlier(before))
 
-    def _start_job(self, what: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
+    def _start_job(self, label: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
         if self._jobs is None:
             job.close()
             return None
-        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{what}")
+        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{label}")
         self._leaving.add(task)
         task.add_done_callback(self._leaving.discard)
         return task
@@ -305,7 +305,7 @@ class CommandLock:
         self._to_restore = before
         self._state.want(before.wanted)
 
-    async def _go_back(self, before: Before) -> None:
+    async def _restore_earlier(self, before: Before) -> None:
         """Restore application and run state; never raises."""
         await self._adopted()
         async with self._lock:

@@ -26,12 +26,12 @@ class Features:
     """The features of a session's protocol that matter in every trigger.
 
     Attributes:
-        ordered: messages come in order and none is lost (TCP).
+        ordered: messages arrive in order and none is lost (TCP).
         numbered: a trigger may be given a sequence number.
         acknowledged: a trigger is answered.
         polled: the status is sent on request, not by itself.
-        fences: a Query goes out with each trigger; the messages around its answer show whether
-            the camera took the trigger.
+        fences: a Query is sent with each trigger; the messages around its answer show whether
+            the camera accepted the trigger.
         shows_triggers: the status shows each accepted trigger.
         ends_triggers: a trigger without a result is ended before its deadline.
         tells_all: every change of the status is sent, in order, and nothing else shows the outcome
@@ -64,7 +64,8 @@ class Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
-        fences = ordered and not dialect.in_order  # in order, the answer itself is enough
+        # if answers come in order, the answer itself is enough
+        fences = ordered and not dialect.in_order
         tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
         return Features(
             ordered=ordered,
@@ -88,7 +89,7 @@ order."""
 
 @dataclass(eq=False)
 class Connection:
-    """One link after the other.
+    """The current link; a new one replaces it in each session.
 
     Attributes:
         name: the camera's name.
@@ -112,7 +113,7 @@ class Connection:
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
-        """The event loop; kept, since asking for it is a system call in CPython 3.11."""
+        """The event loop, cached: looking it up is a system call in CPython 3.11."""
         return self._loop or asyncio.get_running_loop()
 
     def require_link(self) -> Link:
@@ -137,7 +138,7 @@ class Connection:
         return self.require_link().machine.dialect
 
     def require(self, message_type: type[m.Message]) -> None:
-        """Check that the dialect has a message, before anything is done for it.
+        """Check that the dialect has a message.
 
         Raises:
             UnsupportedError: the dialect has no such message.
@@ -155,5 +156,5 @@ class Connection:
         return self.in_seconds(check_seconds(timeout, "timeout", self.name))
 
     def in_seconds(self, timeout: float) -> float:
-        """Return the loop time in ``timeout`` seconds, which were checked."""
+        """Return the loop time in ``timeout`` seconds, without a check."""
         return (self._loop or asyncio.get_running_loop()).time() + timeout

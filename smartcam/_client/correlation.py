@@ -1,27 +1,27 @@
 """Decide to which trigger a result belongs, since the wire carries no correlation.
 
-A container is a trigger's result only if the camera's messages show that it took this trigger
+A container is a trigger's result only if the camera's messages show that it accepted this trigger
 (:class:`TriggerEvidence` and its subclasses). The absence of contrary evidence is not enough.
 
-If every status is sent (TCP, all dialects but ``bid``), a Query goes out before the trigger and
+If every status is sent (TCP, all dialects but ``bid``), one Query is sent before the trigger and
 one after it, in the same write. The camera handles one message after the other and sends in order
 (inferred). Waiting for Trigger falls whenever an inspection begins, and Overtriggered rises
 whenever a trigger is dropped (a status comes after every change: SC manual p. 29, published).
-So if exactly one inspection begins between the two answers, and Overtriggered was clear all the
-time, that inspection is the trigger's. Its results come after its beginning and before the next
+So if exactly one inspection begins between the two answers, and Overtriggered was clear during
+that time, the inspection is the trigger's. Its results come after its beginning and before the next
 inspection's. If two inspections begin, the trigger's cannot be identified.
 
-If the status must be requested (``bid``), the trigger itself is answered, and its answer is the
-fence: containers before it are older. The status is requested before the trigger and after it, in
+If the status must be requested (``bid``), the camera answers the trigger itself, and containers
+before this answer are older. The status is requested before the trigger and after it, in
 the same write: the first status must show that the camera waits for a trigger, the second that it
 has dropped none, since that bit stays until it is reset.
 
-If the layout of the trigger has an ``@sequence`` field, the number has to be right, too: it is
-set with Set sequence number right before the trigger.
+If the layout of the trigger has an ``@sequence`` field, the number must be right, too. The client
+sets it by Set sequence number right before the trigger.
 
-A trigger that was given up leaves a *debt*; the next trigger settles it first
-(:meth:`~smartcam._client.triggering.Triggers.trigger`). Only results after the beginning of that
-trigger's inspection pay it.
+A trigger that was given up leaves an *owed* result. The next trigger waits for it, or makes it
+impossible (:meth:`~smartcam._client.triggering.Triggers.trigger`). Only a container after the
+beginning of the given-up trigger's inspection can be the owed result.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Debt = Literal["late", "streamed"]
 NUMBER_STEP = 1000
 """Step by which each trigger's number is lower than the number of the trigger before.
 
-Runs triggered by others in between count up from this number, away from the next one.
+Runs that others trigger in between count up from this number, away from the next number.
 """
 
 FEWEST_NUMBERS = 64
@@ -46,21 +46,21 @@ RANGE_OF_FIRST_NUMBER = (1 << 31) - 1
 """Number of values from which a new client draws its first number at random."""
 
 MAX_OWED = 1024
-"""Largest number of given-up triggers kept; the result of an older one counts as streamed."""
+"""Largest number of remembered given-up triggers; results of older ones count as streamed."""
 
 
 class TriggerEvidence:
-    """Evidence that the camera took one trigger; this class is for cameras that give no evidence.
+    """Evidence that the camera accepted a trigger; this class is for cameras without evidence.
 
     Such cameras use UDP, where statuses and their order may be lost, or handle commands one after
     the other, so that an answer needs no proof (In-Sight).
 
     Attributes:
         began: number of observed beginnings of inspections that may belong to the trigger. If every
-            status is reported and ``proven`` is True, the first one does.
-        reached: True if containers that come now are not older than the trigger.
-        proven: True if the messages prove that the camera took this trigger.
-        doubtful: True if the messages can no longer show which trigger the camera took.
+            status is reported and ``proven`` is True, the first of them does.
+        reached: True if containers that arrive now are not older than the trigger.
+        proven: True if the messages prove that the camera accepted this trigger.
+        doubtful: True if the messages can no longer show which trigger the camera accepted.
     """
 
     __slots__ = ("began", "doubtful", "proven", "reached")
@@ -71,16 +71,16 @@ class TriggerEvidence:
         self.doubtful = False
 
     def on_query_answer(self) -> None:
-        """Note that a Query which was written with the trigger is answered."""
+        """Note that a Query that was sent with the trigger is answered."""
 
     def on_trigger_answer(self) -> None:
-        """Note that the trigger itself is answered: the camera has received it."""
+        """Note that the trigger is answered: the camera has received it."""
 
     def on_status(self, status: int) -> None:
         """Note a status."""
 
     def take_round(self) -> bool:
-        """Note all messages of a trigger at once; False if each must be noted by itself."""
+        """Note all messages of a trigger together; return False if they must be noted singly."""
         return False
 
     def on_beginning(self) -> bool:
@@ -99,7 +99,7 @@ class EvidenceByAcknowledgement(TriggerEvidence):
         self.reached = self.proven = False
 
     def on_trigger_answer(self) -> None:
-        """Note that the camera has taken the trigger."""
+        """Note that the camera has accepted the trigger."""
         self.reached = self.proven = True
 
 
@@ -135,12 +135,12 @@ class EvidenceByStatus(TriggerEvidence):
         self._answers = 0  # answers to the Queries before the trigger and after it
 
     def on_query_answer(self) -> None:
-        """Note an answer; at the second answer, exactly one inspection has begun, or will begin."""
+        """Note an answer; the second one completes the count of inspections between both."""
         self._answers += 1
         self.proven = self._answers == 2 and self.began > 0
 
     def on_beginning(self) -> bool:
-        """Count the inspection; two between the answers cannot be distinguished."""
+        """Count the inspection; of two between the answers neither is known to be the trigger's."""
         if not self._answers:
             return False
         self.began += 1
@@ -152,7 +152,7 @@ class EvidenceByStatus(TriggerEvidence):
         return self.reached
 
     def take_round(self) -> bool:
-        """Note an answer, the beginning of an inspection and the other answer, if none came yet."""
+        """Note both answers and one inspection between them, if nothing was noted yet."""
         if self._answers or self.began:
             return False
         self._answers, self.began, self.reached, self.proven = 2, 1, True, True
@@ -172,16 +172,16 @@ class EvidenceByAnswer(TriggerEvidence):
         self._waited: bool | None = None
 
     def on_query_answer(self) -> None:
-        """Note that the next status was requested before the trigger, or is as fresh."""
+        """Note that the next status shows the camera's state before the trigger."""
         self._queried = True
 
     def on_trigger_answer(self) -> None:
-        """Note the trigger's answer: earlier containers are older; a busy camera leaves a doubt."""
+        """Note the trigger's answer; if the camera is busy, the trigger stays doubtful."""
         self.reached = True
         self.doubtful = not self._waited
 
     def on_status(self, status: int) -> None:
-        """Check that the camera waited for the trigger, and has dropped none."""
+        """Check that the camera waited for the trigger, and dropped no trigger."""
         if self.reached:
             if status & _OVERTRIGGERED:
                 self.doubtful = True
@@ -193,16 +193,16 @@ class EvidenceByAnswer(TriggerEvidence):
 
 @dataclass(slots=True, eq=False)
 class SentTrigger:
-    """The trigger under way.
+    """A trigger that was sent.
 
     Attributes:
         wanted: number of results expected.
         number: sequence number set for it, None if its layout has none.
         evidence: evidence from the camera's messages.
         received: number of its received results.
-        early: containers received before the camera showed that it had taken the trigger.
-        given_up: True if it was given up; its missing results are pending.
-        ended: True if no caller waits for it any more.
+        early: containers received before the camera showed that it had accepted the trigger.
+        given_up: True if the trigger was given up; its missing results are owed.
+        ended: True if its caller no longer waits.
     """
 
     wanted: int
@@ -219,9 +219,9 @@ class Match:
     """The trigger to which a container belongs, if any.
 
     Attributes:
-        fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of a given-up
-            trigger; ``nobody``: of no trigger of this client.
-        extra: True for one more result of a trigger that has all its results.
+        fate: ``triggered``: result of the running trigger; ``late`` or ``streamed``: result of a
+            given-up trigger; ``nobody``: result of no trigger of this client.
+        extra: True for a further result of a trigger that has all its results.
     """
 
     fate: Literal["triggered", "late", "streamed", "nobody"]
@@ -237,7 +237,7 @@ _OVERTRIGGERED = int(Status.OVERTRIGGERED)
 
 @dataclass(slots=True, eq=False)
 class _Owed:
-    """Results of a given-up trigger, which may still come."""
+    """Results of a given-up trigger, which may still arrive."""
 
     fate: Debt
     number: int | None
@@ -246,18 +246,18 @@ class _Owed:
 
 
 class Correlation:
-    """Decides to which trigger each container belongs; knows no wire and no time.
+    """Decides to which trigger each container belongs, without I/O and time.
 
     Args:
-        chance: random place at which the numbers begin, 0 to 1: results of another client may
-            still be on their way, and their numbers are most probably different.
+        chance: random share of the range of numbers at which numbers begin, 0 to 1: so results of
+            another client that still arrive most probably have other numbers.
 
     Attributes:
-        pending: the trigger under way.
-        satisfied: the last trigger has its results, and no inspection was observed since.
-        owed: results of triggers that were given up, which may still come; the oldest first.
-        doubted: the status may be older than the last trigger, which was given up: it may show that
-            the camera waits for a trigger although it has one.
+        pending: the running trigger.
+        satisfied: whether the last trigger has its results, and no inspection was observed since.
+        owed: results of given-up triggers, which may still arrive; the oldest first.
+        doubted: whether the status may be older than the last trigger, which was given up. Then it
+            may show that the camera waits although it is inspecting.
     """
 
     def __init__(self, chance: float) -> None:
@@ -268,21 +268,21 @@ class Correlation:
         # evidence of the last trigger, until it has its results
         self._last: TriggerEvidence | None = None
         self.owed: list[_Owed] = []
-        # debts by the triggers' numbers; their results are late whenever they come
+        # owed results by the triggers' numbers; they are late whenever they arrive
         self._given_up: dict[int, Debt] = {}
         self._last_number: int | None = None  # number of the last trigger that had its results
         self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
-        self._given: int | None = None
+        self._newest_given: int | None = None
 
     @property
     def debt(self) -> Debt | None:
-        """Fate of the result of an earlier trigger that may still come."""
+        """Fate of the result of an earlier trigger that may still arrive."""
         return self.owed[0].fate if self.owed else None
 
     # ------------------------------------------------------------------ the session
 
     def begin_session(self, *, complete: bool) -> None:
-        """Begin on a new link: pending results of earlier triggers may still come over it.
+        """Begin a session; owed results of earlier triggers may still arrive in it.
 
         Args:
             complete: every change of the status is sent, in order.
@@ -290,12 +290,12 @@ class Correlation:
         self._complete = complete
         self.satisfied = self.doubted = False
         self._last = None
-        for one in self.owed:  # the report of its beginning may have been lost
-            one.evidence = TriggerEvidence()
-            one.evidence.began = 1
+        for owed in self.owed:  # the status with its inspection's beginning may have been lost
+            owed.evidence = TriggerEvidence()
+            owed.evidence.began = 1
 
     def settled(self) -> None:
-        """Note that no older result can come, since the application was stopped."""
+        """Note that no older result can arrive, since the application was stopped."""
         self.owed.clear()
         self.satisfied = self.doubted = False
         self._last = None
@@ -303,11 +303,11 @@ class Correlation:
     def note_query_answered(self) -> None:
         """Note that all earlier messages are received, since a later Query is answered.
 
-        A trigger without a sign by now was not taken: it will have no result.
+        A trigger without a sign of an inspection was not accepted: it will have no result.
         """
         self.doubted = False
         if self._complete:
-            self.owed = [one for one in self.owed if one.evidence.began]
+            self.owed = [owed for owed in self.owed if owed.evidence.began]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
@@ -318,7 +318,7 @@ class Correlation:
         Args:
             highest: largest number that the field holds.
         """
-        given, self._given = self._given, None
+        given, self._newest_given = self._newest_given, None
         used = given is None or given in self._given_up or given == self._last_number
         if given is not None and given <= highest and not used:
             return given
@@ -328,17 +328,17 @@ class Correlation:
 
     def give_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
-        self._given = number
+        self._newest_given = number
 
     def send(self, pending: SentTrigger) -> None:
         """Note that a trigger is sent now."""
         self.pending, self.satisfied = pending, False
         self._last = pending.evidence
         if pending.number is None:
-            self._given = None  # the trigger's run uses it
+            self._newest_given = None  # the trigger's run uses it
 
     def leave(self) -> None:
-        """Note that the trigger's caller goes on."""
+        """Note that the trigger's caller no longer waits."""
         self.pending = None
 
     def done(self, pending: SentTrigger) -> None:
@@ -347,11 +347,11 @@ class Correlation:
         self._last = None
 
     def give_up(self, pending: SentTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
-        """End the caller's wait for the trigger; its results may still come.
+        """End the caller's wait for the trigger, whose results may still arrive.
 
         Args:
             pending: the trigger.
-            fate: fate of the results that still come.
+            fate: fate of results that arrive later.
             unread: number of its containers that could not be interpreted.
         """
         # without evidence the received results may belong to another trigger
@@ -371,20 +371,20 @@ class Correlation:
     # ------------------------------------------------------------------ what comes
 
     def on_query_answer(self) -> None:
-        """Note that a Query which was written with the last trigger is answered."""
+        """Note that a Query that was sent with the last trigger is answered."""
         if self._last is not None:
             self._last.on_query_answer()
 
     def on_trigger_answer(self) -> None:
-        """Note that the last trigger itself is answered, and was not refused."""
+        """Note that the last trigger was acknowledged."""
         if self._last is not None:
             self._last.on_trigger_answer()
 
     def take_round(self, pending: SentTrigger) -> bool:
         """Note two answers, and one inspection between them; return False in any other case.
 
-        These cases: a result of the trigger has come already, an earlier one is pending, or the
-        evidence is of another kind. Otherwise a container after the inspection is this trigger's.
+        The other cases: the trigger already has a result, an earlier result is owed, or the
+        evidence is of another kind. After True, a container after the inspection is this trigger's.
         """
         evidence = pending.evidence
         if not self._complete or self.owed or self._last is not evidence:
@@ -415,13 +415,13 @@ class Correlation:
             self.doubted = False
             return False
         self.satisfied = False
-        self._given = None  # that run uses it
+        self._newest_given = None  # the run of this trigger uses the number
         return self._complete and previous is not None
 
-    def judge_marked(self, asked: bool) -> Match:
+    def judge_marked(self, is_ours: bool) -> Match:
         """Return the trigger of a container if the wire shows whether it answers this client."""
         pending = self.pending
-        if not asked:
+        if not is_ours:
             return NOBODYS
         if pending is not None and not pending.ended:
             return OURS if pending.received < pending.wanted else EXTRA
@@ -445,29 +445,29 @@ class Correlation:
         return self.judge_older(number)
 
     def judge_older(self, number: int | None) -> Match:
-        """Return the trigger of a container that does not belong to the trigger under way."""
+        """Return the trigger of a container that does not belong to the running trigger."""
         if number is not None and number in self._given_up:
-            self._pay([one for one in self.owed if one.number == number])
+            self._pay([owed for owed in self.owed if owed.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
             return EXTRA
-        # an unknown number may be that of a trigger that was sent without a number
+        # an unknown number may belong to a trigger that was sent without a number
         if self.owed:
             open_ = [
-                one
-                for one in self.owed
-                if (number is None or one.number is None) and self._may_pay(one.evidence)
+                owed
+                for owed in self.owed
+                if (number is None or owed.number is None) and self._may_pay(owed.evidence)
             ]
             if open_:
                 return Match(self._pay(open_))
         return EXTRA if self.satisfied and number is None else NOBODYS
 
     def _may_pay(self, run: TriggerEvidence) -> bool:
-        """Return True if a container that comes now may be of a run that has begun."""
+        """Return True if a container that arrives now may belong to a run that has begun."""
         return bool(run.began) or (run.reached and not self._complete)
 
     def _pay(self, owed: list[_Owed]) -> Debt:
-        """Note that a result of the first of these debts has come."""
+        """Note that the first of these owed results has arrived."""
         if not owed:
             return "late"
         owed[0].missing -= 1

@@ -43,13 +43,13 @@ class Times:
 
     def histogram(self) -> Histogram:
         """Return a snapshot of the counts."""
-        some = self._longest >= self._shortest
+        has_any = self._longest >= self._shortest
         return Histogram(
             HISTOGRAM_BOUNDS,
             tuple(self._counts),
             self._total,
-            self._shortest if some else None,
-            self._longest if some else None,
+            self._shortest if has_any else None,
+            self._longest if has_any else None,
         )
 
 
@@ -82,7 +82,7 @@ class ClientCounters:
         self.last_error: str | None = None
         self.round_trip: Times = Times()
         self.processing: Times = Times()
-        self._wire = Counters()  # of the links that are over
+        self._wire = Counters()  # counts of the links that have ended
         self._open: Counters | None = None
 
     def count(self, fate: str, containers: int = 1) -> None:

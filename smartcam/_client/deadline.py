@@ -55,9 +55,9 @@ class DeadlineTimer:
 
     def _start_timer(self, at: float) -> None:
         self._at = at
-        self._timer = asyncio.get_running_loop().call_at(at, self._go_off)
+        self._timer = asyncio.get_running_loop().call_at(at, self._on_timer)
 
-    def _go_off(self) -> None:
+    def _on_timer(self) -> None:
         at, deadline = self._at, self._deadline
         self._timer = None
         if deadline is None:

@@ -71,7 +71,7 @@ class _Round(NamedTuple):
         ended: status when the camera waits again.
         last: answer to the Query after the trigger.
         application: the application that both answers name.
-        bits: bits of the last status, equal to those of the status before.
+        bits: bits of the last status, equal to the bits of the status before.
         endian: byte order in both statuses.
     """
 
@@ -203,8 +203,8 @@ class Dispatch:
     def _only_streams(self) -> bool:
         """Return True if no task needs statuses, and containers go to streams in any case."""
         waits, listeners = self._waits, self._listeners
-        heard = waits.answers or waits.statuses or listeners.hears_statuses
-        return not (heard or listeners.sees_events) and self._results.only_streams
+        has_listeners = waits.answers or waits.statuses or listeners.hears_statuses
+        return not (has_listeners or listeners.sees_events) and self._results.only_streams
 
     def fail(self, error: SmartCamError) -> None:
         """End the session: every wait ends with an error, also one begun before the next session.

@@ -1,13 +1,13 @@
 """Wake the receive task, and callers that wait for it, without a turn of the event loop.
 
-A future wakes its task by way of the event loop: a handle, another turn, another system call.
-That costs more than processing the bytes of a delivery. A caller that rings this doorbell from
-a callback of the loop, as a transport does, makes the task go on at once. It is still a task: an
-exception in it ends the task, and never reaches the caller.
+A future wakes its task through the event loop, which takes a handle, another turn and another
+system call. That costs more than processing the bytes of a delivery. If a callback of the loop,
+such as a transport's, rings this doorbell, the task continues at once. It is still a task: an
+exception in it ends the task, and never reaches the callback.
 
-A caller that waits for a :class:`DirectFuture` goes on in the same way, once the receive task
-sleeps again: no task can begin a step within another one's. A result that comes otherwise, such as
-a timeout, wakes the caller by way of the loop.
+A caller that waits for a :class:`DirectFuture` continues in the same way when the receive task
+sleeps again, since no task can take a step within another task's step. Other outcomes, such as a
+timeout, wake the caller through the loop.
 
 :class:`Doorbell` and :class:`DirectFuture` use the protocol between asyncio's tasks and futures
 (``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` uses
@@ -34,7 +34,7 @@ PLAIN = os.environ.get("SMARTCAM_DOORBELL") == "plain"
 
 
 class Doorbell:
-    """One task may ``await`` it repeatedly; :meth:`ring` makes the task go on.
+    """An object that one task awaits repeatedly; :meth:`ring` makes the task continue.
 
     Args:
         loop: event loop of the task and of the callers.
@@ -54,7 +54,7 @@ class Doorbell:
         self._context: contextvars.Context | None = None
 
     def ring(self) -> None:
-        """Make the task go on at once; in the loop's next turn if a task calls this."""
+        """Make the task continue at once, or in the loop's next turn if the caller is a task."""
         wake, context = self._wake, self._context
         if wake is None or context is None:
             return
@@ -65,9 +65,10 @@ class Doorbell:
             self._loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
-        """Make the task go on as :meth:`ring` does, then the callers whose outcomes it has set.
+        """Make the task continue like :meth:`ring`, then the callers whose outcomes it has set.
 
-        The loop raises exceptions that end the program: a transport would take them for its own.
+        Exceptions that end the program are raised in the loop, since a transport would handle them
+        as errors of its own.
         """
         wake, context, loop = self._wake, self._context, self._loop
         if wake is None or context is None or asyncio.current_task(loop) is not None:
@@ -87,9 +88,9 @@ class Doorbell:
                 loop.call_soon(_raise, exc)
 
     def wake_in_order(self) -> None:
-        """Wake the callers of this delivery by way of the loop, after the tasks that are ready.
+        """Wake the callers of this delivery through the loop, after the tasks that are ready.
 
-        Subscribers then have a result before its trigger's caller goes on.
+        So subscribers get a result before its trigger's caller continues.
         """
         due, self.due = self.due, None
         for outcome in due or ():
@@ -121,7 +122,7 @@ class Doorbell:
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
     ) -> None:
-        """Note that the task sleeps now; ``wake`` makes it go on."""
+        """Note that the task sleeps now; ``wake`` makes it continue."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
@@ -164,7 +165,7 @@ class DirectFuture(Generic[T]):
         return self._cancelled
 
     def set_result(self, value: T) -> None:
-        """Make the task go on with a result.
+        """Make the task continue with a result.
 
         Raises:
             asyncio.InvalidStateError: the outcome is set already.
@@ -179,7 +180,7 @@ class DirectFuture(Generic[T]):
             due.append(self)
 
     def set_exception(self, error: BaseException) -> None:
-        """Make the task go on with an error.
+        """Make the task continue with an error.
 
         Raises:
             asyncio.InvalidStateError: the outcome is set already.
@@ -194,13 +195,13 @@ class DirectFuture(Generic[T]):
         return self._error
 
     def wake(self) -> None:
-        """Make the task go on at once, if it waits."""
+        """Make the task continue at once, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None and self._context is not None:
             self._context.run(wake, self)
 
     def wake_soon(self) -> None:
-        """Make the task go on in the loop's next turn, if it waits."""
+        """Make the task continue in the loop's next turn, if it waits."""
         wake, self._wake = self._wake, None
         if wake is not None:
             self._loop.call_soon(wake, self, context=self._context)
@@ -221,7 +222,7 @@ class DirectFuture(Generic[T]):
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
-        """Wake the task with a CancelledError; False: it was woken already."""
+        """Wake the task with a CancelledError; return False if it was woken already."""
         if self._done:
             return False
         self._done = self._cancelled = True
@@ -231,7 +232,7 @@ class DirectFuture(Generic[T]):
 
     def result(self) -> T:
         """Return the result, or raise the error."""
-        error, self._error = self._error, None  # once raised, it refers to the waiting task
+        error, self._error = self._error, None  # a raised error refers to the waiting task
         if error is not None:
             raise error
         return self._value  # type: ignore[return-value]  # done
@@ -241,13 +242,13 @@ Waiter: TypeAlias = "DirectFuture[None] | asyncio.Future[None]"
 
 
 def wake(waiter: Waiter) -> None:
-    """Make the waiting task go on, unless it does already."""
+    """Wake the waiting task, unless it was woken already."""
     if not waiter.done():
         waiter.set_result(None)
 
 
 async def outlast(task: asyncio.Task[Any]) -> None:
-    """Wait until a task has ended, in any way; as ``asyncio.wait`` for one task, in fewer steps.
+    """Wait until a task has ended in any way, like ``asyncio.wait`` but in fewer steps.
 
     Cancellation: the task is left alone.
     """
@@ -270,7 +271,7 @@ def _raise(error: BaseException) -> NoReturn:
 
 
 class PlainDoorbell:
-    """A doorbell with a future: a ring makes the task go on in the loop's next turn.
+    """A doorbell with a future: a ring makes the task continue in the loop's next turn.
 
     Args:
         loop: event loop of the task and of the callers.
@@ -286,23 +287,23 @@ class PlainDoorbell:
         self._ringing: asyncio.Future[None] | None = None
 
     def ring(self) -> None:
-        """Make the task go on."""
+        """Make the task continue."""
         if self._ringing is not None and not self._ringing.done():
             self._ringing.set_result(None)
 
     def deliver(self) -> None:
-        """Make the task go on; callers whose outcome comes go on after it, by way of the loop."""
+        """Make the task continue; callers continue after it, through the loop."""
         self.ring()
 
     def wake_in_order(self) -> None:
-        """Do nothing: all go on by way of the loop."""
+        """Do nothing, since all callers continue through the loop anyway."""
 
     def outcome(self) -> asyncio.Future[Any]:
         """Return an outcome that one task may wait for."""
         return self._loop.create_future()
 
     def give(self, outcome: Outcome, value: object) -> None:
-        """Give an outcome its result: its task goes on by way of the loop."""
+        """Set the result of an outcome; its task continues through the loop."""
         outcome.set_result(value)
 
     def __await__(self) -> Generator[Any, None, None]:

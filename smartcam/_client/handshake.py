@@ -339,7 +339,7 @@ async def establish(
     round_tries: list[Try] = []
     for left in range(settings.connect_attempts, 0, -1):
         if isinstance(cause, CommandRejectedError):
-            break  # it refused, and would again
+            break  # the camera refused, and would refuse again
         round_tries = []
         end = loop.time() + (deadline - loop.time()) / left
         hurried = len(groups) > 1 and left == settings.connect_attempts > 1
@@ -372,14 +372,16 @@ async def establish(
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):
                 break  # another dialect would fail, too, in this round
             if progress.step != CONNECTING:
-                groups = [dialects]  # it answered the Connect, so this is its dialect
+                groups = [dialects]  # the camera answered the Connect, so this is its dialect
                 break
     why = explain(round_tries, address, protocol)
     raise ConnectFailedError(
         f"{settings.name}: no session with {address.url}: {why}",
         host=address.host,
         port=address.port,
-        attempts=tuple(f"attempt {number}: {one}" for number, one in enumerate(tries, 1)),
+        attempts=tuple(
+            f"attempt {number}: {attempt_made}" for number, attempt_made in enumerate(tries, 1)
+        ),
     ) from cause
 
 

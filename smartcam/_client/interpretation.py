@@ -1,8 +1,8 @@
 """Make a :class:`~smartcam.Result` from a result container: choose the interpreter, and run it.
 
 ``interpret_as`` is one specification for all containers, or a mapping from application id to one.
-``calibration`` follows the interpreter, for all applications or for each one; with it, only values
-that it has turned into poses of the robot pass.
+``calibration`` is applied after the interpreter, one for all applications or one for each. Then
+only values that are poses of the robot are returned.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def byte_order(endian: int) -> ByteOrder:
     )
 
 
-# takes half the time of a NamedTuple's own; a cast, since a bare tuple is generic
+# faster than a NamedTuple's own constructor; the cast gives it a type
 new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 MAX_NUMBER = (1 << 31) - 1
-"""Largest own sequence number: it fits into an int32 in the container."""
+"""Largest sequence number of a trigger: it fits into an int32 in the container."""
 
 
 Interpreted: TypeAlias = tuple[Any, int | None, int]
@@ -68,11 +68,11 @@ Interpreted: TypeAlias = tuple[Any, int | None, int]
 
 
 class Numbering(NamedTuple):
-    """The form in which a layout carries the sequence number.
+    """The place of the sequence number in a layout.
 
     Attributes:
-        highest: the largest number that its field holds, at most 2^31 - 1.
-        always: whether each container has it; False if it is in a record that may be missing.
+        highest: the largest number that the field holds, at most 2^31 - 1.
+        always: whether each container has the number, not only those with records.
     """
 
     highest: int
@@ -112,30 +112,34 @@ class Interpretation:
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
         self._endian = 0
-        self._one: _ApplicationReader | None = None
+        self._reader_of_all: _ApplicationReader | None = None
         self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
-            for application, one in spec.items():
+            for application, interpreter in spec.items():
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{shown(application)} is no id"
                     )
-                self._by_application[application] = _way(resolve(one, lenient=lenient), own)
+                self._by_application[application] = _reader_for(
+                    resolve(interpreter, lenient=lenient), own
+                )
         else:
-            self._one = _raw(own) if spec is None else _way(resolve(spec, lenient=lenient), own)
+            self._reader_of_all = (
+                _raw(own) if spec is None else _reader_for(resolve(spec, lenient=lenient), own)
+            )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
-            if self._one is not None:
-                self._calibrations.check(None, self._one.interpreter)
-            for application, way in self._by_application.items():
-                self._calibrations.check(application, way.interpreter)
-        self.by_application: bool = self._one is None
+            if self._reader_of_all is not None:
+                self._calibrations.check(None, self._reader_of_all.interpreter)
+            for application, reader in self._by_application.items():
+                self._calibrations.check(application, reader.interpreter)
+        self.by_application: bool = self._reader_of_all is None
 
     @property
     def layout(self) -> Layout | None:
         """Layout of every container; None if there is none, or one for each application."""
-        return None if self._one is None else self._one.interpreter.layout
+        return None if self._reader_of_all is None else self._reader_of_all.interpreter.layout
 
     @property
     def applications(self) -> tuple[int, ...]:
@@ -144,46 +148,46 @@ class Interpretation:
 
     def interpreter(self, application: int | None) -> Interpreter | None:
         """Return the interpreter of an application; None for one that is not known."""
-        way = self._way(application)
-        return None if way is None else way.interpreter
+        reader = self._reader_for(application)
+        return None if reader is None else reader.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return the place of the number in this application's containers, None without one."""
-        way = self._one or self._way(application)
-        return way.numbering if way is not None else None
+        reader = self._reader_of_all or self._reader_for(application)
+        return reader.numbering if reader is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
         """Return the layouts with a number in them, in the form of ``interpret_as``."""
-        if self._one is not None:
-            return _numbered(self._one)
-        texts = {key: _numbered(way) for key, way in self._by_application.items()}
+        if self._reader_of_all is not None:
+            return _numbered(self._reader_of_all)
+        texts = {key: _numbered(reader) for key, reader in self._by_application.items()}
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
         """Return a container's sequence number, None if it has none or does not fit."""
-        way = self._way(container.application)
-        if way is None or way.interpreter.layout is None:
+        reader = self._reader_for(container.application)
+        if reader is None or reader.interpreter.layout is None:
             return None
         try:
-            return way.interpreter.layout.sequence(container.data, byte_order(endian))
+            return reader.interpreter.layout.sequence(container.data, byte_order(endian))
         except InterpretationError:
             return None
 
-    def _way(self, application: int | None) -> _ApplicationReader | None:
-        if self._one is not None or application is None:
-            return self._one
+    def _reader_for(self, application: int | None) -> _ApplicationReader | None:
+        if self._reader_of_all is not None or application is None:
+            return self._reader_of_all
         return self._by_application.get(application)
 
-    def _known(self, application: int) -> _ApplicationReader:
-        way = self._way(application)
-        if way is None:
+    def _known_reader(self, application: int) -> _ApplicationReader:
+        reader = self._reader_for(application)
+        if reader is None:
             known = sorted(self._by_application)
             raise WrongApplicationError(
                 f"a result of application {application} came; interpret_as knows {known}",
                 expected=known,
                 got=application,
             )
-        return way
+        return reader
 
     def __call__(
         self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
@@ -195,15 +199,15 @@ class Interpretation:
                 value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        way = self._one or self._known(container.application)
-        interpreter, simple = way.interpreter, way.simple
+        reader_of_application = self._reader_of_all or self._known_reader(container.application)
+        interpreter, simple = reader_of_application.interpreter, reader_of_application.simple
         data = container.data
         if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
-        if simple is not None and not way.sequenced:
+        if simple is not None and not reader_of_application.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
-            if self._calibrations is not None and way.calibrated:
+            if self._calibrations is not None and reader_of_application.calibrated:
                 value = self._calibrations.apply(value, container.application)
             return value, None, context.empty_slots
         order = byte_order(endian)
@@ -212,15 +216,15 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
-        if self._calibrations is not None and way.calibrated:
+        if self._calibrations is not None and reader_of_application.calibrated:
             value = self._calibrations.apply(value, container.application)
-        sequence = run_sequence(interpreter, reader) if way.sequenced else None
+        sequence = run_sequence(interpreter, reader) if reader_of_application.sequenced else None
         return value, sequence, context.empty_slots
 
     def _context(
         self, application: int, endian: int, camera: str, number: int, at: datetime
     ) -> Context:
-        """Return the context for a plain interpreter: always one object, as none keeps it."""
+        """Return the context for a plain interpreter, a shared object."""
         context = self._plain_context
         if endian != self._endian:
             context.byte_order, self._endian = byte_order(endian), endian
@@ -239,20 +243,25 @@ class Interpretation:
         number: int,
         at: datetime,
     ) -> tuple[Sequence[Any], int] | None:
-        """Return the values of several containers that came together, and their empty slots.
+        """Return the values of several containers that arrived together, and their empty slots.
 
-        None if they are to be interpreted one by one: the interpreter uses a Reader, a sequence
+        None if the containers must be interpreted singly: the interpreter uses a Reader, a sequence
         number must be read, or one container does not fit.
         """
-        way = self._way(application)
-        if way is None or way.simple is None or way.sequenced or endian not in _BYTE_ORDERS:
+        reader = self._reader_for(application)
+        if (
+            reader is None
+            or reader.simple is None
+            or reader.sequenced
+            or endian not in _BYTE_ORDERS
+        ):
             return None
         context = self._context(application, endian, camera, number, at)
         try:
-            values = way.simple.read_all(payloads, context)
+            values = reader.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None and way.calibrated:
-                # each alone, so that its bits do not depend on the way it came
+            if self._calibrations is not None and reader.calibrated:
+                # one by one, so that the bits of a value do not depend on its companions
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
             raise
@@ -262,7 +271,7 @@ class Interpretation:
 
 
 class _Calibrations:
-    """The calibrations that each application's values go through.
+    """The calibrations that are applied to each application's values.
 
     Args:
         given: a value of ``calibration``, not None.
@@ -274,27 +283,29 @@ class _Calibrations:
     """
 
     def __init__(self, given: Any, y_down: bool) -> None:
-        self._one: Calibration | None = None
+        self._reader_of_all: Calibration | None = None
         self._by_application: dict[int, Calibration | None] | None = None
         if hasattr(given, "to_robot") or not hasattr(given, "items"):
-            self._one = _calibration(given, y_down)
+            self._reader_of_all = _calibration(given, y_down)
             return
         self._by_application = {}
-        for application, one in given.items():
+        for application, calibration in given.items():
             number = check_application(application, "calibration: application")
-            self._by_application[number] = None if one is None else _calibration(one, y_down)
+            self._by_application[number] = (
+                None if calibration is None else _calibration(calibration, y_down)
+            )
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
-        """Raise if no value of an interpreter would ever pass.
+        """Raise if the calibration can apply to no value of an interpreter.
 
         Args:
             application: id of the application whose results are read; None: any.
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: no value would pass; the text names the possible values.
+            ConfigurationError: the calibration applies to none; the text names the possible values.
         """
-        given, known = [self._one], self._by_application
+        given, known = [self._reader_of_all], self._by_application
         of = "" if application is None else f" of application {application}"
         if known is not None:
             if application is not None and application not in known:
@@ -312,7 +323,7 @@ class _Calibrations:
             )
 
     def apply(self, value: object, application: int) -> Any:
-        """Return localizations in the robot's frame; if the calibration is None, any value.
+        """Return localizations in the robot's frame; the value itself if the calibration is None.
 
         Raises:
             InterpretationError: the value is no list of localizations, or the calibration failed,
@@ -331,7 +342,7 @@ class _Calibrations:
                 got=type(value).__name__,
             )
         try:
-            found: object = calibration.to_robot(parts)
+            transformed: object = calibration.to_robot(parts)
         except CalibrationError as exc:
             raise InterpretationError(
                 f"calibration: {exc}", expected=exc.expected, got=exc.got
@@ -341,20 +352,21 @@ class _Calibrations:
         except BaseException as exc:
             text = text_of(exc)
             raise InterpretationError(f"the calibration failed with {text}", got=text) from exc
-        made = localizations_of(found)
+        made = localizations_of(transformed)
         if made is None or len(made) != len(parts):
-            got = type(found).__name__ if made is None else len(made)
+            actual = type(transformed).__name__ if made is None else len(made)
             raise InterpretationError(
-                f"calibration: expected to_robot to return {len(parts)} localizations, got {got}",
+                f"calibration: expected to_robot to return {len(parts)} localizations, "
+                f"got {actual}",
                 expected=len(parts),
-                got=got,
+                got=actual,
             )
         return made
 
     def _of(self, application: int) -> Calibration | None:
         known = self._by_application
         if known is None:
-            return self._one
+            return self._reader_of_all
         if application not in known:
             raise WrongApplicationError(
                 f"a result of application {application} came; calibration knows {sorted(known)}",
@@ -399,9 +411,9 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 
 def without_poses(interpreter: Interpreter) -> str | None:
     """Return an interpreter's name if it is in ``_WITHOUT_POSES``; a subclass does not count."""
-    # exactly these types: a user's subclass may give anything
-    found = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
-    return next(found, None)
+    # exactly these types, since a subclass may return any value
+    names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
+    return next(names, None)
 
 
 def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
@@ -450,15 +462,15 @@ class _ApplicationReader:
 @functools.cache
 def _raw(own: bool) -> _ApplicationReader:
     """Return the reader without a specification: plain bytes, the same reader for each client."""
-    return _way(resolve(None), own)
+    return _reader_for(resolve(None), own)
 
 
-def _numbered(way: _ApplicationReader) -> str | None:
-    layout = way.interpreter.layout
-    return None if way.numbering is None or layout is None else layout.text
+def _numbered(reader: _ApplicationReader) -> str | None:
+    layout = reader.interpreter.layout
+    return None if reader.numbering is None or layout is None else layout.text
 
 
-def _way(interpreter: Interpreter, own: bool) -> _ApplicationReader:
+def _reader_for(interpreter: Interpreter, own: bool) -> _ApplicationReader:
     layout = interpreter.layout
     sequenced = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None

@@ -1,10 +1,10 @@
-"""Notice a camera that is gone without a message: a pulled cable, a lost supply.
+"""Detect that a camera was lost without a message, as with a pulled cable or a lost supply.
 
-Any received byte is a sign of life. A camera need not send any, so after half the timeout without a
-byte a Query asks for one, and the camera has the whole timeout from then on: a shorter pause ends
-no session, and a camera that is gone is noticed at the latest one and a half timeouts after its
-last byte. While an application is loaded the camera may be silent for longer: then it is asked only
-after ``switch_timeout``.
+Any received byte is a sign of life. A camera need not send bytes by itself, so after half the
+timeout without a byte the client sends a Query, and the camera has the whole timeout to answer. So
+no pause shorter than the timeout ends a session, and a loss is detected at most one and a half
+timeouts after the last byte. While an application is loaded, the camera may be silent for longer:
+then the Query is sent only after ``switch_timeout``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class KeepAlive:
     _requests: Requests
     _waits: Waits
     _state: CameraState
-    _timeout: float | None  # seconds that a camera has for a sign of life; None: no end
+    _timeout: float | None  # seconds that a camera has for a sign of life; None: unlimited
     _switch_timeout: float  # seconds that loading an application may take
 
     def watch(self, link: Link) -> Callable[[], None]:
-        """Watch a link; return the function that ends this."""
+        """Watch a link; return the function that ends the watch."""
         if self._timeout is None:
             return _nothing
         watch = _Watch(self, link, self._timeout)
@@ -46,12 +46,14 @@ class KeepAlive:
         return watch.stop
 
     def ask(self, due: float) -> None:
-        """Ask for a sign of life, to come until ``due`` (loop time)."""
-        with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports that
+        """Ask for a sign of life, which is awaited until ``due`` (loop time)."""
+        with contextlib.suppress(
+            SmartCamError
+        ):  # the link has ended: the receive task reports this
             self._requests.ask_for_life(due)
 
     def patience(self, usual: float) -> float:
-        """Return the seconds of allowed silence: more during a switch, or a trigger with an answer.
+        """Return the allowed silence, seconds: longer during a switch, or a trigger with an answer.
 
         The trigger may also be another program's.
         """
@@ -64,13 +66,13 @@ def _nothing() -> None: ...
 
 
 class _Watch:
-    """A timer, which is set again each time it fires, and never by received bytes."""
+    """A timer that is set again each time it fires; received bytes do not move it."""
 
     def __init__(self, owner: KeepAlive, link: Link, timeout: float) -> None:
         self._owner = owner
         self._link = link
-        self._timeout = timeout  # seconds that the camera has for a sign of life once it is asked
-        self._quiet = timeout / 2  # seconds of silence before the camera is asked
+        self._timeout = timeout  # seconds that the camera has to answer a Query
+        self._quiet = timeout / 2  # seconds of silence before a Query is sent
         self._loop = asyncio.get_running_loop()
         self._asked_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -92,7 +94,7 @@ class _Watch:
                 self._owner.ask(now + self._timeout)
                 when = now + self._quiet
             else:
-                # a load may begin or end meanwhile, so look at each step
+                # a load may begin or end, so check again at each step
                 when = min(heard_at + quiet, now + self._quiet)
         else:
             end = self._asked_at + self._timeout
@@ -100,6 +102,6 @@ class _Watch:
                 silence = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
                 self._link.give_up(TimeoutError(silence))
                 return
-            # the camera may answer meanwhile, so look again when the next question is due
+            # the camera may answer, so check again when the next Query is due
             when = min(end, now + self._quiet)
         self._timer = self._loop.call_at(when, self.look)

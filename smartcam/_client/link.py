@@ -1,9 +1,9 @@
 """One TCP or UDP link to a camera, used once.
 
-The transport hands bytes to the machine of ``protocols/``. Its events wait in a bounded queue, as
-a chunk for each delivery, for the receive task, which takes one chunk in a turn of the event
-loop (:meth:`Link.receive`). So nothing that a chunk causes runs in the transport's callbacks, and a
-camera that floods takes no more of a turn than others.
+The transport passes bytes to the machine of ``protocols/``. The machine's events of each delivery
+wait as a chunk in a bounded queue. The receive task takes one chunk in a turn of the event loop
+(:meth:`Link.receive`). So no user code runs in the transport's callbacks, and a camera that floods
+takes no more of a turn than others.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ MAX_CHUNKS = 2
 """Largest number of chunks that may wait for the receive task before the link stops reading from
 TCP.
 
-The link stops sooner if one chunk is more than the task handles in a turn, and reads on when no
-chunk is left: a camera that sends results faster than they can be delivered has to wait.
+The link stops earlier if one chunk is more than the task handles in a turn, and continues when no
+chunk is left: so a camera cannot send results faster than they are delivered.
 """
 
 MAX_DATAGRAMS = 256
@@ -60,11 +60,11 @@ answers."""
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
 
-The time that one chunk took decides how many bytes the next one holds.
+The processing time of one chunk decides the size of the next one.
 """
 
 SHARED_TURN_TIME = 0.00005
-"""Seconds in place of :data:`TURN_TIME` if other links share the event loop.
+"""Seconds instead of :data:`TURN_TIME` if other links share the event loop.
 
 Each step of another link waits for one turn of every flooded link.
 """
@@ -107,8 +107,7 @@ FIRST_CHUNK = 64
 """Number of frames of a chunk until the time that they take is known."""
 
 LARGEST_CHUNK = 512
-"""Largest number of frames of a chunk, even if they are fast: the next ones may take
-longer."""
+"""Largest number of frames of a chunk, also after fast ones: the next frames may take longer."""
 
 MAX_REST_BYTES = 256
 """Largest number of bytes of an unfinished frame that a trace shows: it may be as long as the
@@ -117,12 +116,12 @@ largest frame."""
 
 @dataclass(slots=True)
 class Chunk:
-    """Events that one delivery of bytes gave, or some of them.
+    """The events of one delivery of bytes, or a part of them.
 
     Attributes:
         received_at: loop time of the delivery.
         events: events of the delivery, in order.
-        frames: number of frames in which the events came; an event may be made of many (In-Sight).
+        frames: number of frames of the events; an event may consist of several (In-Sight).
         delivery: number of the delivery on its link, from 1.
     """
 
@@ -133,15 +132,16 @@ class Chunk:
 
 
 class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
-    """One link. Made by :func:`open_link`; when it ends, a new one is made.
+    """A link, made by :func:`open_link` and used once.
 
     Args:
         machine: the protocol's client side.
         name: the camera's name, for logs and errors.
         host: address of the camera.
         port: port of the camera.
-        liveness_timeout: seconds after which the system, too, gives up a peer that acknowledges
-            nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
+        liveness_timeout: seconds after which the operating system, too, ends the connection of a
+            peer that acknowledges nothing (TCP keep-alive and user timeout, if supported); None
+            for the system's default.
 
     Attributes:
         loop: the event loop that the link is used in.
@@ -180,7 +180,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.heard_at: float = self.loop.time()
         self._transport: Any = None
         self._datagrams = machine.transport is Transport.UDP
-        self._aside: socket.socket | None = None  # reads datagrams that have come already
+        self._aside: socket.socket | None = None  # socket for reading waiting datagrams directly
         self._replies = machine.replies
         self._room = machine.room
         # if the machine can send several at once
@@ -198,7 +198,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.outcome: Callable[[], DirectFuture[Any] | asyncio.Future[Any]] = bell.outcome
         self.wake_in_order: Callable[[], None] = bell.wake_in_order
         self._closed = False
-        self._closers: list[asyncio.Future[None]] = []  # futures of the waits for its end
+        self._closers: list[asyncio.Future[None]] = []  # futures of the waits for the link's end
         self._loss: BaseException | None = None
         self._full = False  # the transport takes no more at present
         self._writable: asyncio.Event | None = None  # made if the transport takes no more
@@ -224,7 +224,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._flush()
 
     def send_all(self, messages: Sequence[Message]) -> None:
-        """Write messages at once: one write on TCP, a datagram each on UDP.
+        """Write several messages: one write on TCP, a datagram each on UDP.
 
         Raises:
             LocalProtocolError: the state forbids a message; those before it were written.
@@ -238,7 +238,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._flush()
 
     def is_writable(self) -> bool:
-        """Return True if the transport takes more at once, so that :meth:`drain` would not wait."""
+        """Return True if the send buffer has room, so that :meth:`drain` would not wait."""
         return not self._full
 
     async def drain(self) -> None:
@@ -264,9 +264,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             await self._doorbell
         chunk = self._chunks.popleft()
         if chunk.frames > self._most:
-            chunk, rest = split(chunk, self._most)
-            if rest.events:
-                self._chunks.appendleft(rest)
+            chunk, remainder = split(chunk, self._most)
+            if remainder.events:
+                self._chunks.appendleft(remainder)
         if chunk.frames >= MIN_FRAMES_PER_CHUNK and (
             self._chunks or chunk.frames > MIN_FRAMES_PER_CHUNK
         ):
@@ -277,22 +277,22 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return chunk
 
     async def close(self, timeout: float) -> None:
-        """Send Disconnect, end the link in order, within ``timeout`` seconds; else abort it.
+        """Send Disconnect and end the link in order; abort it after ``timeout`` seconds.
 
-        On TCP the sending side is closed first and the camera's end awaited: closing a socket with
-        unread bytes in it sends a reset, which can overtake the Disconnect.
+        On TCP the client closes its sending side first and waits for the camera's end: closing a
+        socket with unread bytes sends a reset, which can overtake the Disconnect.
         Cancellation: aborts the link.
         """
         self._closing = True
         try:
             if self._transport is None or self._closed:
                 return
-            self._say_goodbye()
+            self._send_goodbye()
             if self._datagrams:
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
-                with contextlib.suppress(OSError):  # it was reset just now
+                with contextlib.suppress(OSError):  # the buffer was reset just now
                     self._transport.write_eof()
             await self.wait_closed(timeout)
         finally:
@@ -307,7 +307,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def give_up(self, reason: BaseException) -> None:
         """Drop the link at once, but send Disconnect first if there is a session."""
         if self._transport is not None and not self._transport.is_closing():
-            self._say_goodbye()
+            self._send_goodbye()
         self.abort(reason)
 
     def lost_error(self) -> ConnectionLostError:
@@ -322,7 +322,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return error
 
     async def wait_closed(self, timeout: float) -> None:
-        """Wait until the link is over, ``timeout`` seconds at most."""
+        """Wait until the link has ended, ``timeout`` seconds at most."""
         if self._closed:
             return
         waiter: asyncio.Future[None] = self.loop.create_future()
@@ -336,7 +336,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     @property
     def lost(self) -> bool:
-        """True once the link is lost; chunks that came before may still wait to be taken."""
+        """True once the link is lost; earlier chunks may still wait for the receive task."""
         return self._loss is not None
 
     @property
@@ -355,7 +355,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._aside = second_socket(transport)
         sock = transport.get_extra_info("socket")
         if sock is not None and not self._datagrams:
-            # the camera sets it and advises it (SC manual p. 40: published)
+            # the camera sets it, too, and its manual recommends it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
                 for option in _keep_alive_options(self._liveness_timeout):
@@ -395,7 +395,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._lose(ConnectionResetError("the camera closed the connection"))
 
     def error_received(self, exc: Exception) -> None:
-        """asyncio: the system refused a datagram: nothing listens there."""
+        """asyncio: the system reports that nothing listens at the address."""
         self._lose(exc)
         self._transport.abort()
 
@@ -435,7 +435,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self._transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
 
     def _read_aside(self, sock: socket.socket) -> OSError | None:
-        """Read the datagrams that have come already, without a turn of the loop for each.
+        """Read the waiting datagrams, without a turn of the loop for each.
 
         Returns:
             The system's error about a datagram that this side has sent; None without one.
@@ -484,12 +484,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 break
 
     def _adapt(self, since: float) -> None:
-        """Set the size of the next chunks to one turn's time, by the time of the last chunk."""
+        """Set the size of the next chunks by the processing time of the last one."""
         self._busy_since = None
         took = thread_time() - since
         turn = SHARED_TURN_TIME if self._beside.open > 1 else TURN_TIME
         frames = int(self._busy_with * turn / max(took, 1e-9))
-        frames = max(frames, self._most // 2)  # one slow chunk may be an exception
+        frames = max(frames, self._most // 2)  # a single slow chunk may be an exception
         self._most = max(MIN_FRAMES_PER_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _pause(self) -> None:
@@ -568,10 +568,10 @@ class FrameTrace:
 
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
-    """Return a larger chunk's first frames, ``frames`` of them, and its rest; a burst may be cut.
+    """Split a chunk after a number of frames; a burst of results may be split, too.
 
-    A trigger's answer and the events after it stay together, since one frame may be both: otherwise
-    a caller that waits for the answer would send before the result of that frame is judged.
+    A trigger's answer and the events after it stay together, since one frame may be answer and
+    result: otherwise the answer's caller would send before the result is handled.
     """
     at, events = chunk.received_at, chunk.events
     if chunk.frames == len(events):  # one frame for each event
@@ -579,23 +579,23 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
             frames += 1
         others = Chunk(at, events[frames:], chunk.frames - frames, chunk.delivery)
         return Chunk(at, events[:frames], frames, chunk.delivery), others
-    some: list[Event] = []
-    left, rest = frames, collections.deque(events)
-    while left > 0 and rest:
-        event = rest.popleft()
+    known_events: list[Event] = []
+    left, events_left = frames, collections.deque(events)
+    while left > 0 and events_left:
+        event = events_left.popleft()
         if type(event) is ResultBurst:
             if len(event.data) > left:
                 event, behind = event.cut(left)
-                rest.appendleft(behind)
+                events_left.appendleft(behind)
             left -= len(event.data)
         else:
             left -= 1
-        some.append(event)
-    while some and rest and type(some[-1]) is TriggerAnswer:
-        some.append(rest.popleft())
+        known_events.append(event)
+    while known_events and events_left and type(known_events[-1]) is TriggerAnswer:
+        known_events.append(events_left.popleft())
     taken = frames - left
-    first = replace(chunk, events=some, frames=taken)
-    return first, replace(chunk, events=list(rest), frames=chunk.frames - taken)
+    first = replace(chunk, events=known_events, frames=taken)
+    return first, replace(chunk, events=list(events_left), frames=chunk.frames - taken)
 
 
 async def open_link(
@@ -614,7 +614,7 @@ async def open_link(
 
     Args:
         protocol: function that makes the machine.
-        dialects: one, or several that begin a session alike.
+        dialects: one dialect, or several that begin a session alike.
         transport: TCP or UDP.
         host: the camera's name or address.
         port: port of the camera.
@@ -624,7 +624,7 @@ async def open_link(
         liveness_timeout: see :class:`Link`.
 
     Raises:
-        OSError: the name does not resolve, nothing listens, no way to the host.
+        OSError: the name does not resolve, nothing listens, or the host is unreachable.
     """
     loop = asyncio.get_running_loop()
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)

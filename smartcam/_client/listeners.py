@@ -210,7 +210,7 @@ class Listeners:
 
 
 def _offer_all(streams: Sequence[Queue[Result]], results: Sequence[Result], now: float) -> None:
-    size = sum([len(one.raw) for one in results])
+    size = sum([len(result.raw) for result in results])
     for stream in streams:
         stream.offer_all(results, now, size)
 
@@ -222,14 +222,14 @@ def _drop_frames(error: SmartCamError) -> None:
     """
     chain: list[BaseException | None] = [error]
     while chain:
-        one = chain.pop()
-        place = one.__traceback__ if one is not None else None
-        if one is None or place is None:
+        frame = chain.pop()
+        place = frame.__traceback__ if frame is not None else None
+        if frame is None or place is None:
             continue
         while place.tb_next is not None:
             place = place.tb_next
-        if one is not error:
+        if frame is not error:
             code = place.tb_frame.f_code
-            one.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
-        one.__traceback__ = None  # so that each error is visited once
-        chain += (one.__cause__, one.__context__)
+            frame.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
+        frame.__traceback__ = None  # so that each error is visited once
+        chain += (frame.__cause__, frame.__context__)

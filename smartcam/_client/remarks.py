@@ -47,7 +47,7 @@ class Remarks:
         """
         logged = self._kinds.setdefault(kind, _Logged(now))
         if now - logged.begun >= PERIOD:
-            self._tell_left_out(kind, level, logged)
+            self._log_left_out(kind, level, logged)
             logged.begun, logged.count = now, 0
         logged.count += 1
         if logged.count <= MAX_REMARKS:
@@ -58,12 +58,12 @@ class Remarks:
 
     def end(self) -> None:
         """Log the number of left-out lines at the session's end."""
-        for kind, found in self._kinds.items():
-            self._tell_left_out(kind, logging.WARNING, found)
+        for kind, remarks in self._kinds.items():
+            self._log_left_out(kind, logging.WARNING, remarks)
         self._kinds.clear()
 
-    def _tell_left_out(self, kind: str, level: int, found: _Logged) -> None:
-        left_out = found.count - MAX_REMARKS
+    def _log_left_out(self, kind: str, level: int, remarks: _Logged) -> None:
+        left_out = remarks.count - MAX_REMARKS
         if left_out > 0:
             text = "%s ! %d of the kind %r were not logged"
             logger.log(level, text, self._name, left_out, kind)

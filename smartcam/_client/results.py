@@ -1,4 +1,4 @@
-"""Decide the fate of each result: the trigger under way, a stream, an account."""
+"""Decide where each result goes: to the running trigger, to streams, or only into the counts."""
 
 from __future__ import annotations
 
@@ -35,23 +35,22 @@ if TYPE_CHECKING:
     from smartcam._client.listeners import Listeners
     from smartcam.protocols._inside import ResultBurst
 
-    # a container, its fate, its number, and when it came: loop time, and wall clock
+    # a container, its fate, its number, and its arrival by the loop's and the wall clock
     _Unproven = tuple[m.ResultContainer, str, int | None, float, datetime]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 # as plain integers: operations of an IntFlag cost more than the rest of handling a status
-_TELLING = int(
-    Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING
-)  # a change of these may mean that the trigger under way has failed
+# a change of these bits may mean that the running trigger has failed
+_TELLING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING)
 
 _CURRENT = {"triggered", "nobody"}
-"""Fates of containers that do not belong to an older trigger, as far as is known."""
+"""Fates of containers that are not known to belong to an older trigger."""
 
 
 @dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
-    """The trigger under way, and the outcome that its caller waits for.
+    """The running trigger, and the outcome that its caller waits for.
 
     Attributes:
         outcome: future with the results or the error.
@@ -59,10 +58,11 @@ class PendingTrigger(SentTrigger):
         has_input: True if input data was sent with the trigger.
         sent_at: loop time at which the trigger was sent.
         triggered_at: time of the wall clock, UTC.
-        application: id of the application that is believed to be active, None if any will do.
+        application: id of the application that is probably active; None: any is accepted.
         results: results received so far.
-        unproven: containers that wait for proof that the camera took the trigger (those with the
-            fate ``triggered`` are its own then), and the containers after them.
+        unproven: containers that wait for proof that the camera accepted the trigger, and the
+            containers after them. With the proof, containers with the fate ``triggered`` are the
+            trigger's.
     """
 
     outcome: DirectFuture[list[Result]] | asyncio.Future[list[Result]]
@@ -75,7 +75,7 @@ class PendingTrigger(SentTrigger):
     unproven: list[_Unproven] = field(init=False, default_factory=list)
 
     def fail(self, error: Exception) -> None:
-        """End the trigger: its caller gets the error instead of results."""
+        """End the trigger with an error for its caller."""
         self.ended = True
         if not self.outcome.done():  # an interpreter may have cancelled the caller
             self.outcome.set_exception(error)
@@ -88,8 +88,8 @@ class Results:
     Attributes:
         interpretation: interpretation of results, unless a trigger has its own.
         correlation: finds the trigger of each container.
-        input_in_doubt: the input data of a trigger without a result may still be queued in the
-            camera.
+        input_in_doubt: whether the input data of a trigger without a result may still be queued in
+            the camera.
     """
 
     _name: str
@@ -102,9 +102,8 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        self._numbering: Interpretation | None = (
-            None  # reads the numbers in results, once triggers had numbers
-        )
+        # reads the numbers in results after the first trigger with a number
+        self._numbering: Interpretation | None = None
         self._warned_extra = self._warned_others = False
         self._lossy = False  # a message may come twice, or not
         self._timer = DeadlineTimer(weak_callback(self, Results._time_out))
@@ -124,9 +123,9 @@ class Results:
         self.correlation.begin_session(complete=complete)
 
     def fail(self, error: SmartCamError) -> None:
-        """End the session, and with it the trigger under way.
+        """End the session and the running trigger.
 
-        Its results may still come in the next session: they are pending.
+        The trigger's results are pending, since they may still arrive in the next session.
         """
         if self._pending is not None:
             self.give_up(copy_to_raise(error))
@@ -138,11 +137,11 @@ class Results:
     # ------------------------------------------------------------------ the trigger under way
 
     def _awaited(self) -> PendingTrigger | None:
-        """Return the trigger under way, as long as its caller waits."""
+        """Return the running trigger while its caller waits, else None."""
         pending = self._pending
         if pending is None:
             return None
-        if pending.outcome.cancelled() and not pending.ended:  # its caller was not woken yet
+        if pending.outcome.cancelled() and not pending.ended:  # the call's task was not woken yet
             pending.ended = True
             self.correlation.give_up(pending)
         if not pending.ended:
@@ -152,7 +151,7 @@ class Results:
         return None
 
     def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
-        """Note that a trigger is sent; from ``deadline`` (loop time) on its results are late."""
+        """Note that a trigger is sent; its results are late after ``deadline`` (loop time)."""
         self._pending = pending
         self._timer.set(deadline)
         if pending.number is not None:
@@ -160,7 +159,7 @@ class Results:
         self.correlation.send(pending)
 
     def end_trigger(self) -> None:
-        """Note that the trigger's caller goes on."""
+        """Note that the trigger's caller no longer waits."""
         pending, self._pending = self._pending, None
         if pending is not None and pending.unproven:
             pending.ended = True
@@ -169,7 +168,7 @@ class Results:
         self.correlation.leave()
 
     def give_up(self, error: Exception) -> None:
-        """End the trigger under way with an error; its results are late from this moment on."""
+        """End the running trigger with an error; its results are late from now on."""
         pending = self._awaited()
         if pending is not None:
             self.correlation.give_up(pending)
@@ -177,28 +176,28 @@ class Results:
             self._release(pending)
 
     def input_sent(self) -> None:
-        """Note that input data went out with the trigger, and may not have been used."""
+        """Note that input data was sent with the trigger, and is perhaps unused."""
         self.input_in_doubt = True
 
     # ------------------------------------------------------------------ what comes
 
     def on_switched(self) -> None:
-        """Forget older results: another application was loaded, so none can come."""
+        """Forget older results, which cannot arrive after another application was loaded."""
         self.input_in_doubt = False
         self.correlation.settled()
 
     def on_query_answer(self, now: float) -> None:
-        """Note that a Query which was written with the last trigger is answered."""
+        """Note that the Query that was sent with the last trigger is answered."""
         self.correlation.on_query_answer()
         self._decide(now)
 
     def on_trigger_answer(self, now: float) -> None:
-        """Note that the last trigger is answered, and was not refused."""
+        """Note that the last trigger was acknowledged."""
         self.correlation.on_trigger_answer()
         self._decide(now)
 
     def _decide(self, now: float) -> None:
-        """End the trigger under way if the camera's messages so far are enough for that."""
+        """End the running trigger if the messages received so far decide its outcome."""
         pending = self._awaited()
         if pending is None:
             return
@@ -233,7 +232,7 @@ class Results:
             self._decide(now)
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
-        """End the trigger under way if the status shows that its result cannot be trusted."""
+        """End the running trigger if the status shows that its result would be unreliable."""
         pending = self._awaited()
         if pending is None:
             return
@@ -259,27 +258,27 @@ class Results:
             self._fail(pending, error)
 
     def _fail(self, pending: PendingTrigger, error: SmartCamError) -> None:
-        """End the trigger under way; results that still come go to the streams."""
+        """End the running trigger; later results of it go to the streams."""
         self.correlation.give_up(pending, "streamed")
         pending.fail(error)
         self._release(pending)
 
     def _release(self, pending: PendingTrigger) -> None:
-        """Pass on the unproven containers: to the trigger, or as older ones if it has ended."""
+        """Pass the unproven containers to the trigger, or to the streams if it has ended."""
         unproven, pending.unproven = pending.unproven, []
         if not pending.ended:
             pending.received -= sum(fate == "triggered" for _, fate, *_ in unproven)
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
                 self.hand_on(container, None, fate, number, now, at)
-            elif not pending.ended:  # it has ended if the container before could not be read
+            elif not pending.ended:  # the call has ended if the container before could not be read
                 self.hand_on(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate
                 self.hand_on(container, None, older, number, now, at)
 
     def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
-        """Count and pass on several containers at once; one by one if they may differ."""
+        """Count and pass on several containers together, or singly if their fates may differ."""
         results = self._read_burst(burst, at)
         if results is None:
             for container in burst:
@@ -294,16 +293,16 @@ class Results:
 
     @property
     def only_streams(self) -> bool:
-        """True if results go to streams, and need not be passed on one by one.
+        """True if all results go to streams, and need not be passed on singly.
 
-        No result can then belong to a trigger, pay a debt, or count as an extra result.
+        No result can then belong to a trigger, be a pending one, or count as an extra result.
         """
         correlation = self.correlation
         ours = self._pending or self._numbering or correlation.owed or correlation.satisfied
         return not ours and self._listeners.streams_results
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
-        """Return the results of a burst that is only streamed; None if one may be anything else.
+        """Return the results of a burst that is only streamed; None if they must be passed singly.
 
         Otherwise a trigger or a single waiter may need one of them, one may be a pending result,
         and one that cannot be interpreted is its own item.
@@ -331,7 +330,7 @@ class Results:
         return list(map(new_tuple, itertools.repeat(Result), rows))
 
     def on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
-        """Give a container its fate.
+        """Decide the fate of a container, and pass its result on.
 
         Args:
             container: container received.
@@ -340,7 +339,7 @@ class Results:
         """
         state, counters, pending = self._state, self._counters, self._awaited()
         active, expected = state.active, state.expected
-        if container.application < 0:  # a quirk: it does not name its application
+        if container.application < 0:  # some cameras do not send the application
             known = m.UNNAMED_APPLICATION if active is None else active
             container = replace(container, application=known)
         if expected is None and pending is not None:
@@ -348,8 +347,9 @@ class Results:
         if active != container.application:
             state.set_active(container.application, at)
         if expected is not None and container.application != expected:
-            self.give_up(self._wrong_application(container, expected))  # ours may still come
-            if state.shared:  # another program may want it
+            # the trigger's result may still arrive
+            self.give_up(self._wrong_application(container, expected))
+            if state.shared:  # the result may be for another program
                 self.hand_on(container, None, "streamed", None, now, at)
             else:
                 counters.count("wrong_application")
@@ -357,8 +357,10 @@ class Results:
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        asked = container.asked
-        match = correlation.judge(number) if asked is None else correlation.judge_marked(asked)
+        requested = container.asked
+        match = (
+            correlation.judge(number) if requested is None else correlation.judge_marked(requested)
+        )
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:
@@ -385,10 +387,10 @@ class Results:
         counters, listeners = self._counters, self._listeners
         current = fate in _CURRENT
         if owner is None:
-            heard = listeners.hears_results
+            has_listeners = listeners.hears_results
             if fate == "nobody":
-                fate = "streamed" if heard else "unclaimed"
-            if not heard:
+                fate = "streamed" if has_listeners else "unclaimed"
+            if not has_listeners:
                 counters.count(fate)
                 return
         name, own_number = self._name, counters.received + 1
@@ -421,10 +423,10 @@ class Results:
             self._complete(owner, now)
 
     def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
-        """Return the trigger under way if a container with its answers around it is its result.
+        """Return the running trigger if a container between the trigger's answers is its result.
 
-        That is noted then, and :meth:`hand_on` handles the container. None if anything but its
-        evidence decides, or a result of it has come already.
+        The result is noted, and :meth:`hand_on` handles the container. None if the answers do not
+        suffice for the decision, or if the trigger already has a result.
         """
         pending = self._pending
         if pending is None or pending.ended or pending.outcome.done() or pending.received:
@@ -441,9 +443,9 @@ class Results:
         return pending
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
-        """Return True if an equal container came before, as when a datagram comes twice."""
+        """Return True if the same container has arrived before, as with a repeated datagram."""
         results = pending.results if pending is not None else []
-        return any(one.raw == container.data for one in results)
+        return any(result.raw == container.data for result in results)
 
     def _note_extra(self, count: int = 1) -> None:
         self._counters.note_extra(count)
@@ -462,7 +464,7 @@ class Results:
             logger.warning("%s ! something else triggers the camera, too", self._name)
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
-        """End the trigger under way if it has all its results, without a sign against them."""
+        """End the running trigger if it has all results, and no message speaks against them."""
         if owner.received < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:
@@ -475,10 +477,10 @@ class Results:
     def _fail_unread(
         self, owner: PendingTrigger, error: InterpretationError, number: int | None
     ) -> None:
-        """End a trigger whose result came and cannot be read."""
+        """End a trigger whose result cannot be interpreted."""
         if owner.has_input:
             self.input_in_doubt = False
-        # without a readable number it may be another's result, and its own may still come
+        # without a readable number the result may be another trigger's
         certain = owner.number is None or number == owner.number
         self.correlation.give_up(owner, unread=int(certain))
         if not owner.given_up:

@@ -1,4 +1,4 @@
-"""Get the camera's status, and wait for it."""
+"""Request the camera's status, and wait for a particular one."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from smartcam._client.waits import Waits
 
 BUSY_PAUSE = 0.02
-"""Seconds until a camera that was too busy for a request is asked again."""
+"""Seconds until a request is repeated that the camera was too busy for."""
 
 
 def is_ready(status: Status) -> bool:
-    """Running and not BUSY."""
+    """Return True if the camera is Running and not BUSY."""
     return Status.RUNNING in status and Status.BUSY not in status
 
 
 @dataclass(eq=False)
 class StatusRequests:
-    """Waits for statuses, and requests them if they do not come by themselves."""
+    """Waits for statuses, and requests them if the camera does not send them by itself."""
 
     _connection: Connection
     _requests: Requests
@@ -41,27 +41,27 @@ class StatusRequests:
     _waits: Waits
 
     def begin_session(self) -> None:
-        """Request the status from now on, if it does not come by itself."""
+        """Request statuses from now on, if the camera does not send them by itself."""
         self._polling.begin_session()
 
     def end_session(self) -> None:
-        """Request no status any more."""
+        """Stop requesting statuses."""
         self._polling.end_session()
 
     def wanted(self) -> None:
-        """Request statuses for a new subscriber, if they do not come by themselves."""
+        """Request statuses for a new subscriber, if the camera does not send them by itself."""
         self._polling.wanted()
 
     @property
     def last(self) -> Status:
-        """The last status; there is one since the session was made."""
+        """The last status; every session begins with one."""
         return self._state.status or Status(0)
 
     async def until(
         self,
         predicate: Callable[[Status], bool],
         deadline: float,
-        what: str,
+        label: str,
         *,
         insist: bool = True,
     ) -> Status:
@@ -70,12 +70,12 @@ class StatusRequests:
         Args:
             predicate: function that returns True for the status awaited.
             deadline: loop time.
-            what: description of the status awaited, for the error.
+            label: description of the status awaited, for the error.
             insist: request the status again if a report of it may have been lost.
 
         Raises:
-            ResponseTimeoutError: the status did not come in time; the text names it and the last
-                one.
+            ResponseTimeoutError: the status did not arrive in time; the text names it and the last
+                received one.
         """
         begin = asyncio.get_running_loop().time()
         try:
@@ -85,7 +85,7 @@ class StatusRequests:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited {shown_time(waited)} for {what}; "
+                f"{self._connection.name}: waited {shown_time(waited)} for {label}; "
                 f"status: {self.last}",
                 waited=waited,
             ) from exc
@@ -93,7 +93,7 @@ class StatusRequests:
     async def wait(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
         """Return the first status, the present one included, that ``predicate`` accepts.
 
-        It gets every status in order. Its errors are raised here.
+        ``predicate`` is called with every status in order; its errors are raised here.
 
         Raises:
             TimeoutError: at ``deadline`` (loop time).
@@ -123,8 +123,8 @@ class StatusRequests:
     async def demand(self, deadline: float) -> None:
         """Make the camera send its status, by Get status if the dialect has it.
 
-        Otherwise Connect brings one (SC manual p. 29, published). A Query goes first: a client that
-        has lost the session must not take it back by this.
+        Otherwise the camera sends one after Connect (SC manual p. 29, published). A Query goes
+        first, so that a client that has lost its session does not take it back by the Connect.
         """
         link = self._connection.require_link()
         if self._connection.features.polled:
@@ -134,8 +134,8 @@ class StatusRequests:
             await self._requests.fence(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
-            pass  # its own time may not be over; keepalive detects a lost camera
-        except LocalProtocolError as exc:  # the last one's answer never came
+            pass  # the caller's time may not be over; keepalive detects a lost camera
+        except LocalProtocolError as exc:  # the last request's answer never arrived
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     async def refresh(self, deadline: float) -> None:
@@ -159,7 +159,7 @@ class StatusRequests:
                 await self.pause(deadline, "the camera to tell its status")
             older = before = state.statuses_received  # earlier answers have come or are lost
 
-    async def pause(self, deadline: float, what: str) -> None:
+    async def pause(self, deadline: float, label: str) -> None:
         """Wait a moment before the camera is asked again.
 
         Raises:
@@ -168,10 +168,10 @@ class StatusRequests:
         now = asyncio.get_running_loop().time()
         if deadline - now <= BUSY_PAUSE:
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited until the time was over for {what}; "
+                f"{self._connection.name}: waited until the time was over for {label}; "
                 f"status: {self.last}"
             )
-        with contextlib.suppress(TimeoutError):  # and a loss ends it at once
+        with contextlib.suppress(TimeoutError):  # a loss ends the pause at once
             await self.wait(_never, now + BUSY_PAUSE)
 
 

@@ -1,11 +1,10 @@
 """The life of a client: sessions, one after the other, and the steps between them.
 
-One task per client, the only one outside of a task group. It makes a session, has the receive
-task read its link to the end, ends all waits, and makes the next by the
-:class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another client has
-it: then the task stops or, at an agent, tries again slowly. The steps after its end are done by a
-callback, since a task that is cancelled before its first step runs no
-``finally``.
+Each client has one task for this, the only task outside of a task group. It makes a session, reads
+its link to the end by the receive task, ends all waits, and makes the next session after the delays
+of :class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another client
+has it: then the task stops or, at an agent, tries again slowly. A callback does the steps after the
+task's end, since a task that is cancelled before its first step runs no ``finally``.
 """
 
 from __future__ import annotations
@@ -50,14 +49,14 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 TAKEN_WITHIN = 10.0
-"""Seconds: a session that is lost again within this time of its Connect was taken by another
-client (a decision of this library; the camera does not say so)."""
+"""Seconds after Connect within which a lost session counts as taken by another client (a decision
+of this library: the camera does not report it)."""
 
 
 FIRST_RETRY_DELAY_OF_TAKEN = 30.0
 MAX_RETRY_DELAY_OF_TAKEN = 600.0
-"""Shortest and longest time, seconds, until a taken camera is tried again, if ``on_taken`` is set:
-doubled each time that it is taken again. Each try interrupts the other client's session."""
+"""Shortest and longest time, seconds, until the next try to get a taken camera, if ``on_taken`` is
+set: doubled each time that it is taken again. Each try interrupts the other client's session."""
 
 
 @dataclass(eq=False)
@@ -66,8 +65,8 @@ class Supervisor:
 
     Attributes:
         session: the last session that was made, None before the first.
-        on_taken: function that is called when the camera was taken, which is then tried again
-            slowly; None: a taken camera is the end.
+        on_taken: function that is called when another client took the camera, after which sessions
+            are tried at long intervals; None: the client ends.
     """
 
     _settings: CameraSettings
@@ -91,13 +90,14 @@ class Supervisor:
         self._closed: ConnectionClosedError | None = None  # error for all waits after close()
         self._ended_by: SmartCamError | None = None  # reason of the end, if not this program
         self._finished = False  # whether the task is over, and all waits have ended
-        self._reading = False  # whether a link is read, whose end is noticed then
+        self._reading = False  # whether the task reads a link, and so detects its end
         self.on_taken: Callable[[], None] | None = None
         self._times_taken = 0  # losses in a row to another client
         self._take_back = asyncio.Event()
         self._short_lived = 0  # sessions in a row that were lost soon
-        self._excused = False  # an early loss of this session is no other client's doing
-        self._restarting: Link | None = None  # the camera was told to restart over this link
+        # whether an early loss of this session has another cause than a client
+        self._excused = False
+        self._restarting: Link | None = None  # link over which a restart was requested
 
     # ------------------------------------------------------------------ for the client
 
@@ -108,7 +108,7 @@ class Supervisor:
 
     @property
     def over(self) -> bool:
-        """True if there will be no session any more."""
+        """True if there will be no further session."""
         return self._closing or self._ended_by is not None
 
     @property
@@ -177,7 +177,7 @@ class Supervisor:
         if task is None or task.done():
             return False
         self._closing = True
-        with contextlib.suppress(RuntimeError):  # the loop is closed, and its links with it
+        with contextlib.suppress(RuntimeError):  # a closed loop has closed its links
             task.get_loop().call_soon_threadsafe(self._drop)
         return True
 
@@ -238,11 +238,11 @@ class Supervisor:
     # ------------------------------------------------------------------ the task
 
     def _end(self, task: asyncio.Task[SmartCamError]) -> None:
-        """End all waits, since there will be no session any more: the task is over."""
+        """End all waits, since the task has ended and there will be no further session."""
         error = self._reason(task)
         self._dispatch.fail(error)
         if self._closing:
-            error = self._closed or self.closed_error()  # also if the session was lost before
+            error = self._closed or self.closed_error()  # also after an earlier loss of the session
         else:
             self._ended_by = error
         if self.session is not None:
@@ -280,7 +280,7 @@ class Supervisor:
         try:
             return await self._live()
         except ENDS_PROGRAM as exc:
-            # the receive task has raised it out of the event loop, which must clean up undisturbed
+            # the receive task has raised the error in the loop; here only clean up
             return self._failed(exc)
 
     async def _live(self) -> SmartCamError:
@@ -294,7 +294,7 @@ class Supervisor:
             if self._closing or self._settings.reconnect is None:
                 return error
             ordered = session.link.machine.transport is Transport.TCP
-            # over UDP only silence shows that another client has the camera: the loss began earlier
+            # over UDP the loss began earlier: only silence shows that another client has the camera
             now = asyncio.get_running_loop().time()
             short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
             takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
@@ -329,7 +329,7 @@ class Supervisor:
                         error = await tasks.create_task(self._receive(link), name=name)
                     finally:
                         stop_watching()
-                    self._report_loss(link, error)  # ends the jobs' waits too
+                    self._report_loss(link, error)  # also ends the waits of jobs
                 finally:
                     self._lock.end_session()
         finally:
@@ -366,7 +366,7 @@ class Supervisor:
             if self._listeners.has_subscribers:
                 link.wake_in_order()
             self._dispatch.dispatch(chunk)
-            del chunk  # the next one may take its time
+            del chunk  # free it, since the next chunk may come much later
 
     def _report_loss(self, link: Link, error: ConnectionLostError) -> None:
         """End all waits, since a link has ended; all its events are dispatched."""
@@ -385,7 +385,9 @@ class Supervisor:
             self._listeners.publish(event)
         self._wake_waiters()
 
-    async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
+    async def _retry_taken(
+        self, taken: ConnectionTakenError, notify: Callable[[], None]
+    ) -> Session:
         """Make a new session after a long pause, or as soon as the camera is to be taken back.
 
         Raises:
@@ -395,11 +397,11 @@ class Supervisor:
         self._waits.end = taken
         self._times_taken += 1
         self._take_back.clear()
-        tell()
+        notify()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._take_back.wait()
-        # a camera that does not answer has no client: from then on it is awaited like any other
+        # a camera that does not answer has no client, so it counts as lost from then on
         return await self._reconnect(taken, at_once=True)
 
     async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
@@ -433,12 +435,12 @@ class Supervisor:
 
     def _taken(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
-        what = f"stopped, so as not to fight for it ({error})"
+        outcome = f"stopped, so as not to fight for it ({error})"
         if self.on_taken is not None:
-            what = f"it is tried again in {self._pause_of_taken:.0f} s ({error})"
+            outcome = f"it is tried again in {self._pause_of_taken:.0f} s ({error})"
         taken = ConnectionTakenError(
             f"{self._name}: lost again right after a reconnect: another client has the "
-            f"camera, which serves one; {what}",
+            f"camera, which serves one; {outcome}",
             host=address.host,
             port=address.port,
         )
@@ -451,7 +453,7 @@ class Supervisor:
     @property
     def _pause_of_taken(self) -> float:
         """Seconds until a camera that was taken is tried again."""
-        doubled = min(self._times_taken, 16)  # more is far beyond the longest pause
+        doubled = min(self._times_taken, 16)  # a larger power is far beyond the longest pause
         return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
 
     def _wake_waiters(self) -> None:

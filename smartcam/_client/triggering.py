@@ -1,7 +1,7 @@
-"""Triggers: from the camera's readiness to the results, or to the reason of their absence.
+"""Triggers: from the camera's readiness to the results, or to the reason why there are none.
 
-Pending results of earlier triggers are settled first, and a fence goes out before each trigger, so
-that no older result passes for its result (:mod:`smartcam._client.correlation`).
+Owed results of earlier triggers are settled first, and a Query is sent before each trigger, so that
+no older result is taken for the trigger's result (:mod:`smartcam._client.correlation`).
 """
 
 from __future__ import annotations
@@ -57,31 +57,31 @@ if TYPE_CHECKING:
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
+# bits of which exactly Waiting is set if a trigger may go out at once
 _TELLS_AGAINST = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR | Status.OVERTRIGGERED
-)  # of these, exactly Waiting is set if a trigger may go out at once
-_SPEAKS_AGAINST = int(
-    Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR
-)  # of these, exactly Waiting must be set before a trigger
+)
+# bits of which exactly Waiting must be set before a trigger
+_SPEAKS_AGAINST = int(Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR)
 
 LATE_GRACE = 0.25
-"""Seconds that a late result is waited for before it is made impossible: most are only a little
-late, and stopping and starting an application costs more."""
+"""Seconds for which a late result is awaited before a Stop makes it impossible: most results are
+only a little late, and stopping and starting an application costs more."""
 
 
 OVERTRIGGERED_GRACE = 1.0
-"""Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set, it
-cannot show that the new trigger was dropped, so no trigger is sent."""
+"""Seconds for which a trigger waits until the Overtriggered of an earlier one falls. While the bit
+is set, it cannot show that a new trigger was dropped, so no trigger is sent."""
 
 MAX_SHARE_WITHOUT_WAIT = 0.5
-"""A trigger with less than this share of its timeout left has had to wait."""
+"""A trigger with less than this share of its timeout left counts as delayed."""
 
 MIN_TIMEOUT_SHARE = 0.01
-"""Share of its timeout that a trigger which had to wait needs at least."""
+"""Least share of its timeout that a delayed trigger must have left."""
 
 READING_SHARE = 0.8
-"""Share of the time until its deadline after which a trigger is ended on a camera that would
-not end it by itself. The rest is for its answer."""
+"""Share of the time until its deadline after which the client ends a trigger, on a camera that
+would not end it by itself. The rest is for the answer."""
 
 _WHY_READY = "; it does not while it inspects, and an application that runs free never does"
 
@@ -101,9 +101,9 @@ class TriggerRequest:
 
     Attributes:
         interpretation: interpretation of its results.
-        input_data: data to send right before it, None for none.
+        input_data: data to send right before the trigger, None for none.
         results: number of results expected.
-        wait: wait until the camera takes a trigger; else refuse if it does not.
+        wait: whether to wait until the camera accepts a trigger; else refuse if it does not.
         expected: application expected to send its results; by default the named one.
     """
 
@@ -115,7 +115,7 @@ class TriggerRequest:
 
 
 def is_stopped(status: Status) -> bool:
-    """Neither Running nor BUSY."""
+    """Return True if the camera is neither Running nor BUSY."""
     return not status & (Status.RUNNING | Status.BUSY)
 
 
@@ -126,7 +126,7 @@ def takes_trigger(status: Status) -> bool:
 
 @dataclass(eq=False)
 class Triggers:
-    """Triggers a camera, one trigger at a time; the command lock decides whose."""
+    """Triggers a camera, one trigger at a time, in the order of the command lock."""
 
     _connection: Connection
     _requests: Requests
@@ -150,10 +150,10 @@ class Triggers:
         self._correlation.give_number(number)
 
     def _check_time(self, left: float, timeout: float) -> None:
-        """Check that a trigger that had to wait still has the time that a result takes.
+        """Check that a delayed trigger has enough time left for its result.
 
-        Otherwise it would end without its result, which then comes late, and the next
-        trigger has to settle that first.
+        Otherwise it would end without its result, which would arrive late, and which the next
+        trigger would have to settle first.
 
         Raises:
             ResponseTimeoutError: less time is left than the quickest result of this application
@@ -172,7 +172,7 @@ class Triggers:
     def trigger(
         self, request: TriggerRequest, deadline: float, timeout: float
     ) -> Coroutine[Any, Any, list[Result]]:
-        """Wait until the camera takes a trigger, send it, return its results.
+        """Wait until the camera accepts a trigger, send it, and return its results.
 
         Args:
             request: the trigger's arguments.
@@ -208,7 +208,7 @@ class Triggers:
     async def _trigger_once(
         self, request: TriggerRequest, deadline: float, timeout: float
     ) -> list[Result]:
-        """Send one trigger as soon as the camera takes it, return its results.
+        """Send one trigger when the camera accepts it, and return its results.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
@@ -245,7 +245,7 @@ class Triggers:
         try:
             self._send(pending, link, words, deadline)
             if not link.is_writable():
-                with contextlib.suppress(TimeoutError):  # the outcome is a timeout then, too
+                with contextlib.suppress(TimeoutError):  # the outcome is then a timeout, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
             results = await pending.outcome  # TimeoutError: the timer of Results, at the deadline
@@ -273,7 +273,7 @@ class Triggers:
             self._results.end_trigger()
 
     def _is_ready(self, request: TriggerRequest, expected: int | None) -> bool:
-        """Return True if :meth:`_get_ready` certainly has nothing to do."""
+        """Return True if :meth:`_get_ready` has certainly nothing to do."""
         correlation = self._correlation
         return (
             self._connection.features.tells_all
@@ -290,7 +290,7 @@ class Triggers:
     async def _get_ready(
         self, request: TriggerRequest, expected: int | None, deadline: float
     ) -> None:
-        """Wait until the camera takes a trigger, and no result of an earlier one can come.
+        """Wait until the camera accepts a trigger, and no result of an earlier one can arrive.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`Camera.trigger`; no trigger was sent.
@@ -312,19 +312,20 @@ class Triggers:
             await self._check_application(expected, deadline)
         if self._doubtful is not None and self._doubtful is connection.link:
             await self._status.demand(deadline)
-            await self._requests.fence(deadline)  # a status has come by then, or is lost again
+            # afterwards a status has arrived, or was lost again
+            await self._requests.fence(deadline)
             self._doubtful = None
             correlation.note_query_answered()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
-        # an older result shows by its number if each container has one
+        # if each container has a number, it identifies older results
         decided = numbering is not None and numbering.always
-        if correlation.doubted:  # the trigger before may not show in the status yet
+        if correlation.doubted:  # the status may not show the earlier trigger yet
             await self._requests.fence(deadline)
             correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
-        waited = False  # in line with Queries, so that neither kind delays the other
+        waited = False  # waits in line with Queries, so that neither kind delays the other
         while True:
             status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
@@ -332,7 +333,7 @@ class Triggers:
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
             elif features.fences and (
-                self._waits.is_pending(m.QueryAnswer)  # one can be open
+                self._waits.is_pending(m.QueryAnswer)  # only one Query can be open
                 if waited
                 else not self._requests.is_free(m.QueryAnswer)
             ):
@@ -342,7 +343,7 @@ class Triggers:
                 break
 
     async def _await_turn(self, deadline: float) -> None:
-        """Wait until a trigger may go out: another task may have asked meanwhile."""
+        """Wait until a trigger may be sent: another task may have sent a Query."""
         requests, features = self._requests, self._connection.features
         while True:
             if features.acknowledged and self._waits.is_pending(m.TriggerAnswer):
@@ -355,7 +356,7 @@ class Triggers:
     def _send(
         self, pending: PendingTrigger, link: Link, words: Sequence[m.Message], deadline: float
     ) -> None:
-        """Write a trigger and its other messages; note the pending answers."""
+        """Write a trigger with its other messages; note the pending answers."""
         requests, features = self._requests, self._connection.features
         link.send_all(words)
         if features.tells_all and words is FENCED_TRIGGER:
@@ -376,15 +377,15 @@ class Triggers:
     def _timed_out(
         self, pending: PendingTrigger, link: Link, deadline: float
     ) -> TriggerTimeoutError:
-        """Give up a trigger whose time is over; return the error."""
+        """Give up a trigger at its deadline; return the error."""
         self._correlation.give_up(pending)
-        # it may have been stopped: then Waiting did not drop for this trigger
+        # after a stop, Waiting did not fall for this trigger
         certain = self._connection.features.ordered or pending.evidence.began
         self._doubtful = None if certain else link
         waited = max(0.0, deadline - pending.sent_at)
-        came = f"{len(pending.results)} of {pending.wanted} results"
+        arrived = f"{len(pending.results)} of {pending.wanted} results"
         return TriggerTimeoutError(
-            f"{self._name}: {came if pending.results else 'no result'} within "
+            f"{self._name}: {arrived if pending.results else 'no result'} within "
             f"{shown_time(waited)} of the trigger; status: {self._status.last}"
             f"{_what_is_missing(pending)}",
             waited=waited,
@@ -395,9 +396,9 @@ class Triggers:
     ) -> list[m.Message]:
         """Return the messages of a trigger; its input is sent now if it is answered."""
         requests, features = self._requests, self._connection.features
-        asked = features.fences and features.polled and features.shows_triggers
+        has_evidence = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []
-        if asked:
+        if has_evidence:
             words.append(_GET_STATUS)
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
@@ -409,25 +410,27 @@ class Triggers:
             words.append(m.SetInput(data=input_data))
         words.append(_TRIGGER)
         if features.fences and features.shows_triggers:
-            words.append(_GET_STATUS if asked else _QUERY)
+            words.append(_GET_STATUS if has_evidence else _QUERY)
         return words
 
     def _end_reading(self, link: Link) -> None:
-        """Make the camera end the trigger under way, which it would not do by itself."""
+        """Make the camera end the running trigger, which it would not do by itself."""
         with contextlib.suppress(SmartCamError):  # the link is over, and the trigger with it
             link.send(m.EndTrigger(), answered=False)
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
-        """End the trigger at once if the camera reports that it took none."""
+        """End the trigger at once if the camera reports that it accepted none."""
 
         def on_answer(answer: asyncio.Future[Answer]) -> None:
-            got = answer.result()
-            if isinstance(got, SmartCamError) or pending.outcome.done():
+            answer_message = answer.result()
+            if isinstance(answer_message, SmartCamError) or pending.outcome.done():
                 return
             try:
-                self._requests.check(m.Trigger, got)
+                self._requests.check(m.Trigger, answer_message)
             except (CommandRejectedError, UnsupportedError) as exc:
-                busy = isinstance(got, m.Acknowledgement) and self._requests.is_busy(got)
+                busy = isinstance(answer_message, m.Acknowledgement) and self._requests.is_busy(
+                    answer_message
+                )
                 if not self._connection.features.ordered:  # perhaps an earlier trigger's answer
                     self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
@@ -453,7 +456,7 @@ class Triggers:
             )
 
     async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
-        """Wait until the camera takes a trigger, or raise the reason why it never will."""
+        """Wait until the camera accepts a trigger, or raise the reason why it never will."""
         begin = asyncio.get_running_loop().time()
         ends_at = math.inf  # time at which another program's trigger is ended
         if self._connection.features.ends_triggers:
@@ -489,21 +492,22 @@ class Triggers:
                 ) from exc
 
     async def _end_stranger(self, deadline: float) -> None:
-        """End a trigger of others, or one whose link broke: the camera never would."""
+        """End a trigger of others or of a lost link, which the camera would not end by itself."""
         ours = self._waits.is_pending(m.TriggerAnswer)
         if Status.BUSY in self._status.last and not ours:
             self._end_reading(self._connection.require_link())
-            await self._requests.fence(deadline)  # a line of that trigger is not the next one's
+            # afterwards no line of that trigger can be taken for the next one's
+            await self._requests.fence(deadline)
 
     def _fault(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
-        """Await the result of an earlier trigger, or make it impossible, unless a number decides.
+        """Await the result of an earlier trigger, or make it impossible; skip it with numbers.
 
-        Stop voids the inspection under way, a Query is the fence: containers before its answer are
-        older. Without a Stop the inspection's end is awaited: the camera waits for a trigger
-        again. A camera that handles requests one after the other needs the fence only.
+        Stop voids the running inspection; containers before the answer to a later Query are older.
+        Without Stop this waits for the end of the inspection, when the camera waits for a trigger
+        again. For a camera that handles requests one after the other, a Query is enough.
         Source: that Stop voids the inspection is inferred.
         """
         correlation, commands = self._correlation, self._commands
@@ -523,15 +527,15 @@ class Triggers:
             if correlation.debt is None:
                 return
         if commands.runs:
-            # interrupted here, the next trigger does all of it again
+            # after an interruption here the next trigger repeats all of this
             await commands.void_inspection(deadline)
         correlation.settled()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
         """Reset Overtriggered, or wait until it falls: only then can it rise for the next trigger.
 
-        Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
-        until it is reset (BVS ID guide p. 227, published).
+        Source: the bit falls by itself (SC manual p. 30, published), at an unknown time; on BVS ID
+        it stays until it is reset (BVS ID guide p. 227, published).
 
         Raises:
             OvertriggeredError: the bit stays set; no trigger was sent.
@@ -558,9 +562,8 @@ def _is_not_overtriggered(status: Status) -> bool:
 def _evidence(features: Features) -> TriggerEvidence:
     """Return the evidence that a trigger needs before results count as its own."""
     if not features.fences:
-        acknowledged = (
-            features.acknowledged and features.ordered
-        )  # else an answer may be lost, or late
+        # over UDP an answer may be lost or late
+        acknowledged = features.acknowledged and features.ordered
         return EvidenceByAcknowledgement() if acknowledged else TriggerEvidence()
     if not features.shows_triggers:
         return EvidenceByFence()
@@ -571,8 +574,8 @@ def _what_is_missing(pending: PendingTrigger) -> str:
     """Return the part of an error text on the camera's missing messages about the trigger."""
     evidence, early = pending.evidence, ""
     if pending.early:
-        what = "1 result" if pending.early == 1 else f"{pending.early} results"
-        early = f"; {what} came before the camera had shown that it took the trigger"
+        missing = "1 result" if pending.early == 1 else f"{pending.early} results"
+        early = f"; {missing} came before the camera had shown that it took the trigger"
     if not evidence.reached:
         return f"; the camera has not shown that it took the trigger{early}{_HINT if early else ''}"
     if not evidence.proven:

@@ -53,7 +53,7 @@ def lua_tables() -> dict[str, Any]:
         "STATUSES": [_name(member) for member in Status],
         "IDS": _ids(rows),
         "DIALECTS": [_dialect(dialect) for dialect in dialects.values()],
-        "KIN": [[one.name, *one.quirks] for group in first_tries for one in group],
+        "KIN": [[protocol.name, *protocol.quirks] for group in first_tries for protocol in group],
     }
 
 
@@ -141,9 +141,9 @@ def _status(bits: StatusBits) -> dict[str, Any]:
 def _ids(rows: Sequence[MessageRow]) -> dict[int, str]:
     """Return the names of the messages with each id, requests first."""
     names: dict[int, dict[str, None]] = {}
-    for row in sorted(rows, key=lambda one: one.type.sender is Sender.CAMERA):
+    for row in sorted(rows, key=lambda row: row.type.sender is Sender.CAMERA):
         names.setdefault(row.message_id, {})[row.type.__name__] = None
-    return {number: " / ".join(found) for number, found in sorted(names.items())}
+    return {number: " / ".join(texts) for number, texts in sorted(names.items())}
 
 
 def _lua(value: Any, indent: str = "") -> str:
@@ -156,11 +156,11 @@ def _lua(value: Any, indent: str = "") -> str:
         case str():
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         case dict():
-            entries = [(f"[{_lua(key)}] = ", one) for key, one in value.items()]
+            entries = [(f"[{_lua(key)}] = ", item) for key, item in value.items()]
         case _:
-            entries = [("", one) for one in value]
-    if not any(isinstance(one, (dict, list)) for _, one in entries):
-        return "{" + ", ".join(key + _lua(one) for key, one in entries) + "}"
+            entries = [("", item) for item in value]
+    if not any(isinstance(item, (dict, list)) for _, item in entries):
+        return "{" + ", ".join(key + _lua(item) for key, item in entries) + "}"
     deeper = indent + "  "
-    lines = [f"{deeper}{key}{_lua(one, deeper)},\n" for key, one in entries]
+    lines = [f"{deeper}{key}{_lua(item, deeper)},\n" for key, item in entries]
     return "{\n" + "".join(lines) + indent + "}"

@@ -84,5 +84,5 @@ def local_steps(seen: Callable[[Array], Array], points: Array, step: float) -> A
 
     ``seen`` maps points (N, 2) of the plane to pixels; ``step`` is in the plane's unit.
     """
-    ways = [(seen(points + way) - seen(points - way)) / 2 for way in step * np.eye(2)]
+    ways = [(seen(points + shift) - seen(points - shift)) / 2 for shift in step * np.eye(2)]
     return np.stack(ways, axis=1)

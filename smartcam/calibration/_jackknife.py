@@ -29,8 +29,8 @@ def jackknife(left_out: Array) -> Array:
     count = len(left_out)
     if count < 2:
         raise ValueError(f"jackknife: expected 2 views or more, got {count}")
-    off = left_out - left_out.mean(axis=0)
-    covariance: Array = (count - 1) / count * off.T @ off
+    deviations = left_out - left_out.mean(axis=0)
+    covariance: Array = (count - 1) / count * deviations.T @ deviations
     return covariance
 
 
@@ -52,8 +52,8 @@ def weighed_jackknife(changes: Array, spreads: Array, whole: Array, power: float
         return np.zeros(whole.shape)
     scale = unit_diagonal(whole)
     values, vectors = np.linalg.eigh(whole / np.outer(scale, scale))
-    kept = values > RANK * values.max()
-    root = scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    significant = values > RANK * values.max()
+    root = scale[:, None] * vectors[:, significant] * np.sqrt(values[significant])
     back = np.linalg.pinv(root)
     sizes, ways = np.linalg.eigh(back @ spreads @ back.T)
     along = np.einsum("vji,jk,vk->vi", ways, back, changes) / np.maximum(sizes, 1.0) ** power

@@ -57,15 +57,15 @@ class Normal(NamedTuple):
     mixed: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
-    def nothing(cls, shared: int, poses: int, own: int) -> Normal:
+    def nothing(cls, shared: int, poses: int, extra: int) -> Normal:
         """Return the equations of no residuals."""
         return cls(
             0.0,
             np.zeros((shared, shared)),
             np.zeros(shared),
-            np.zeros((poses, own, own)),
-            np.zeros((poses, own)),
-            np.zeros((poses, own, shared)),
+            np.zeros((poses, extra, extra)),
+            np.zeros((poses, extra)),
+            np.zeros((poses, extra, shared)),
         )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
@@ -191,6 +191,6 @@ def independent_parts(covariance: Array) -> Array:
     """Return independent vectors (K, S) whose outer products add up to a covariance."""
     scale = unit_diagonal(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > RANK_OF_COVARIANCE * values.max(initial=0.0)
-    parts: Array = (vectors[:, kept] * np.sqrt(values[kept])).T * scale
+    significant = values > RANK_OF_COVARIANCE * values.max(initial=0.0)
+    parts: Array = (vectors[:, significant] * np.sqrt(values[significant])).T * scale
     return parts

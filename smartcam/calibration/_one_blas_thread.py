@@ -13,7 +13,7 @@ from contextlib import ContextDecorator, suppress
 from typing import Any
 
 from smartcam._extras import load
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import MissingExtraError
 
 
@@ -27,7 +27,7 @@ class OneBlasThread(ContextDecorator):
 
     def __init__(self) -> None:
         self.forked()
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def forked(self) -> None:
         """Reset the state in a fork; its BLAS may stay limited to one thread."""

@@ -422,16 +422,16 @@ class Chain:
         return solved
 
 
-def check_frames(localizations: Sequence[Localization], frame: str | None, what: str = "") -> None:
+def check_frames(localizations: Sequence[Localization], frame: str | None, label: str = "") -> None:
     """Raise WRONG_FRAME if a localization is in another frame than ``frame``; None allows any.
 
-    ``what`` begins the message.
+    ``label`` begins the message.
     """
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
-        got = ", ".join(sorted(frames - {frame}))
+        others = ", ".join(sorted(frames - {frame}))
         raise Code.WRONG_FRAME.refusal(
-            f"{what}expected poses in the frame {frame!r}, got some in {got!r}", frame, got
+            f"{label}expected poses in the frame {frame!r}, got some in {others!r}", frame, others
         )
 
 

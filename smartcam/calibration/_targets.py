@@ -299,8 +299,8 @@ class MarkerGrid:
         lower_left = 4 * self.columns * row + 2 * column
         up = 2 * self.columns
         clockwise = np.array([up, up + 1, 1, 0])
-        found: NDArray[np.intp] = lower_left[:, None] + np.roll(clockwise, 2 * self.kalibr)
-        return found
+        corner_indices: NDArray[np.intp] = lower_left[:, None] + np.roll(clockwise, 2 * self.kalibr)
+        return corner_indices
 
 
 Target: TypeAlias = Checkerboard | Charuco | CircleGrid | MarkerGrid
@@ -347,9 +347,10 @@ def resized(target: T, factor: float, digits: int | None = None) -> T:
         CalibrationError: SHAPE: the factor is not positive.
     """
     lengths = {
-        one.name: factor * value if digits is None else round(factor * value, digits)
-        for one in dataclasses.fields(target)
-        if str(one.type).startswith("float") and (value := getattr(target, one.name)) is not None
+        field.name: factor * value if digits is None else round(factor * value, digits)
+        for field in dataclasses.fields(target)
+        if str(field.type).startswith("float")
+        and (value := getattr(target, field.name)) is not None
     }
     return dataclasses.replace(target, **lengths)
 

@@ -101,7 +101,7 @@ class Judgement(NamedTuple):
 
     def chosen(self, options: Iterable[str]) -> str:
         """Return the advised one of some options; a poor result is never just accepted."""
-        return next(one for one in (self.option, "redo", "more") if one in options)
+        return next(choice for choice in (self.option, "redo", "more") if choice in options)
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def refused(
     """Return the judgement that a calibration is not good; ``text`` names the fault."""
     named = re.search(r"\bpoints? (\d+)", text)
     number = int(named[1]) if named else worst
-    cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
+    cure, option = next((how for curable, how in cures.items() if curable == code), _LOOK)
     verdict = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
     return Judgement(verdict, option=option, number=number)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 IDS = storage.Form(
     list[storage.Count],
-    read=lambda ids, _: np.array([min(one, MAX_POINTS) for one in ids], dtype=np.intp),
+    read=lambda ids, _: np.array([min(ident, MAX_POINTS) for ident in ids], dtype=np.intp),
     write=lambda ids: ids.tolist(),
 )
 
@@ -81,10 +81,10 @@ class TargetView(storage.Stored):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def _read(cls, found: dict[str, Any], context: storage.Context) -> TargetView:
+    def _read(cls, fields: dict[str, Any], context: storage.Context) -> TargetView:
         if context.get("target") is None:
             raise storage.refused(context["called"], "target: expected the one that it shows", None)
-        return super()._read({"target": context["target"], **found}, context)
+        return super()._read({"target": context["target"], **fields}, context)
 
     @property
     def object_points(self) -> Array:
@@ -105,7 +105,7 @@ class TargetView(storage.Stored):
         # Source: Hotelling, Relations Between Two Sets of Variates (1936).
         flat, seen = self.object_points[:, :2], self.points
         both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
-        spread = math.prod(float(np.linalg.det(one.T @ one)) for one in both)
+        spread = math.prod(float(np.linalg.det(rotation.T @ rotation)) for rotation in both)
         turn = float(np.linalg.det(both[0].T @ both[1]))
         return turn / math.sqrt(spread) if spread > 0 else math.nan
 
@@ -121,12 +121,14 @@ def label(view: TargetView, number: int) -> str:
     return view.name or f"view {number}"
 
 
-def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
+def checked(value: Any, kinds: type | tuple[type, ...], label: str) -> Any:
     """Return a value if it is of one of some kinds; otherwise raise SHAPE, which describes it."""
     if isinstance(value, kinds):
         return value
-    names = [one.__name__ for one in (kinds if isinstance(kinds, tuple) else (kinds,))]
-    raise Code.SHAPE.unexpected(f"{what}: expected a {' or '.join(names)}", names, described(value))
+    names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
+    raise Code.SHAPE.unexpected(
+        f"{label}: expected a {' or '.join(names)}", names, described(value)
+    )
 
 
 def described(value: Any) -> str:
@@ -136,19 +138,21 @@ def described(value: Any) -> str:
     return kind if shape is None else f"{kind} of shape {tuple(shape)}"
 
 
-def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
+def as_views(views: Iterable[TargetView], label: str) -> list[TargetView]:
     """Return views as a list; raise SHAPE for no list, or for another kind of element."""
-    return as_list(views, TargetView, f"{what}: view")
+    return as_list(views, TargetView, f"{label}: view")
 
 
-def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
+def as_list(values: Any, kinds: type | tuple[type, ...], label: str) -> list[Any]:
     """Return values as a list; raise SHAPE unless each is of one of some kinds."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
-        raise Code.SHAPE.unexpected(f"{what}: expected a list of such", "a list", described(values))
-    return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
+        raise Code.SHAPE.unexpected(
+            f"{label}: expected a list of such", "a list", described(values)
+        )
+    return [checked(value, kinds, f"{label} {number}") for number, value in enumerate(values)]
 
 
-def as_covariances(values: Any, count: int, what: str) -> Array:
+def as_covariances(values: Any, count: int, label: str) -> Array:
     """Return covariances of points in an image, (``count``, 2, 2).
 
     Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
@@ -156,31 +160,31 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     try:
         given = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.unexpected(f"{what}: expected numbers", (count, 2, 2), exc) from exc
+        raise Code.SHAPE.unexpected(f"{label}: expected numbers", (count, 2, 2), exc) from exc
     if given.shape != (count, 2, 2):
         raise Code.SHAPE.unexpected(
-            f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
+            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
         )
-    found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
+    covariances = as_points(given.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
-    trace = np.trace(found, axis1=1, axis2=2)
-    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(found).max(
-        axis=(1, 2)
-    )
-    product = found[:, 0, 0] * found[:, 1, 1]
-    negative = (found[:, 0, 0] < 0) | (
-        product - found[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
+    trace = np.trace(covariances, axis1=1, axis2=2)
+    uneven = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(
+        covariances
+    ).max(axis=(1, 2))
+    product = covariances[:, 0, 0] * covariances[:, 1, 1]
+    negative = (covariances[:, 0, 0] < 0) | (
+        product - covariances[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
     )
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
-        got = found[wrong[0]].tolist()
+        value = covariances[wrong[0]].tolist()
         raise Code.NO_COVARIANCE.refusal(
-            f"{what}: expected symmetric matrices of no negative variance, got {got} in row "
+            f"{label}: expected symmetric matrices of no negative variance, got {value} in row "
             f"{wrong[0]}",
             "covariances",
-            got,
+            value,
         )
-    return found
+    return covariances
 
 
 def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -191,9 +195,9 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
             f"{called}: ids: expected whole numbers", "(N,)", str(exc)
         ) from exc
     if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-        got = f"{given.dtype} of shape {given.shape}"
+        received = f"{given.dtype} of shape {given.shape}"
         raise Code.SHAPE.unexpected(
-            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", got
+            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", received
         )
     wrong = given[(given < 0) | (given >= known)]
     if len(wrong) and wrong[0] < 0:
@@ -205,7 +209,7 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
     ids = given.astype(np.intp)
     back = np.flatnonzero(np.diff(ids) <= 0)
     if len(back):
-        got = ids[back[0] : back[0] + 2].tolist()
+        received = ids[back[0] : back[0] + 2].tolist()
         expected = f"{called}: ids: expected each once, ascending (points in the order of the ids)"
-        raise Code.SHAPE.unexpected(expected, "ascending", got)
+        raise Code.SHAPE.unexpected(expected, "ascending", received)
     return ids

@@ -68,15 +68,15 @@ def add_options(parser: Any) -> None:
 
 def terminal_summary(reporter: Any) -> None:
     """Write the findings about clients into pytest's report, if there are any."""
-    found = [
+    findings = [
         value
         for reports in reporter.stats.values()
-        for one in reports
-        if getattr(one, "when", None) == "call"
-        for name, value in one.user_properties
+        for report in reports
+        if getattr(report, "when", None) == "call"
+        for name, value in report.user_properties
         if name == PROPERTY
     ]
-    if found:
+    if findings:
         from smartcam.conformance.client._report import ClientFinding, write_findings
 
-        write_findings(reporter, [ClientFinding.from_json(value) for value in found])
+        write_findings(reporter, [ClientFinding.from_json(value) for value in findings])

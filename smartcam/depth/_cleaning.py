@@ -32,7 +32,7 @@ MIN_NEW_SCENE_SHARE: Final = 0.5
 
 @takes(scale=a_number)
 def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
-    """Return a depth map as float32 metres, 0 where there is none.
+    """Return a depth map as float32 metres, 0 for pixels without depth.
 
     Args:
         depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (disparities in
@@ -124,13 +124,13 @@ class SpatialFilter:
     def _smooth(self, lines: NDArray[np.float32]) -> None:
         """Smooth along the first axis, forwards and backwards, in place."""
         step, size = np.empty_like(lines[0]), np.empty_like(lines[0])
-        near = np.empty(lines.shape[1], bool)
-        rest, delta = np.float32(1 - self.alpha), np.float32(self.delta)
+        is_near = np.empty(lines.shape[1], bool)
+        weight_of_new, delta = np.float32(1 - self.alpha), np.float32(self.delta)
         for line, before in _forth_and_back(len(lines)):
             np.subtract(lines[line], lines[before], out=step)
-            np.less(np.abs(step, out=size), delta, out=near)
-            np.multiply(step, rest, out=step)
-            np.subtract(lines[line], step, out=lines[line], where=near)
+            np.less(np.abs(step, out=size), delta, out=is_near)
+            np.multiply(step, weight_of_new, out=step)
+            np.subtract(lines[line], step, out=lines[line], where=is_near)
 
 
 def _forth_and_back(count: int) -> list[tuple[int, int]]:
@@ -183,18 +183,18 @@ class TemporalFilter:
         average, holes = self._average, self._holes
         if average is None or holes is None or average.shape != new.shape:
             return self._begin(new)
-        there = new > 0
-        both = there & (average > 0)
+        seen = new > 0
+        both = seen & (average > 0)
         step = new - average
         changed = both & (np.abs(step) >= self.delta)
         if np.count_nonzero(changed) > MIN_NEW_SCENE_SHARE * np.count_nonzero(both):
             return self._begin(new)
-        kept = both & ~changed
-        np.add(average, np.float32(self.alpha) * step, out=average, where=kept)
-        np.copyto(average, new, where=there & ~kept)
+        steady = both & ~changed
+        np.add(average, np.float32(self.alpha) * step, out=average, where=steady)
+        np.copyto(average, new, where=seen & ~steady)
         holes += holes < 255
-        holes[there] = 0
-        holes[_dilated(changed) & ~there] = 255
+        holes[seen] = 0
+        holes[_dilated(changed) & ~seen] = 255
         average[holes > self.persistence] = 0.0
         return average.copy()
 
@@ -272,8 +272,8 @@ def _widened(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
     return values
 
 
-def _check_average(who: str, alpha: float, delta: float) -> None:
+def _check_average(caller: str, alpha: float, delta: float) -> None:
     if not 0 < alpha <= 1:
-        raise ConfigurationError(f"{who}: alpha: expected above 0, up to 1, got {shown(alpha)}")
+        raise ConfigurationError(f"{caller}: alpha: expected above 0, up to 1, got {shown(alpha)}")
     if not (delta > 0 and math.isfinite(delta)):
-        raise ConfigurationError(f"{who}: delta: expected a step above 0, got {shown(delta)}")
+        raise ConfigurationError(f"{caller}: delta: expected a step above 0, got {shown(delta)}")

@@ -121,14 +121,14 @@ class Cloud:
         parts = list(clouds)
         columns: dict[str, NDArray[Any] | None] = {}
         for name in ("colours", "sigma"):
-            found = [part for one in parts if (part := getattr(one, name)) is not None]
-            if found and len(found) < len(parts):
+            arrays = [part for cloud in parts if (part := getattr(cloud, name)) is not None]
+            if arrays and len(arrays) < len(parts):
                 raise ConfigurationError(
                     f"joined: expected all clouds with {name} or none, "
-                    f"got {len(found)} of {len(parts)}"
+                    f"got {len(arrays)} of {len(parts)}"
                 )
-            columns[name] = np.concatenate(found) if found else None
-        points = [np.empty((0, 3), np.float32), *(one.points for one in parts)]
+            columns[name] = np.concatenate(arrays) if arrays else None
+        points = [np.empty((0, 3), np.float32), *(part.points for part in parts)]
         return cls(np.concatenate(points), **columns)
 
     def transformed(self, pose: Transform) -> Self:
@@ -164,47 +164,47 @@ def _as(values: NDArray[Any]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _shape(values: NDArray[Any], what: str, shape: tuple[int | None, ...]) -> None:
+def _shape(values: NDArray[Any], label: str, shape: tuple[int | None, ...]) -> None:
     fits = len(values.shape) == len(shape) and all(
-        want is None or got == want for got, want in zip(values.shape, shape, strict=True)
+        want is None or count == want for count, want in zip(values.shape, shape, strict=True)
     )
     if not fits:
-        wanted = ", ".join("any" if one is None else str(one) for one in shape)
-        raise ConfigurationError(f"{what}: expected the shape ({wanted}), got {values.shape}")
+        wanted = ", ".join("any" if count is None else str(count) for count in shape)
+        raise ConfigurationError(f"{label}: expected the shape ({wanted}), got {values.shape}")
 
 
-def _floats(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+def _floats(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
     """Return a read-only view as finite float32; raise ConfigurationError otherwise."""
-    values = _array(given, what)
+    values = _array(given, label)
     if values.dtype.kind not in _NUMBERS:
-        raise ConfigurationError(f"{what}: expected numbers, got {values.dtype}")
-    _shape(values, what, shape)
+        raise ConfigurationError(f"{label}: expected numbers, got {values.dtype}")
+    _shape(values, label, shape)
     with np.errstate(over="ignore"):
         floats = np.ascontiguousarray(values, np.float32).view()
     if not np.isfinite(floats).all():
         wrong = int(np.count_nonzero(~np.isfinite(floats)))
         raise ConfigurationError(
-            f"{what}: expected finite float32 values, got {wrong} that are not"
+            f"{label}: expected finite float32 values, got {wrong} that are not"
         )
     floats.flags.writeable = False
     return floats
 
 
-def _bytes(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArray[np.uint8]:
-    values = _array(given, what)
+def _bytes(given: ArrayLike, label: str, shape: tuple[int | None, ...]) -> NDArray[np.uint8]:
+    values = _array(given, label)
     if values.dtype != np.uint8:
-        raise ConfigurationError(f"{what}: expected uint8, got {values.dtype}")
-    _shape(values, what, shape)
+        raise ConfigurationError(f"{label}: expected uint8, got {values.dtype}")
+    _shape(values, label, shape)
     view = np.ascontiguousarray(values).view()
     view.flags.writeable = False
     return view
 
 
-def _array(given: ArrayLike, what: str) -> NDArray[Any]:
+def _array(given: ArrayLike, label: str) -> NDArray[Any]:
     try:
         return np.asarray(given)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise ConfigurationError(f"{what}: expected an array, got {type(given).__name__}") from exc
+        raise ConfigurationError(f"{label}: expected an array, got {type(given).__name__}") from exc
 
 
 def _picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:

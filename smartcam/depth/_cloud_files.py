@@ -71,7 +71,7 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
     ``mm`` or ``inch``.
 
     PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
-    with a coordinate that is not finite, as organised files have them, are left out. Colours are
+    with a coordinate that is not finite, as in organised files, are left out. Colours are
     ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``, or PCL's
     ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the same unit.
     Properties of other names are skipped, and so is a PCD's viewpoint. Large files take seconds: do
@@ -107,14 +107,14 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
 
 def _unit_comment(data: bytes) -> str:
     """Return the unit from the header's comment; raise BadTableError if it is missing."""
-    found = UNIT_COMMENT.search(data[:MAX_HEAD_BYTES])
-    if found is None:
+    match = UNIT_COMMENT.search(data[:MAX_HEAD_BYTES])
+    if match is None:
         raise BadTableError(
             'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '
             "--unit on the command line",
             "none",
         )
-    return found[1].decode()
+    return match[1].decode()
 
 
 @takes(cloud=of_class("Cloud"), text=check_flag)
@@ -152,61 +152,72 @@ def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
     if missing:
         raise BadTableError("x, y and z", f"no {', '.join(missing)}, but {', '.join(columns)}")
     coordinates = [columns[name] for name in "xyz"]
-    there = np.isfinite(coordinates[0])
+    valid = np.isfinite(coordinates[0])
     for column in coordinates[1:]:
-        there = there & np.isfinite(column)
-    points = np.empty((int(there.sum()), 3), np.float32)
+        valid = valid & np.isfinite(column)
+    points = np.empty((int(valid.sum()), 3), np.float32)
     for place, column in enumerate(coordinates):
-        found = column[there] if metre == 1.0 else column[there] * metre
+        columns_in_metres = column[valid] if metre == 1.0 else column[valid] * metre
         with np.errstate(over="ignore"):
-            points[:, place] = found
-        if found.dtype == np.float64 and found.size and _loses(found, points[:, place]):
+            points[:, place] = columns_in_metres
+        if (
+            columns_in_metres.dtype == np.float64
+            and columns_in_metres.size
+            and _loses(columns_in_metres, points[:, place])
+        ):
             raise BadTableError(
                 "coordinates that float32 keeps to a millimetre",
-                f"{'xyz'[place]} up to {np.abs(found).max():g} m: move the origin",
+                f"{'xyz'[place]} up to {np.abs(columns_in_metres).max():g} m: move the origin",
             )
     try:
-        sigma = _sigma(columns, there)
+        sigma = _sigma(columns, valid)
         scaled = sigma if sigma is None or metre == 1.0 else (metre * sigma).astype(sigma.dtype)
-        return Cloud(points, _colours(columns, there), scaled)
+        return Cloud(points, _colours(columns, valid), scaled)
     except ConfigurationError as exc:
         raise BadTableError("a cloud", str(exc)) from exc
 
 
-def _loses(exact: NDArray[Any], kept: NDArray[Any]) -> bool:
+def _loses(exact: NDArray[Any], stored: NDArray[Any]) -> bool:
     with np.errstate(invalid="ignore"):
-        return not float(np.abs(exact - kept.astype(np.float64)).max()) <= MAX_ROUNDING_METRES
+        return not float(np.abs(exact - stored.astype(np.float64)).max()) <= MAX_ROUNDING_METRES
 
 
 def _colours(
-    columns: Mapping[str, NDArray[Any]], there: NDArray[np.bool_]
+    columns: Mapping[str, NDArray[Any]], valid: NDArray[np.bool_]
 ) -> NDArray[np.uint8] | None:
-    names = next((some for some in COLOUR_NAMES if all(name in columns for name in some)), None)
+    names = next(
+        (
+            names_of_form
+            for names_of_form in COLOUR_NAMES
+            if all(name in columns for name in names_of_form)
+        ),
+        None,
+    )
     if names is None:
         return None
-    found: NDArray[Any] = np.stack([columns[name][there] for name in names], axis=1)
-    if found.dtype == np.uint8 or not found.size:
-        return found.astype(np.uint8)
-    least, most = float(found.min()), float(found.max())
-    if found.dtype == np.uint16:
+    colours: NDArray[Any] = np.stack([columns[name][valid] for name in names], axis=1)
+    if colours.dtype == np.uint8 or not colours.size:
+        return colours.astype(np.uint8)
+    least, most = float(colours.min()), float(colours.max())
+    if colours.dtype == np.uint16:
         scale = 1 / 257  # 65535 is 255
-    elif found.dtype.kind == "f" and least >= 0 and most <= 1:
+    elif colours.dtype.kind == "f" and least >= 0 and most <= 1:
         scale = 255.0
-    elif found.dtype.itemsize > 1 and least >= 0 and most <= 255:
+    elif colours.dtype.itemsize > 1 and least >= 0 and most <= 255:
         scale = 1.0
     else:
         raise BadTableError(
             "colours of 0 to 1, of 0 to 255 or of 16 bits",
-            f"{found.dtype} of {least:g} to {most:g}",
+            f"{colours.dtype} of {least:g} to {most:g}",
         )
-    levels: NDArray[np.uint8] = np.rint(found * scale).astype(np.uint8)
+    levels: NDArray[np.uint8] = np.rint(colours * scale).astype(np.uint8)
     return levels
 
 
 def _sigma(
-    columns: Mapping[str, NDArray[Any]], there: NDArray[np.bool_]
+    columns: Mapping[str, NDArray[Any]], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32] | None:
     if "sigma" not in columns:
         return None
     with np.errstate(over="ignore"):
-        return columns["sigma"][there].astype(np.float32)
+        return columns["sigma"][valid].astype(np.float32)

@@ -55,7 +55,7 @@ class ColourRange:
             given: Any = getattr(self, name)
             try:
                 low, high = given
-                fits = all(type(one) is int and 0 <= one <= most for one in (low, high))
+                fits = all(type(level) is int and 0 <= level <= most for level in (low, high))
             except (TypeError, ValueError, ArithmeticError):
                 low, high, fits = 0, 0, False
             if not fits or (low > high and name != "hue"):
@@ -82,10 +82,12 @@ class ColourRange:
         """Return the mask (H, W) of the pixels in the range, from HSV (H, W, 3) of uint8."""
         low, high = self.hue
         if low <= high:
-            found = self._between(picture, low, high)
+            chosen = self._between(picture, low, high)
         else:
-            found = self._between(picture, low, MAX_LEVELS["hue"]) | self._between(picture, 0, high)
-        return found > 0
+            chosen = self._between(picture, low, MAX_LEVELS["hue"]) | self._between(
+                picture, 0, high
+            )
+        return chosen > 0
 
     def _between(self, picture: NDArray[np.uint8], low: int, high: int) -> NDArray[np.uint8]:
         lows, highs = zip((low, high), self.saturation, self.value, strict=True)
@@ -146,8 +148,8 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
         raise ConfigurationError(
             f"ColourRange: expected a pixel within {width}x{height}, got ({x}, {y})"
         )
-    near = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
-    hues, saturations, values = near.reshape(-1, 3).astype(int).T
+    around = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
+    hues, saturations, values = around.reshape(-1, 3).astype(int).T
     saturation, value = _spread(saturations, margin), _spread(values, margin)
     if np.median(values) < MIN_COLOURFUL:
         return ColourRange(value=(0, value[1]))
@@ -155,8 +157,8 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
         return ColourRange(saturation=(0, saturation[1]), value=value)
     # hues relative to their middle, so that red is not split at 0
     middle = round(np.angle(np.exp(2j * np.pi * hues / HUE_UNITS).sum()) * HUE_UNITS / (2 * np.pi))
-    off = (hues - middle + HUE_UNITS // 2) % HUE_UNITS - HUE_UNITS // 2
-    low, high = (round(float(one)) for one in np.percentile(off, (5, 95)))
+    differences = (hues - middle + HUE_UNITS // 2) % HUE_UNITS - HUE_UNITS // 2
+    low, high = (round(float(difference)) for difference in np.percentile(differences, (5, 95)))
     low, high = low - (margin + 1) // 2, high + (margin + 1) // 2
     hue = (0, MAX_LEVELS["hue"])
     if high - low < HUE_UNITS - 1:
@@ -247,20 +249,20 @@ def find_regions(
     _, labels, rows, _ = cv2.connectedComponentsWithStats(given.view(np.uint8), connectivity=8)
     areas = rows[1:, cv2.CC_STAT_AREA]
     wanted = np.flatnonzero((areas >= area[0]) & (areas <= area[1])) + 1
-    found: list[ColourRegion] = []
-    for label in sorted(wanted.tolist(), key=lambda one: -int(rows[one, cv2.CC_STAT_AREA])):
-        left, top, width, height = (int(one) for one in rows[label, :4])
+    regions: list[ColourRegion] = []
+    for label in sorted(wanted.tolist(), key=lambda index: -int(rows[index, cv2.CC_STAT_AREA])):
+        left, top, width, height = (int(number) for number in rows[label, :4])
         cut = (
             min(left, top) == 0 or left + width == given.shape[1] or top + height == given.shape[0]
         )
         if whole and cut:
             continue
-        one = _region(labels, label, np.s_[top : top + height, left : left + width])
-        if ratio[0] <= one.ratio <= ratio[1] and one.fullness >= fullness:
-            found.append(one)
-        if len(found) == most:
+        region = _region(labels, label, np.s_[top : top + height, left : left + width])
+        if ratio[0] <= region.ratio <= ratio[1] and region.fullness >= fullness:
+            regions.append(region)
+        if len(regions) == most:
             break
-    return found
+    return regions
 
 
 def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> ColourRegion:
@@ -273,7 +275,7 @@ def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> Colou
     turned = 0.5 * math.atan2(2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y)))
     hull = cv2.convexHull(points.astype(np.int32))
     around = cv2.minAreaRect(hull)
-    (width, height), angle = (one + 1 for one in around[1]), around[2]  # from rim to rim
+    (width, height), angle = (offset + 1 for offset in around[1]), around[2]  # from rim to rim
     mask = np.zeros(labels.shape, bool)
     mask[box] = pixels
     return ColourRegion(

@@ -53,8 +53,8 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
     Raises:
         ConfigurationError: the corners are not (3,), or one is not below the other.
     """
-    corners = [np.asarray(one, np.float64) for one in (low, high)]
-    if any(one.shape != (3,) for one in corners) or not (corners[0] <= corners[1]).all():
+    corners = [np.asarray(corner, np.float64) for corner in (low, high)]
+    if any(corner.shape != (3,) for corner in corners) or not (corners[0] <= corners[1]).all():
         raise ConfigurationError(f"crop_box: expected a low and a high x, y, z; got {low}, {high}")
     ends = _as_float32(corners)
     inside = np.all((cloud.points >= ends[0]) & (cloud.points <= ends[1]), axis=1)
@@ -69,7 +69,7 @@ def _as_float32(ends: ArrayLike) -> NDArray[np.float32]:
 
 @takes(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
-    """Return the points without those that are unusually far from their neighbours.
+    """Return the points without points that are unusually far from their neighbours.
 
     A point stays if its mean distance to its ``neighbours`` nearest points is at most ``ratio``
     standard deviations above the mean of these distances. An empty cloud is returned as it is.
@@ -112,12 +112,12 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     if len(cloud) <= neighbours:
         return cloud.select(np.zeros(len(cloud), bool))
     tree = load("scipy.spatial").cKDTree(cloud.points)
-    kept = np.empty(len(cloud), bool)
+    mask = np.empty(len(cloud), bool)
     for part in _parts(len(cloud)):
         # It is enough to know the distance to the last of the required neighbours.
         distances, _ = tree.query(cloud.points[part], k=[neighbours + 1])
-        kept[part] = distances[:, 0] <= radius
-    return cloud.select(kept)
+        mask[part] = distances[:, 0] <= radius
+    return cloud.select(mask)
 
 
 @takes(cloud=of_class("Cloud"), size=a_number)
@@ -145,7 +145,7 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
         return sums / counts
 
     def columns(values: NDArray[Any]) -> NDArray[np.float64]:
-        return np.stack([means(one) for one in values.T], axis=1)
+        return np.stack([means(column) for column in values.T], axis=1)
 
     colours = cloud.colours
     return Cloud(
@@ -181,13 +181,13 @@ def _parts(count: int) -> Iterator[slice]:
         yield slice(start, min(start + POINTS_AT_A_TIME, count))
 
 
-def _check_count(value: int, what: str) -> None:
+def _check_count(value: int, label: str) -> None:
     if not isinstance(value, int) or not 1 <= value <= MAX_NEIGHBOURS:
         raise ConfigurationError(
-            f"{what}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
+            f"{label}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
         )
 
 
-def _check_length(value: float, what: str) -> None:
+def _check_length(value: float, label: str) -> None:
     if not 0 < value < math.inf:
-        raise ConfigurationError(f"{what}: expected metres above 0, got {shown(value)}")
+        raise ConfigurationError(f"{label}: expected metres above 0, got {shown(value)}")

@@ -210,11 +210,11 @@ class StereoMatcher:
                 f"got {first.shape[1]}x{first.shape[0]} and {second.shape[1]}x{second.shape[0]}"
             )
         with self._lock:
-            found = self._match(first, second)
-        return Disparity(*refined(first, second, found, self._refine))
+            disparity = self._match(first, second)
+        return Disparity(*refined(first, second, disparity, self._refine))
 
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return OpenCV's disparities, NaN where there is none."""
+        """Return OpenCV's disparities, NaN for pixels without one."""
         cv2 = load("cv2")
         invalid = (int(self.parameters["min_disparity"]) - 1) * SUBPIXELS
         sixteenths = self._padded(left, right)
@@ -224,8 +224,8 @@ class StereoMatcher:
             apart = _disagreement(sixteenths, self._reverse(left, right), invalid)
             sixteenths[~(apart <= self._left_right * SUBPIXELS)] = invalid
         column = np.arange(left.shape[1])
-        there = column - np.round(sixteenths / SUBPIXELS)
-        sixteenths[(there < 0) | (there >= left.shape[1])] = invalid
+        left_column = column - np.round(sixteenths / SUBPIXELS)
+        sixteenths[(left_column < 0) | (left_column >= left.shape[1])] = invalid
         size = int(self.parameters["speckle_window_size"])
         if size:
             reach = int(self.parameters["speckle_range"]) * SUBPIXELS
@@ -245,12 +245,14 @@ class StereoMatcher:
         before = max(0, self.max_disparity + 1)
         after = max(0, -int(self.parameters["min_disparity"]))
         wide = [
-            cv2.copyMakeBorder(np.ascontiguousarray(one), 0, 0, before, after, cv2.BORDER_REPLICATE)
-            for one in (left, right)
+            cv2.copyMakeBorder(
+                np.ascontiguousarray(picture), 0, 0, before, after, cv2.BORDER_REPLICATE
+            )
+            for picture in (left, right)
         ]
         width = left.shape[1]
-        found = np.asarray(self._compute(*wide))[:, before : before + width]
-        return np.ascontiguousarray(found)
+        computed = np.asarray(self._compute(*wide))[:, before : before + width]
+        return np.ascontiguousarray(computed)
 
 
 def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
@@ -264,7 +266,9 @@ def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
             )
         if known[name].check(value) is None:
             raise _wrong(f"{algorithm}: {name}", str(known[name]), value)
-    merged: dict[str, Value] = {name: one.default for name, one in known.items()} | dict(given)
+    merged: dict[str, Value] = {name: setting.default for name, setting in known.items()} | dict(
+        given
+    )
     if algorithm == "sgbm":
         area = int(merged["block_size"]) ** 2
         merged["P1"] = merged["P1"] or 8 * area
@@ -274,8 +278,8 @@ def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
     return merged
 
 
-def _wrong(what: str, expected: str, got: object) -> ConfigurationError:
-    return ConfigurationError(f"StereoMatcher: {what}: expected {expected}, got {shown(got)}")
+def _wrong(label: str, expected: str, actual: object) -> ConfigurationError:
+    return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {shown(actual)}")
 
 
 def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
@@ -316,7 +320,7 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
             f"{cv2.__version__} without; leave wls out"
         )
     try:
-        smoothness, edges = (float(one) for one in wls)
+        smoothness, edges = (float(number) for number in wls)
     except (TypeError, ValueError, ArithmeticError):
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):

@@ -56,7 +56,7 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
         OSError: one of the files cannot be read.
     """
     given = [(parse_camera_info(_text(path)), path) for path in (left, right)]
-    (one, _), (two, _) = given
+    (left_info, _), (two, _) = given
     shift = float(two.projection[0, 3] / two.projection[0, 0])
     if not shift < 0:
         raise CalibrationError(
@@ -71,7 +71,7 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
     first, second = (_rotation(info.rectification, path) for info, path in given)
     transform = Transform("right", "left", second.T @ first, second.T @ np.array([shift, 0, 0]))
     return CameraChain(
-        cameras=(one.camera, two.camera), transforms=(transform,), names=("left", "right")
+        cameras=(left_info.camera, two.camera), transforms=(transform,), names=("left", "right")
     )
 
 
@@ -137,9 +137,9 @@ class CalibratedPair:
         self._shapes = tuple(lens.size for lens in lenses)
         wanted = lenses[0].size if size is None else size
         left, right = (scaled(lens, wanted) for lens in lenses)
-        found = rectify(left, right, transform, alpha=alpha)
-        self.size = found.size
-        projection = found.projections[1]
+        rectification = rectify(left, right, transform, alpha=alpha)
+        self.size = rectification.size
+        projection = rectification.projections[1]
         self.focal = float(projection[0, 0])
         self.baseline = -float(projection[0, 3]) / self.focal
         if not self.baseline > 0:
@@ -148,11 +148,13 @@ class CalibratedPair:
                 f"stereo: expected a left camera that is left of the right one, got one {where}: "
                 "swap the two, or turn both by a quarter"
             )
-        self.camera_info = CameraModel(size=found.size, matrix=found.projections[0][:, :3])
+        self.camera_info = CameraModel(
+            size=rectification.size, matrix=rectification.projections[0][:, :3]
+        )
         self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
-        self._covariance_root = _covariance_root(found.rotations[1], covariance)
-        self._maps, self._masks = found.maps, found.masks
-        self.rotation: NDArray[np.float64] = found.rotations[0]
+        self._covariance_root = _covariance_root(rectification.rotations[1], covariance)
+        self._maps, self._masks = rectification.maps, rectification.masks
+        self.rotation: NDArray[np.float64] = rectification.rotations[0]
         self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
 
     def rectified(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:
@@ -222,9 +224,16 @@ class CalibratedPair:
         f, (cx, cy) = np.float32(self.focal), self.camera_info.matrix[:2, 2]
         x = ((np.arange(self.size[0]) - cx) / self.focal).astype(np.float32)[None]
         y = ((np.arange(self.size[1]) - cy) / self.focal).astype(np.float32)[:, None]
-        near = 1 / z
-        beside = x - np.float32(self.baseline) * near
-        factors = (-beside * y, 1 + beside * x, -y, near, np.float32(0), -beside * near)
+        inverse_depth = 1 / z
+        beside = x - np.float32(self.baseline) * inverse_depth
+        factors = (
+            -beside * y,
+            1 + beside * x,
+            -y,
+            inverse_depth,
+            np.float32(0),
+            -beside * inverse_depth,
+        )
         variance = np.zeros_like(z)
         for column in spread.T:
             part = np.zeros_like(z)

@@ -35,23 +35,23 @@ class PairClock:
     """Estimate skew and drift of two cameras from their paired frames."""
 
     def __init__(self) -> None:
-        self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
+        self._pairs: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
 
     def saw(self, left: Frame, right: Frame) -> None:
         """Record a pair; restart if a camera's frame numbers restarted."""
-        now = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
-        if self._seen and not all(
-            a < b for a, b in zip(self._seen[-1].sequence, now.sequence, strict=True)
+        pair = _SeenPair((left.captured, right.captured), (left.sequence, right.sequence))
+        if self._pairs and not all(
+            a < b for a, b in zip(self._pairs[-1].sequence, pair.sequence, strict=True)
         ):
-            self._seen.clear()
-        self._seen.append(now)
+            self._pairs.clear()
+        self._pairs.append(pair)
 
     def skew(self) -> float | None:
         """Return the median time, seconds, by which the right frames of recent pairs are later."""
-        recent = list(self._seen)[-SKEW_PAIRS:]
+        recent = list(self._pairs)[-SKEW_PAIRS:]
         if not recent:
             return None
-        return statistics.median(one.captured[1] - one.captured[0] for one in recent)
+        return statistics.median(pair.captured[1] - pair.captured[0] for pair in recent)
 
     def drift(self, clocks: Sequence[ClockStatistics | None]) -> tuple[float | None, str]:
         """Return the right clock's drift against the left clock, and the source of this value.
@@ -59,7 +59,7 @@ class PairClock:
         Each camera's own clock sets its frame rate. Without timestamps of these clocks, and at the
         same nominal rate, the ratio of the frame rates is the ratio of the clocks.
         """
-        left, right = (None if one is None else one.drift for one in clocks)
+        left, right = (None if clock is None else clock.drift for clock in clocks)
         if left is not None and right is not None:
             return (right - left) / (1 + left), "clocks"
         rates = self._rates()
@@ -70,12 +70,12 @@ class PairClock:
 
     def _rates(self) -> tuple[float, float] | None:
         """Return both cameras' frame rates by the local clock."""
-        seen = list(self._seen)
+        seen = list(self._pairs)
         if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None
-        found = []
+        rates = []
         for side in (0, 1):
-            at = np.array([one.captured[side] - seen[0].captured[side] for one in seen])
-            number = np.array([one.sequence[side] - seen[0].sequence[side] for one in seen])
-            found.append(float(np.polyfit(at, number, 1)[0]))
-        return (found[0], found[1]) if min(found) > 0 else None
+            at = np.array([pair.captured[side] - seen[0].captured[side] for pair in seen])
+            number = np.array([pair.sequence[side] - seen[0].sequence[side] for pair in seen])
+            rates.append(float(np.polyfit(at, number, 1)[0]))
+        return (rates[0], rates[1]) if min(rates) > 0 else None

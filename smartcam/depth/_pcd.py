@@ -100,22 +100,22 @@ def _header(data: bytes) -> _PcdHeader:
         raise BadTableError("each of the FIELDS once", shown(" ".join(names)))
     types = []
     for kind, size in zip(kinds, sizes, strict=True):
-        found = TYPES.get((kind, count_of(size, "bytes")))
-        if found is None:
+        number_type = TYPES.get((kind, count_of(size, "bytes")))
+        if number_type is None:
             raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
-        types.append(found)
-    width, height, points = (_one(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
+        types.append(number_type)
+    width, height, points = (_single_line(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
         raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
-    if lines["DATA"] not in [[one] for one in READERS]:
+    if lines["DATA"] not in [[reader] for reader in READERS]:
         raise BadTableError(f"DATA {', '.join(READERS)}", shown(" ".join(lines["DATA"])))
-    many = [count_of(one, "numbers") for one in counts]
+    many = [count_of(count, "numbers") for count in counts]
     if max(many) > MAX_FIELDS or min(many) < 1:
         raise BadTableError(f"COUNT from 1 to {MAX_FIELDS}", f"{min(many)} to {max(many)}")
     return _PcdHeader(names, types, many, points, lines["DATA"][0], place)
 
 
-def _one(lines: Mapping[str, list[str]], name: str) -> int:
+def _single_line(lines: Mapping[str, list[str]], name: str) -> int:
     words = lines.get(name, [])
     if len(words) != 1:
         raise BadTableError(f"{name} and a number", shown(" ".join(words)))
@@ -146,11 +146,11 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
         raise BadTableError(f"points that unpack to {MAX_UNPACKED_BYTES} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
-    packed, whole = struct.unpack_from("<II", data, head.start)
-    if whole != size or packed > len(data) - head.start - 8:
+    packed, unpacked_size = struct.unpack_from("<II", data, head.start)
+    if unpacked_size != size or packed > len(data) - head.start - 8:
         raise BadTableError(
             f"up to {len(data) - head.start - 8} bytes that unpack to {size}",
-            f"{packed} that unpack to {whole}",
+            f"{packed} that unpack to {unpacked_size}",
         )
     columns, place = {}, 0
     body = unpacked(data[head.start + 8 : head.start + 8 + packed], size)

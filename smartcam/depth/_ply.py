@@ -106,12 +106,12 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
     before, vertex = _vertex(elements)
     row = vertex.row(order)
     if order:
-        for one in before:
-            start = one.end(data, start, order)
+        for element in before:
+            start = element.end(data, start, order)
         rows = from_bytes(data, start, vertex.count, row)
         return {name: rows[name].astype(kind) for name, kind in vertex.properties.items()}
     types = [np.dtype(kind) for kind in vertex.properties.values()]
-    columns = from_text(data, start, sum(one.count for one in before), vertex.count, types)
+    columns = from_text(data, start, sum(element.count for element in before), vertex.count, types)
     return dict(zip(row.names or (), columns, strict=True))
 
 
@@ -162,11 +162,11 @@ def _add_part(element: _PlyElement, *part: str) -> None:
 
 def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
     """Return the elements before the vertices, and the vertices' element."""
-    for place, one in enumerate(elements):
-        if one.name == "vertex":
-            return elements[:place], one
-    found = ", ".join(shown(one.name) for one in elements) or "none"
-    raise BadTableError("an element vertex", found)
+    for place, element in enumerate(elements):
+        if element.name == "vertex":
+            return elements[:place], element
+    names = ", ".join(shown(element.name) for element in elements) or "none"
+    raise BadTableError("an element vertex", names)
 
 
 def write(cloud: Cloud, text: bool) -> bytes:

@@ -79,21 +79,21 @@ def region_depth(
         )
     metres = as_metres(depth, scale)
     inside = metres[_mask(region, metres.shape)]
-    there = inside[inside > 0].astype(float)
-    if not there.size:
+    measured = inside[inside > 0].astype(float)
+    if not measured.size:
         raise FrameFormatError(
             f"region_depth: expected a depth in {_described(region)}, "
             f"got none in {inside.size} pixels"
         )
-    median = float(np.median(there))
-    spread = SIGMA_PER_MAD * float(np.median(np.abs(there - median)))
+    median = float(np.median(measured))
+    spread = SIGMA_PER_MAD * float(np.median(np.abs(measured - median)))
     # variance of the median as a share of a pixel's variance
-    variance = min(1.0, (shared + MEDIAN_EXCESS_VARIANCE) / there.size)
+    variance = min(1.0, (shared + MEDIAN_EXCESS_VARIANCE) / measured.size)
     return RegionDepth(
         median=median,
         sigma=spread * math.sqrt(variance),
         spread=spread,
-        count=int(there.size),
+        count=int(measured.size),
         pixels=int(inside.size),
     )
 
@@ -135,10 +135,10 @@ def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return levels as greys from 1 to 255, with equally many pixels of each grey."""
     _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
     upto = np.cumsum(counts)
-    rest = upto[-1] - upto[0]
-    if not rest:
+    distinct = upto[-1] - upto[0]
+    if not distinct:
         return np.full(levels.shape, 255, np.uint8)
-    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / rest).astype(np.uint8)
+    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / distinct).astype(np.uint8)
     return greys[place.reshape(levels.shape)]
 
 
@@ -163,7 +163,7 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
         return given
     if given.dtype.kind in "iuf" and np.isfinite(given).all():
         if given.shape == (4,) and given.dtype.kind != "f" and given[2:].min() > 0:
-            x, y, width, height = (int(one) for one in given)
+            x, y, width, height = (int(number) for number in given)
             mask = np.zeros(shape, bool)
             mask[max(0, y) : max(0, y + height), max(0, x) : max(0, x + width)] = True
             return mask

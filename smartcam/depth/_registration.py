@@ -149,10 +149,10 @@ def register(
     distances, _ = tree.query(
         begin.apply(points), distance_upper_bound=MAX_DISTANCE_FACTOR * max_distance
     )
-    near = points[np.isfinite(distances)]
+    points_near = points[np.isfinite(distances)]
     pose, ended = begin, True
-    if len(near) >= NEIGHBOURS:
-        pose, ended = _aligned(near, goals, begin, METHODS[method], max_distance)
+    if len(points_near) >= NEIGHBOURS:
+        pose, ended = _aligned(points_near, goals, begin, METHODS[method], max_distance)
     match = _matched(points, tree, pose, max_distance)
     return _judged(method, pose, ended, match, len(points), goals, tree, min_overlap)
 
@@ -175,8 +175,8 @@ def _aligned(
 ) -> tuple[Transform, bool]:
     """Return the pose, and whether the iteration converged; both clouds are centred first."""
     gicp = load("small_gicp")
-    here, there = points.mean(axis=0), goals.mean(axis=0)
-    clouds = [gicp.PointCloud(points - here), gicp.PointCloud(goals - there)]
+    centre, goal = points.mean(axis=0), goals.mean(axis=0)
+    clouds = [gicp.PointCloud(points - centre), gicp.PointCloud(goals - goal)]
     for cloud in clouds:
         gicp.estimate_normals_covariances(cloud, None, NEIGHBOURS)
     tree = gicp.KdTree(clouds[1])
@@ -196,20 +196,20 @@ def _aligned(
 
     motion = np.eye(4)
     motion[:3, :3] = begin.rotation
-    motion[:3, 3] = begin.rotation @ here + begin.translation - there
-    found = stepped(motion, MAX_STEPS)
-    motion, ended = np.asarray(found.T_target_source, np.float64), bool(found.converged)
+    motion[:3, 3] = begin.rotation @ centre + begin.translation - goal
+    transform = stepped(motion, MAX_STEPS)
+    motion, ended = np.asarray(transform.T_target_source, np.float64), bool(transform.converged)
     if np.isfinite(motion).all() and not ended:
         before = motion
         motion = np.asarray(stepped(before, FURTHER_STEPS).T_target_source, np.float64)
-        change = (points - here) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
+        change = (points - centre) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
         ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_FURTHER_SHARE * reach)
     if not np.isfinite(motion).all():
         return begin, False
     # The product of many small turns is not exactly a rotation.
     left, _, right = np.linalg.svd(motion[:3, :3])
     rotation = left @ right
-    translation = motion[:3, 3] - rotation @ here + there
+    translation = motion[:3, 3] - rotation @ centre + goal
     return Transform(begin.target, begin.source, rotation, translation), ended
 
 
@@ -217,9 +217,9 @@ def _matched(points: Array, tree: Any, pose: Transform, reach: float) -> _Neighb
     turned = points @ pose.rotation.T
     moved = turned + pose.translation
     distances, nearest = tree.query(moved, distance_upper_bound=reach)
-    near = np.isfinite(distances)
-    index = nearest[near]
-    return _Neighbours(moved[near], index, tree.data[index] - moved[near], turned[near])
+    is_near = np.isfinite(distances)
+    index = nearest[is_near]
+    return _Neighbours(moved[is_near], index, tree.data[index] - moved[is_near], turned[is_near])
 
 
 def _judged(
@@ -247,19 +247,19 @@ def _judged(
         planes = planes_of(goals, tree, NEIGHBOURS, once).taken(places.reshape(-1))
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
-        reasons += [_described(one, match.moved - centre) for one in steps]
+        reasons += [_described(step, match.moved - centre) for step in steps]
         left_open = steps.copy()
         left_open[:, 3:] += np.cross(steps[:, :3], pose.translation - centre)
         rows = slopes(match.arms, planes.normals)
         information = rows.T @ rows
         across = (match.offsets * planes.normals).sum(axis=1)
-        off = np.linalg.norm(match.offsets, axis=1) if method == "icp" else across
-        rms = float(np.sqrt((off**2).mean()))
+        distances = np.linalg.norm(match.offsets, axis=1) if method == "icp" else across
+        rms = float(np.sqrt((distances**2).mean()))
         if method != "icp" and not len(steps):
             covariance = _covariance(rows, across, match.nearest)
-    for one in (information, covariance, left_open):
-        if one is not None:
-            one.flags.writeable = False
+    for array in (information, covariance, left_open):
+        if array is not None:
+            array.flags.writeable = False
     return Registration(
         pose=pose,
         converged=not reasons,
@@ -280,7 +280,7 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
     they are squared.
     """
     # Source: White, A heteroskedasticity-consistent covariance matrix estimator (1980), over
-    # groups as Liang and Zeger have it (1986).
+    # groups by the method of Liang and Zeger (1986).
     places = np.unique(nearest, return_inverse=True)[1].reshape(-1)
     groups = np.zeros((int(places.max()) + 1, 6))
     np.add.at(groups, places, rows * across[:, None])

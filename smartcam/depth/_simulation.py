@@ -28,7 +28,8 @@ BASELINE: Final = 0.05
 """Metres between the two cameras that see depth."""
 
 DISPARITY_SIGMA: Final = 0.1
-"""Noise of a disparity, pixels: that of a depth is ``Z^2 / (FOCAL * BASELINE)`` times as much."""
+"""Noise of a disparity, pixels: the noise of a depth is ``Z^2 / (FOCAL * BASELINE)`` times as
+much."""
 
 CAMERA_SIGMA: Final = 2e-4
 """Standard deviation of the camera's place at the hand, metres on each axis."""
@@ -138,9 +139,9 @@ class TowerTable:
 
     def tower(self) -> list[WoodenBlock]:
         """Return the blocks of the highest stack, the lowest first."""
-        top = max(self.blocks, key=lambda one: one.top)
-        stack = [one for one in self.blocks if _apart(one, top) < BLOCK[0] / 2]
-        return sorted(stack, key=lambda one: one.z)
+        top = max(self.blocks, key=lambda block: block.top)
+        stack = [block for block in self.blocks if _apart(block, top) < BLOCK[0] / 2]
+        return sorted(stack, key=lambda block: block.z)
 
     def pick(self, x: float, y: float, angle: float) -> Grip:
         """Close the gripper at a pose on the table, and grasp a block within its tolerance.
@@ -148,8 +149,8 @@ class TowerTable:
         Returns the errors from the nearest black block; ``held`` is None if it is missed.
         """
         wanted = WoodenBlock(x, y, angle)
-        loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]
-        block = min(loose, key=lambda one: _apart(one, wanted))
+        loose = [block for block in self.blocks if block.z == 0 and block.colour == "black"]
+        block = min(loose, key=lambda block: _apart(block, wanted))
         grip = Grip(_apart(block, wanted), math.remainder(angle - block.angle, math.pi))
         if grip.off < GRIP_TOLERANCE_METRES and block.size == BLOCK:
             self.blocks.remove(block)
@@ -187,18 +188,18 @@ class TowerTable:
         middle = fine[RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE, RAYS_PER_SIDE // 2 :: RAYS_PER_SIDE]
         rough = _jumps(middle)
         hidden = _hidden(middle)
-        found: list[NDArray[np.uint16]] = []
+        measured: list[NDArray[np.uint16]] = []
         for _ in range(maps):
             sigma = depth**2 / (FOCAL * BASELINE) * DISPARITY_SIGMA
             noisy = depth + sigma * self.random.standard_normal(depth.shape, np.float32)
             chance = self.random.random(depth.shape, np.float32)
             lost = hidden | (chance < HOLE_SHARES[0]) | (rough & (chance < HOLE_SHARES[1]))
-            found.append(np.where(lost, 0, np.rint(1e3 * noisy)).astype(np.uint16))
-        return found
+            measured.append(np.where(lost, 0, np.rint(1e3 * noisy)).astype(np.uint16))
+        return measured
 
 
-def _apart(one: WoodenBlock, other: WoodenBlock) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)
+def _apart(first: WoodenBlock, other: WoodenBlock) -> float:
+    return math.hypot(first.x - other.x, first.y - other.y)
 
 
 def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -213,29 +214,29 @@ def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that have a neighbour beyond an edge."""
-    found = np.zeros(depth.shape, bool)
+    jumps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis)) > MIN_JUMP_METRES
         first, second = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        found[first] |= step
-        found[second] |= step
-    return found
+        jumps[first] |= step
+        jumps[second] |= step
+    return jumps
 
 
 def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask of the pixels that the second camera, to the right, does not see."""
-    there = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # columns in its picture
-    nearer = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
-    found = np.zeros(depth.shape, bool)
-    found[:, :-1] = there[:, :-1] >= nearer[:, 1:]
-    return found
+    column_in_right = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # columns in its picture
+    nearer = np.minimum.accumulate(column_in_right[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(depth.shape, bool)
+    hidden[:, :-1] = column_in_right[:, :-1] >= nearer[:, 1:]
+    return hidden
 
 
 class _TableRays:
     """The rays of a camera, with the depth and colour at the end of each ray."""
 
     def __init__(self, camera: tuple[float, float, float]) -> None:
-        width, height = (RAYS_PER_SIDE * one for one in SIZE)
+        width, height = (RAYS_PER_SIDE * count for count in SIZE)
         columns = ((np.arange(width) + 0.5) / RAYS_PER_SIDE - 0.5 - SIZE[0] / 2) / FOCAL
         rows = ((np.arange(height) + 0.5) / RAYS_PER_SIDE - 0.5 - SIZE[1] / 2) / FOCAL
         self._camera = camera
@@ -261,23 +262,27 @@ class _TableRays:
         if 0 in shape:
             return
         c, s = np.float32(math.cos(block.angle)), np.float32(math.sin(block.angle))
-        off = np.subtract(self._camera, (block.x, block.y, block.z))
+        from_camera = np.subtract(self._camera, (block.x, block.y, block.z))
         # AXES: right is -y of the robot, down is -x, ahead is -z
-        begin = (c * off[0] + s * off[1], c * off[1] - s * off[0], off[2] - block.size[2] / 2)
+        begin = (
+            c * from_camera[0] + s * from_camera[1],
+            c * from_camera[1] - s * from_camera[0],
+            from_camera[2] - block.size[2] / 2,
+        )
         ways = (-c * down - s * across, s * down - c * across, np.full((1, 1), -1.0, np.float32))
-        near, far = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
+        nearest, farthest = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
         side = np.zeros(shape, np.int8)
-        for axis, (start, way, size) in enumerate(zip(begin, ways, block.size, strict=True)):
-            way = np.where(np.abs(way) < 1e-9, np.float32(1e-9), way)
-            one, other = ((sign * size / 2 - start) / way for sign in (-1, 1))
-            enters = np.minimum(one, other).astype(np.float32)
-            side[np.broadcast_to(enters, shape) > near] = axis
-            near = np.maximum(near, enters)
-            far = np.minimum(far, np.maximum(one, other).astype(np.float32))
-        hit = (near < far) & (near < self.depth[box])
-        self.depth[box][hit] = near[hit]
-        along = begin[0] + near * ways[0]
-        grain = 1 + 0.06 * np.sin(900 * (begin[1] + near * ways[1]) + 20 * along)
+        for axis, (start, direction, size) in enumerate(zip(begin, ways, block.size, strict=True)):
+            direction = np.where(np.abs(direction) < 1e-9, np.float32(1e-9), direction)
+            entry, other = ((sign * size / 2 - start) / direction for sign in (-1, 1))
+            enters = np.minimum(entry, other).astype(np.float32)
+            side[np.broadcast_to(enters, shape) > nearest] = axis
+            nearest = np.maximum(nearest, enters)
+            farthest = np.minimum(farthest, np.maximum(entry, other).astype(np.float32))
+        hit = (nearest < farthest) & (nearest < self.depth[box])
+        self.depth[box][hit] = nearest[hit]
+        along = begin[0] + nearest * ways[0]
+        grain = 1 + 0.06 * np.sin(900 * (begin[1] + nearest * ways[1]) + 20 * along)
         shade = np.take(np.asarray(SHADES, np.float32), side) * grain
         self.colour[box][hit] = shade[hit][:, None] * np.asarray(COLOURS[block.colour], np.float32)
 
@@ -330,10 +335,10 @@ def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) 
     for _ in range(100_000):
         x, y = table.random.uniform(0.17, 0.46), table.random.uniform(-0.26, 0.26)
         apart = min(
-            math.hypot(x - one.x, y - one.y)
+            math.hypot(x - block.x, y - block.y)
             - math.hypot(*size[:2]) / 2
-            - math.hypot(*one.size[:2]) / 2
-            for one in table.blocks
+            - math.hypot(*block.size[:2]) / 2
+            for block in table.blocks
         )
         beside = math.hypot(x - tower.x, y - tower.y)
         if apart > MIN_GAP_METRES and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:

@@ -142,17 +142,17 @@ class StereoDepth:
                 f"stereo: focal_sigma: expected pixels, got {shown(focal_sigma)}"
             )
         if size is not None and not (
-            len(size) == 2 and all(isinstance(one, int) and one > 0 for one in size)
+            len(size) == 2 and all(isinstance(count, int) and count > 0 for count in size)
         ):
             raise ConfigurationError(f"stereo: size: expected width and height, got {shown(size)}")
         self._make = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )
         sources = {
-            name: one
-            if isinstance(one, FrameSource)
-            else FrameSource(ReaderDriver(one, name), stall=None)
-            for name, one in (("left", left), ("right", right))
+            name: source
+            if isinstance(source, FrameSource)
+            else FrameSource(ReaderDriver(source, name), stall=None)
+            for name, source in (("left", left), ("right", right))
         }
         self._group = FrameGroup(sources, within=within, timeout=timeout)
         self._matcher, self._colour = matcher, colour
@@ -274,18 +274,18 @@ def _depth(
 ) -> DepthFrame:
     left, right = both["left"], both["right"]
     grey = [
-        pair.rectified(_bytes(one, one.grey()), side, one.source)
-        for side, one in enumerate((left, right))
+        pair.rectified(_bytes(frame, frame.grey()), side, frame.source)
+        for side, frame in enumerate((left, right))
     ]
-    found = matcher(grey[0], grey[1])
-    disparity = found.pixels
+    disparities = matcher(grey[0], grey[1])
+    disparity = disparities.pixels
     pair.drop_outside(disparity)
     disparity[~(disparity > 0)] = np.nan  # at infinity, or behind the camera
     depth = pair.depth(disparity)
     shown = pair.rectified(_bytes(left, left.rgb()), 0, left.source) if colour else grey[0]
     return DepthFrame(
         depth=depth,
-        sigma=pair.sigma(depth, found.sigma),
+        sigma=pair.sigma(depth, disparities.sigma),
         disparity=disparity,
         left=shown,
         camera_info=pair.camera_info,

@@ -80,15 +80,15 @@ def refined(
     smooth &= _whole_around(known)
     # near an edge, a coarse value may belong to the other side of the edge
     found_sigma = np.fmax(sigma, plane.rough)
-    found, usable = start, known
-    fit = _fitted(_linearized(pictures, found, known), found, None, plane, sums)
+    disparity, usable = start, known
+    fit = _fitted(_linearized(pictures, disparity, known), disparity, None, plane, sums)
     for step in range(MAX_GAUSS_NEWTON_STEPS):
         last = step == MAX_GAUSS_NEWTON_STEPS - 1
         if step:
-            plane = _plane(found, usable if usable.any() else known, sums)
-            linear = _without_outliers(_linearized(pictures, found, known), fit)
-            fit = _fitted(linear, found, usable, plane, sums)
-            last = last or _moved(fit, found, usable) < MAX_LAST_MOVE_SIGMAS
+            plane = _plane(disparity, usable if usable.any() else known, sums)
+            linear = _without_outliers(_linearized(pictures, disparity, known), fit)
+            fit = _fitted(linear, disparity, usable, plane, sums)
+            last = last or _moved(fit, disparity, usable) < MAX_LAST_MOVE_SIGMAS
         if last:
             fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
         usable = (
@@ -96,13 +96,13 @@ def refined(
             & (fit.sigma < MIN_COARSE_SIGMA_PX)
             & (np.abs(fit.disparity - start) < MAX_SHIFT_PX)
         )
-        found = np.where(usable, fit.disparity, start)
+        disparity = np.where(usable, fit.disparity, start)
         if last:
             break
     found_sigma = np.where(usable, fit.sigma, found_sigma)
-    found[~known] = np.nan
+    disparity[~known] = np.nan
     found_sigma[~known] = np.nan
-    return found.astype(np.float32, copy=False), found_sigma.astype(np.float32, copy=False)
+    return disparity.astype(np.float32, copy=False), found_sigma.astype(np.float32, copy=False)
 
 
 def _moved(fit: _Refined, before: Field, usable: NDArray[np.bool_]) -> float:
@@ -129,13 +129,13 @@ class _WindowSums:
     def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
         """Return the sums of values times powers of the distance from the window's middle."""
         if not (across or down):
-            found = self._cv2.boxFilter(
+            averaged = self._cv2.boxFilter(
                 values, -1, self._side, normalize=False, borderType=self._border
             )
         else:
             x, y = self._ramp**across, self._ramp**down
-            found = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
-        return np.asarray(found, dtype=np.float32)
+            averaged = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
+        return np.asarray(averaged, dtype=np.float32)
 
 
 class _DisparityPlane(NamedTuple):
@@ -180,10 +180,10 @@ def _linearized(
 ) -> _LinearMatch:
     left, right = pictures
     width = left.shape[1]
-    there = np.arange(width, dtype=np.float32) - disparity
-    inside = known & (there >= 2) & (there <= width - 4)  # interpolation uses six pixels
+    matched = np.arange(width, dtype=np.float32) - disparity
+    inside = known & (matched >= 2) & (matched <= width - 4)  # interpolation uses six pixels
     mask = inside.astype(np.float32)
-    moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
+    moved, slope = _sampled(right, np.where(inside, matched, np.float32(2)))
     slope += np.gradient(left, axis=1)
     level = (moved - np.float32(MIDDLE_GREY)) * mask
     return _LinearMatch((left - moved) * mask, slope * mask / 2, level, mask)
@@ -203,7 +203,7 @@ class _Refined(NamedTuple):
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
     """Return the equations without outliers, such as pixels of another surface."""
     fits = np.abs(linear.e - fit.expected) <= MAX_INLIER_SIGMAS * np.sqrt(fit.variance)
-    return _LinearMatch(*(one * fits for one in linear))
+    return _LinearMatch(*(term * fits for term in linear))
 
 
 def _fitted(
@@ -219,14 +219,14 @@ def _fitted(
     """
     # With the right picture's row taken at u - d_q, L - R_q = b + c R_q - g (D + s (q - p) - d_q)
     # + noise for all q of the window around p: linear in D, b and the gain less 1, c. g is the mean
-    # of both pictures' slopes, whose noise does not go with that of their difference.
+    # of both pictures' slopes, whose noise is not correlated with the noise of their difference.
     e, g, level, mask = linear
-    gg, rg, rest = g * g, g * level, e - g * disparity
+    gg, rg, constant = g * g, g * level, e - g * disparity
     n = np.maximum(sums(mask), 1)
     sg, sr, mean = sums(g), sums(level), sums(level * level)
     sy, gy, ry = (
         sums(rest_) + plane.across * sums(g_, 1) + plane.down * sums(g_, 0, 1)
-        for rest_, g_ in ((rest, g), (rest * g, gg), (rest * level, rg))
+        for rest_, g_ in ((constant, g), (constant * g, gg), (constant * level, rg))
     )
     gy -= sg * sy / n
     ry -= sr * sy / n
@@ -248,11 +248,11 @@ def _fitted(
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
     texture = curvature - n * variance / 8
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (gr * ry / rr - gy) / curvature
+        correction = (gr * ry / rr - gy) / curvature
         sigma = np.sqrt(variance / texture)
-    usable = (texture > 0) & np.isfinite(found) & (n >= MIN_WINDOW_PIXELS)
+    usable = (texture > 0) & np.isfinite(correction) & (n >= MIN_WINDOW_PIXELS)
     return _Refined(
-        np.where(usable, found, disparity),
+        np.where(usable, correction, disparity),
         np.where(usable, sigma, np.inf),
         linear,
         se / m + gain * (level - st / m),
@@ -266,17 +266,17 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     # (a = -0.75) moves a ramp by up to 0.03 pixels.
     height, width = picture.shape
     wide = np.pad(picture, ((0, 0), (3, 3)), mode="edge").ravel()
-    whole = np.floor(columns)
-    t = columns - whole
-    start = whole.astype(np.int32) + (1 + np.arange(height, dtype=np.int32) * (width + 6))[:, None]
+    base = np.floor(columns)
+    t = columns - base
+    start = base.astype(np.int32) + (1 + np.arange(height, dtype=np.int32) * (width + 6))[:, None]
     pixels = [wide[k:].take(start) for k in range(6)]  # at -2 to 3 from the column
     factors = {node: t - np.float32(node) for node in range(-2, 4)}
     value = np.zeros_like(t)
     for node, pixel in zip(factors, pixels, strict=True):
-        others = [one for one in factors if one != node]
-        weight = pixel * np.float32(1 / np.prod([node - one for one in others]))
-        for one in others:
-            weight *= factors[one]
+        others = [factor for factor in factors if factor != node]
+        weight = pixel * np.float32(1 / np.prod([node - index for index in others]))
+        for index in others:
+            weight *= factors[index]
         value += weight
     # central differences as in the left picture, with linear interpolation
     slope = (1 - t) * (pixels[3] - pixels[1]) / 2 + t * (pixels[4] - pixels[2]) / 2
@@ -294,24 +294,24 @@ def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
-    # one constant and gain for the whole picture, since those of windows would absorb noise
+    # one constant and gain for the whole picture, since values for each window would absorb noise
     level = (fit.linear.r - (fit.linear.r * mask).sum() / np.maximum(mask.sum(), 1)) * mask
     e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
     e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))
     height, width = e.shape
 
     def products(one: Field, other: Field, u: int, v: int) -> float:
-        here = one[v:, max(u, 0) : width + min(u, 0)]
-        there = other[: height - v, max(-u, 0) : width + min(-u, 0)]
-        return float(np.einsum("ij,ij->", here, there))
+        first = one[v:, max(u, 0) : width + min(u, 0)]
+        second = other[: height - v, max(-u, 0) : width + min(-u, 0)]
+        return float(np.einsum("ij,ij->", first, second))
 
     power = products(e, e, 0, 0) * products(g, g, 0, 0)
     if power <= 0:
         return 1.0
-    whole = 1.0
+    total = 1.0
     for v in range(MAX_NOISE_LAG_PX + 1):
         for u in range(-MAX_NOISE_LAG_PX if v else 1, MAX_NOISE_LAG_PX + 1):
             both = products(e, e, u, v) * products(g, g, u, v)
             crossed = products(e, g, u, v) * products(g, e, u, v)
-            whole += 2 * (both + crossed) / power
-    return max(whole, MIN_NOISE_FACTOR)
+            total += 2 * (both + crossed) / power
+    return max(total, MIN_NOISE_FACTOR)

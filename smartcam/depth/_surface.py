@@ -20,7 +20,7 @@ MIN_INFORMATION_FACTOR: Final = 12.0
 """Least ratio of a direction's information to that from noise of the normals alone.
 
 On simulated clouds the ratio is 0.8 to 1.4 for the free directions of planes, edges and corridors,
-up to 11 for those of cylinders and spheres, and 29 or more in a corner.
+up to 11 for the free directions of cylinders and spheres, and 29 or more in a corner.
 """
 
 
@@ -39,7 +39,7 @@ class SurfacePlanes(NamedTuple):
 
     def taken(self, index: Any) -> SurfacePlanes:
         """Return the planes at an index."""
-        return SurfacePlanes(*(one[index] for one in self))
+        return SurfacePlanes(*(column[index] for column in self))
 
 
 def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
@@ -47,11 +47,11 @@ def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]
 
     ``tree``: search tree of all points.
     """
-    found = []
+    planes = []
     for start in range(0, len(index), POINTS_AT_A_TIME):
         _, nearest = tree.query(points[index[start : start + POINTS_AT_A_TIME]], k=neighbours)
-        found.append(_fitted(points[nearest]))
-    return SurfacePlanes(*(np.concatenate(one) for one in zip(*found, strict=True)))
+        planes.append(_fitted(points[nearest]))
+    return SurfacePlanes(*(np.concatenate(parts) for parts in zip(*planes, strict=True)))
 
 
 def _fitted(groups: Array) -> SurfacePlanes:
@@ -94,5 +94,5 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     basis, _ = np.linalg.qr(steps[:, ratios < MIN_INFORMATION_FACTOR])
     # Any combination of undetermined steps is undetermined: return turns first, then pure shifts.
     apart, _, _ = np.linalg.svd(basis.T[:, :3])
-    found: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
-    return found
+    directions: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)
+    return directions

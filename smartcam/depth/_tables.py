@@ -29,8 +29,8 @@ NUMBERS_AT_A_TIME: Final = 1 << 18
 class BadTableError(Exception):
     """Error in a file's content; the caller adds the file's name."""
 
-    def __init__(self, expected: str, came: str) -> None:
-        super().__init__(f"expected {expected}, got {came}")
+    def __init__(self, expected: str, actual: str) -> None:
+        super().__init__(f"expected {expected}, got {actual}")
 
 
 def shown(data: bytes | str) -> str:
@@ -56,15 +56,15 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
         _fail("a header in ASCII", line)
 
 
-def count_of(text: str, what: str) -> int:
+def count_of(text: str, label: str) -> int:
     """Return a count from text; raise BadTableError if the text is no count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
-        _fail(f"a number of {what}", text)
+        _fail(f"a number of {label}", text)
     return int(text)
 
 
-def _fail(expected: str, came: bytes | str) -> NoReturn:
-    raise BadTableError(expected, shown(came)) from None
+def _fail(expected: str, actual: bytes | str) -> NoReturn:
+    raise BadTableError(expected, shown(actual)) from None
 
 
 def check_row(row: np.dtype[Any]) -> None:
@@ -75,10 +75,10 @@ def check_row(row: np.dtype[Any]) -> None:
 
 def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArray[Any]:
     """Return ``count`` rows from the offset ``start``; bytes after them are ignored."""
-    there = len(data) - start
-    if count * row.itemsize > there:
+    available = len(data) - start
+    if count * row.itemsize > available:
         raise BadTableError(
-            f"{count} rows of {row.itemsize} bytes, {count * row.itemsize} in all", f"{there}"
+            f"{count} rows of {row.itemsize} bytes, {count * row.itemsize} in all", f"{available}"
         )
     return np.frombuffer(data, row, count, start)
 
@@ -90,10 +90,10 @@ def from_text(
 
     Numbers for integer types must be whole and in range.
     """
-    check_row(np.dtype([(str(place), one) for place, one in enumerate(types)]))
+    check_row(np.dtype([(str(place), kind) for place, kind in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
-    columns = tuple(np.empty(count, one) for one in types)
+    columns = tuple(np.empty(count, kind) for kind in types)
     done, place, left = 0, start, skipped
     while done < count:
         lines: list[list[bytes]] = []
@@ -124,13 +124,13 @@ def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
             values = np.array([float(word) for word in words], np.float64)
             with np.errstate(over="ignore"):
                 return values.astype(kind)
-        whole = [int(word) for word in words if len(word) <= 20]
+        numbers = [int(word) for word in words if len(word) <= 20]
     except ValueError as exc:
         raise BadTableError("numbers", shown(str(exc))) from None
     limits = np.iinfo(kind)
-    if len(whole) < len(words) or not limits.min <= min(whole) <= max(whole) <= limits.max:
+    if len(numbers) < len(words) or not limits.min <= min(numbers) <= max(numbers) <= limits.max:
         raise BadTableError(f"numbers from {limits.min} to {limits.max}", "others")
-    return np.array(whole, kind)
+    return np.array(numbers, kind)
 
 
 def to_text(columns: Iterable[NDArray[Any]]) -> bytes:

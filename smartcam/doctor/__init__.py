@@ -121,7 +121,7 @@ def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
     with from_part("fleet", "an examination of a camera of a fleet needs"):
         from smartcam.doctor import _fleet_checks as checks
 
-    found = (
+    steps = (
         _NAME,
         _DoctorCheck("bus", checks.reach, _switch, in_session=False),
         _DoctorCheck(
@@ -130,7 +130,7 @@ def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
         _DoctorCheck("session", checks.connect, _switch, in_session=False),
         _DoctorCheck("reservation", checks.reserve, _once),
     )
-    return found, checks.address_of(url)
+    return steps, checks.address_of(url)
 
 
 _CHECKS = (
@@ -149,9 +149,9 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
-"""The checks in their order, after those of the wire or of the fleet. The limits only matter for an
-internal error, since each step has a bound of its own. Their sum, and a second for the end of the
-session, bounds the whole."""
+"""The checks in their order, after the checks of the wire or of the fleet. The limits only matter
+for an internal error, since each step has a bound of its own. Their sum, and a second for the end
+of the session, bounds the whole."""
 
 
 async def examine(
@@ -191,7 +191,7 @@ async def examine(
     loaded again. The same happens when the generator is closed: use :func:`contextlib.aclosing`.
     """
     if application is not None:
-        application = check_application(application, who="doctor")
+        application = check_application(application, caller="doctor")
     gige = _is_gige(url)
     if gige and (trigger or application is not None or interpret_as is not None):
         raise ConfigurationError(
@@ -226,13 +226,13 @@ async def examine(
         count=count,
     )
     fleet = is_fleet(url)
-    way, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
+    steps, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # checks the options
     alone = not fleet and serves_one(load_protocol(address.protocol))
     yield SHARED if fleet else NOTICE if alone else SEVERAL
     async with exam.stack, exam.borrowed:
-        for check in (*way, *_CHECKS):
+        for check in (*steps, *_CHECKS):
             goes_on = await _run(check, exam)
             for finding in exam.take():
                 yield finding
@@ -251,7 +251,10 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         async with asyncio.timeout(limit):
             await check.run(exam)
             if not check.in_session:
-                return not any(one.exit_code for one in exam.pending) or exam.camera is not None
+                return (
+                    not any(finding.exit_code for finding in exam.pending)
+                    or exam.camera is not None
+                )
             if not exam.connected_camera.connected and check.name != "clock":
                 await exam.connected_camera.query_application()  # raises the reason
     except LinkError as exc:

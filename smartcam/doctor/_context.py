@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_KEPT = 1000
+MAX_STATUSES = 1000
 """Largest number of statuses and arrival times kept: 300 results per second for 3 seconds."""
 
 MAX_CONTAINERS = 32
@@ -88,8 +88,8 @@ class Witness(Observer):
     """
 
     def __init__(self) -> None:
-        self.statuses: deque[Status] = deque(maxlen=MAX_KEPT)
-        self.arrivals: deque[float] = deque(maxlen=MAX_KEPT)
+        self.statuses: deque[Status] = deque(maxlen=MAX_STATUSES)
+        self.arrivals: deque[float] = deque(maxlen=MAX_STATUSES)
         self.containers: deque[Result] = deque(maxlen=MAX_CONTAINERS)
         self.results: int = 0
         self.unreadable: InterpretationError | None = None
@@ -246,11 +246,11 @@ class Examination:
 
     def pin(self, url: str) -> None:
         """Use protocol, transport and dialect of a URL; a login, which no URL shows, stays."""
-        found = parse_address(url)
-        if found.protocol != self.address.protocol:
-            self.address = found
+        address = parse_address(url)
+        if address.protocol != self.address.protocol:
+            self.address = address
         self.address = self.address._replace(
-            scheme=found.scheme, dialect=found.dialect, quirks=found.quirks
+            scheme=address.scheme, dialect=address.dialect, quirks=address.quirks
         )
 
     def make_camera(self) -> Camera:
@@ -258,17 +258,17 @@ class Examination:
 
         Raises ConfigurationError: a timeout is not valid.
         """
-        asked = self.options
+        chosen = self.options
         options: CameraOptions = {
             "reconnect": None,
-            "connect_timeout": asked.step(10.0),
-            "request_timeout": asked.step(5.0),
-            "switch_timeout": asked.step(10.0),
+            "connect_timeout": chosen.step(10.0),
+            "request_timeout": chosen.step(5.0),
+            "switch_timeout": chosen.step(10.0),
         }
-        if asked.y_down or not self.in_fleet:  # the agent may know the direction
-            options["y_down"] = asked.y_down
-        if asked.interpreter is not None:
-            options["interpret_as"] = Keeper(asked.interpreter)
+        if chosen.y_down or not self.in_fleet:  # the agent may know the direction
+            options["y_down"] = chosen.y_down
+        if chosen.interpreter is not None:
+            options["interpret_as"] = Keeper(chosen.interpreter)
         frames = [FrameObserver(self.trace)] if self.trace is not None else []
         observers = [self.witness, *frames]
         camera: Camera

@@ -61,9 +61,9 @@ def summary(findings: Iterable[Finding]) -> Finding:
     """
     all_found = list(findings)
     counts: dict[str, int] = {
-        name: sum(one.severity == name for one in all_found) for name in SEVERITIES
+        name: sum(finding.severity == name for finding in all_found) for name in SEVERITIES
     }
-    ranks = [SEVERITIES.index(one.severity) for one in all_found]
+    ranks = [SEVERITIES.index(finding.severity) for finding in all_found]
     worst = all_found[ranks.index(max(ranks))] if all_found else None
     words = [
         f"{count} {name}{'s' if count > 1 else ''}"

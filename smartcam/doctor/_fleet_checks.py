@@ -115,31 +115,32 @@ async def _certificates(exam: Examination, address: FleetAddress) -> bool:
         return True
     folder, loop = Path(address.certificates), asyncio.get_running_loop()
     try:
-        own = await loop.run_in_executor(None, read_identity, folder)
+        own_identity = await loop.run_in_executor(None, read_identity, folder)
     except ConfigurationError as exc:
         exam.fail(str(exc), f"smartcam fleet certificates makes what belongs into {folder}.")
         return False
-    if own.expired:
-        exam.fail(own.expired, "Until then nothing there takes this program.")
+    if own_identity.expired:
+        exam.fail(own_identity.expired, "Until then nothing there takes this program.")
         return False
-    theirs = await shake_hands(address.host, address.port, folder)
-    if theirs.trouble:
+    peer_identity = await shake_hands(address.host, address.port, folder)
+    if peer_identity.trouble:
         exam.fail(
-            f"no handshake as {own}: {theirs.trouble}",
+            f"no handshake as {own_identity}: {peer_identity.trouble}",
             "Both sides have to show a certificate of one authority (ca.pem), and the agent's has "
             "to name the host of the URL: smartcam fleet certificates --host.",
         )
         return False
-    warning = own.warning or ends_soon("the agent's certificate", theirs.ends)
+    warning = own_identity.warning or ends_soon("the agent's certificate", peer_identity.ends)
     exam.report(
         "hint" if warning else "ok",
-        f"this program is {own}: it may look" + (", and command" if may_command(own.role) else ""),
+        f"this program is {own_identity}: it may look"
+        + (", and command" if may_command(own_identity.role) else ""),
         warning,
         check="certificates",
-        role=own.role,
-        certificate=own.name,
-        ends=own.ends,
-        agent_ends=theirs.ends,
+        role=own_identity.role,
+        certificate=own_identity.name,
+        ends=own_identity.ends,
+        agent_ends=peer_identity.ends,
     )
     return True
 
@@ -164,7 +165,7 @@ async def find(exam: Examination) -> None:
         return
     sharing = [(fleet, agent) for fleet, agent, name in cameras if name == address.camera]
     fleets = sorted({fleet for fleet, _ in sharing})
-    details: dict[str, Any] = {"agents": agents, "cameras": len({one[2] for one in cameras})}
+    details: dict[str, Any] = {"agents": agents, "cameras": len({camera[2] for camera in cameras})}
     if not sharing:
         names = sorted({name for _, _, name in cameras})
         listed = ", ".join(names[:MAX_CAMERAS_LISTED]) + (
@@ -194,19 +195,19 @@ async def find(exam: Examination) -> None:
 
 
 async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
-    """Return fleet, agent and name of all cameras, including those that have just appeared."""
+    """Return fleet, agent and name of all cameras, including cameras that have just appeared."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
         raise LookupError("there is no bus; checks that use it run after the check that reaches it")
     end = loop.time() + LOOKS_WITHIN
     pattern = Keys(address.fleet or "*").camera("*", "**")
     while True:
-        found: list[tuple[str, str, str]] = []
+        cameras: list[tuple[str, str, str]] = []
         for key in await bus.present(pattern, max(LOOK_AGAIN, end - loop.time())):
             _, fleet, _, _, agent, *chunks = key.split("/")
-            found.append((fleet, agent, "/".join(chunks)))
-        if loop.time() > end or any(name == address.camera for *_, name in found):
-            return sorted(found)
+            cameras.append((fleet, agent, "/".join(chunks)))
+        if loop.time() > end or any(name == address.camera for *_, name in cameras):
+            return sorted(cameras)
         await asyncio.sleep(LOOK_AGAIN)
 
 

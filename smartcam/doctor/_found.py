@@ -1,4 +1,4 @@
-"""The findings of a search: protocols of open ports, and the cameras that answered."""
+"""Results of a search: the protocols of open ports, and the cameras that answered."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ class FoundPort:
     Attributes:
         host: address of the host.
         port: number of the port.
-        protocols: names of the protocols that it may speak, the most probable first; empty if the
-            received bytes fit none of them.
-        evidence: ``greeted``: it sent the greeting of the protocol's cameras; ``silent``: it sends
-            nothing before it receives something, like such cameras; ``said``: it sent something,
-            and the cameras' greeting is not known; ``ended``: it closed the connection at once, as
-            a camera with a client may; ``other``: it is no such camera.
-        received: bytes that it sent unasked, up to 512.
+        protocols: names of the protocols that the port may use, the most probable first; empty if
+            the received bytes fit none.
+        evidence: ``greeted``: the port sent the greeting of the protocol's cameras; ``silent``: it
+            sent nothing, like cameras of the protocol; ``said``: it sent something, and the
+            cameras' greeting is unknown; ``ended``: it closed the connection at once, as a camera
+            with a client may; ``other``: no camera of a known protocol.
+        received: bytes that the port sent without a request, up to 512.
         seconds: time until the connection was open.
         answer: the camera's description of itself, if it was asked and has answered.
-        refusal: reason why the camera has not answered, if it was asked.
+        refusal: reason why the camera did not answer, if it was asked.
     """
 
     host: str
@@ -62,7 +62,7 @@ class FoundPort:
 
     @property
     def greeting(self) -> str:
-        """The first line of the bytes that it sent unasked, unprintable characters as dots."""
+        """The first line that the port sent without a request, unprintable characters as dots."""
         lines = self.received.decode("latin-1").strip().splitlines()
         return (
             "".join(c if c.isascii() and c.isprintable() else "." for c in lines[0])
@@ -75,8 +75,8 @@ class FoundPort:
 
 
 def tcp_protocols() -> dict[str, Protocol]:
-    """Return the protocols over TCP, by name; those that cannot be loaded are left out."""
-    found: dict[str, Protocol] = {}
+    """Return the protocols over TCP, by name; protocols that cannot be loaded are left out."""
+    protocols: dict[str, Protocol] = {}
     for info in PROTOCOLS.available():
         try:
             protocol = PROTOCOLS.load(info.name)
@@ -85,8 +85,8 @@ def tcp_protocols() -> dict[str, Protocol]:
                 raise
             continue  # a broken plug-in is left out
         if isinstance(protocol, Protocol) and Transport.TCP in protocol.schemes.values():
-            found[info.name] = protocol
-    return found
+            protocols[info.name] = protocol
+    return protocols
 
 
 def ports_of(
@@ -95,13 +95,13 @@ def ports_of(
     """Return the ports to open, and the protocols that may be spoken there.
 
     Raises:
-        ConfigurationError: a name is not that of a protocol over TCP, or a number is no port.
+        ConfigurationError: a name is no protocol over TCP, or a number is no port.
     """
     known = tcp_protocols()
     chosen = [*known]
     if names is not None:
         given = check_all(names, "protocols", "names of protocols", "find")
-        chosen = [*dict.fromkeys(check_text(one, "protocol", "find") for one in given)]
+        chosen = [*dict.fromkeys(check_text(name, "protocol", "find") for name in given)]
     for name in chosen:
         if name not in known:
             raise ConfigurationError(
@@ -110,17 +110,22 @@ def ports_of(
             )
     if not chosen:
         raise ConfigurationError("find: no protocol is named")
-    found: dict[int, tuple[Protocol, ...]] = {}
+    protocols_of_port: dict[int, tuple[Protocol, ...]] = {}
     for name in chosen:
         port = known[name].default_port
-        found[port] = (*found.get(port, ()), known[name])
-    for one in check_all(further, "ports", "numbers of ports", "find"):
-        port = check_integer(one, "port", 1, 0xFFFF, "find")
-        own = found.get(port, ())
-        found[port] = (*own, *(known[name] for name in chosen if known[name] not in own))
-    if len(found) > MAX_PORTS:
-        raise ConfigurationError(f"find: {len(found)} ports: expected {MAX_PORTS} at most")
-    return found
+        protocols_of_port[port] = (*protocols_of_port.get(port, ()), known[name])
+    for number in check_all(further, "ports", "numbers of ports", "find"):
+        port = check_integer(number, "port", 1, 0xFFFF, "find")
+        protocols_here = protocols_of_port.get(port, ())
+        protocols_of_port[port] = (
+            *protocols_here,
+            *(known[name] for name in chosen if known[name] not in protocols_here),
+        )
+    if len(protocols_of_port) > MAX_PORTS:
+        raise ConfigurationError(
+            f"find: {len(protocols_of_port)} ports: expected {MAX_PORTS} at most"
+        )
+    return protocols_of_port
 
 
 def serves_one(protocol: Protocol) -> bool:
@@ -134,7 +139,14 @@ def _scheme(protocol: Protocol) -> str:
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
     """Raise ConfigurationError if asking at these ports may take a camera from its client."""
-    names = sorted({one.name for several in ports.values() for one in several if serves_one(one)})
+    names = sorted(
+        {
+            protocol.name
+            for several in ports.values()
+            for protocol in several
+            if serves_one(protocol)
+        }
+    )
     if names:
         raise ConfigurationError(
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
@@ -150,8 +162,12 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
     """Return an open port with the protocols that fit the received bytes."""
     received = opened.received.lstrip()
-    greeted = [one for one in protocols if one.greeting and received.startswith(one.greeting)]
-    possible = greeted or [one for one in protocols if _may_be(one, opened)]
+    greeted = [
+        protocol
+        for protocol in protocols
+        if protocol.greeting and received.startswith(protocol.greeting)
+    ]
+    possible = greeted or [protocol for protocol in protocols if _may_be(protocol, opened)]
     evidence: Evidence = "silent"
     if greeted:
         evidence = "greeted"
@@ -164,7 +180,7 @@ def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, 
     return FoundPort(
         host=host,
         port=port,
-        protocols=tuple(one.name for one in possible),
+        protocols=tuple(protocol.name for protocol in possible),
         evidence=evidence,
         received=opened.received,
         seconds=opened.seconds,
@@ -184,9 +200,9 @@ def is_decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:
     start = received.lstrip()
     if not start:
         return False
-    for one in protocols:
-        if one.greeting is None or (one.greeting and one.greeting.startswith(start)):
+    for protocol in protocols:
+        if protocol.greeting is None or (protocol.greeting and protocol.greeting.startswith(start)):
             return False
-        if one.greeting and start.startswith(one.greeting):
+        if protocol.greeting and start.startswith(protocol.greeting):
             return b"\n" in start
     return True

@@ -80,7 +80,7 @@ class _GigEExamination:
         details: Mapping[str, Any] | None = None,
     ) -> None:
         """Add a finding."""
-        found = Finding(
+        finding = Finding(
             check=self.check,
             severity=severity,
             text=text,
@@ -88,7 +88,7 @@ class _GigEExamination:
             details=details or {},
             exit_code=exit_code,
         )
-        self.findings.append(found)
+        self.findings.append(finding)
 
     def fail(
         self,
@@ -134,8 +134,8 @@ async def examine_gige(
         except FrameSourceError as exc:
             exam.fail(f"this check failed: {exc}", "", Exit.NO_SESSION)
             over = True
-        found, exam.findings = exam.findings, []
-        for finding in found:
+        earlier, exam.findings = exam.findings, []
+        for finding in earlier:
             yield finding
         if over:
             return
@@ -148,7 +148,7 @@ async def _find_address(exam: _GigEExamination) -> None:
     """Find the address that the URL means."""
     try:
         host, exam.port = await places.place(exam.address, places.wanted(exam.address))
-        found = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
+        addresses = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
     except FrameSourceError as exc:
         raise exam.fail(
             str(exc),
@@ -159,19 +159,21 @@ async def _find_address(exam: _GigEExamination) -> None:
         raise exam.fail(
             f"the name {exam.address.host} has no IPv4 address: {exc}", "Write the address itself."
         ) from exc
-    exam.host = str(found[0][4][0])
+    exam.host = str(addresses[0][4][0])
     exam.add("ok", f"the camera is looked for at {exam.host}, UDP port {exam.port}")
 
 
 async def _look_at_networks(exam: _GigEExamination) -> None:
     """Check whether the camera's address is in one of this machine's networks."""
-    own = [one for one in discovery.networks() if one.network is not None]
-    if not own:
+    networks = [network for network in discovery.networks() if network.network is not None]
+    if not networks:
         exam.add("hint", "the networks of this machine cannot be listed here")
         return
     host = ipaddress.IPv4Address(exam.host)
-    around = [one for one in own if one.network is not None and host in one.network]
-    named = ", ".join(f"{one.address} in {one.network}" for one in own)
+    around = [
+        network for network in networks if network.network is not None and host in network.network
+    ]
+    named = ", ".join(f"{network.address} in {network.network}" for network in networks)
     if not around:
         exam.add(
             "warning",
@@ -179,13 +181,13 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
             f"Give the camera an address of a network here, or this machine one of {exam.host}'s: "
             "by the maker's tool (ForceIP), or by ip address add. Through a router a camera is not "
             "found by a search, and its stream rarely comes.",
-            details={"networks": [str(one.network) for one in own]},
+            details={"networks": [str(network.network) for network in networks]},
         )
     elif len(around) > 1:
         exam.add(
             "warning",
             f"{exam.host} is of {len(around)} networks of this machine: "
-            f"{', '.join(f'{one.address} in {one.network}' for one in around)}",
+            f"{', '.join(f'{network.address} in {network.network}' for network in around)}",
             "Give the two interfaces different subnets: the system sends by one of them, which may "
             "be the wrong one.",
         )
@@ -218,12 +220,12 @@ async def _ask(exam: _GigEExamination) -> None:
     exam.check = "control"
     if taken:
         where = f" at {ipaddress.IPv4Address(other)}" if other else ""
-        own = other and str(ipaddress.IPv4Address(other)) in {
-            one.address for one in discovery.networks()
+        is_own = other and str(ipaddress.IPv4Address(other)) in {
+            network.address for network in discovery.networks()
         }
         raise exam.fail(
-            f"another application{where} controls it{', on this machine' if own else ''}: one at a "
-            "time can",
+            f"another application{where} controls it{', on this machine' if is_own else ''}: "
+            "one at a time can",
             "Close the other program: a viewer of the maker, a process of yours that is left over, "
             "an agent. One that was killed loses the camera after its heartbeat's time, some "
             "seconds; while a debugger holds a program, that time can be minutes.",
@@ -234,8 +236,8 @@ async def _ask(exam: _GigEExamination) -> None:
 async def _no_answer(exam: _GigEExamination, error: FrameSourceError) -> _ExaminationOverError:
     """Report why nothing answered, as far as possible."""
     others = await discovery.find(discovery.networks())
-    at = [one for one in others if exam.host in (one.address, one.info.address)]
-    listed = ", ".join(f"gige://{one.address} {one.info.label}" for one in others)
+    at = [camera for camera in others if exam.host in (camera.address, camera.info.address)]
+    listed = ", ".join(f"gige://{camera.address} {camera.info.label}" for camera in others)
     if "refused" in str(error).lower():
         return exam.fail(
             f"{exam.host} is there, and nothing listens at UDP port {exam.port}: it is no GigE "
@@ -263,7 +265,7 @@ async def _no_answer(exam: _GigEExamination, error: FrameSourceError) -> _Examin
             else "See to its power, cable and address (ping), then to a firewall, which must let "
             "UDP port 3956 through: nothing answered a search either."
         ),
-        details={"others": [one.address for one in others]},
+        details={"others": [camera.address for camera in others]},
     )
 
 
@@ -318,9 +320,9 @@ async def _number(features: GenicamFeatures, *names: str) -> float | None:
     for name in names:
         if name in features:
             with contextlib.suppress(FrameSourceError):
-                found = await features.number(name)
-                if found is not None:
-                    return float(found)
+                number = await features.number(name)
+                if number is not None:
+                    return float(number)
     return None
 
 
@@ -464,8 +466,8 @@ async def _watch(exam: _GigEExamination) -> _StreamSeen:
     source = open_frames(exam.address.url, timeout=None, stall=None)
     async with source:
         driver = cast("GigEDriver", source.driver)
-        found = source.format.rates
-        exam.rate = found[0] if found else exam.rate
+        rates = source.format.rates
+        exam.rate = rates[0] if rates else exam.rate
         loop = asyncio.get_running_loop()
         began = loop.time()
         async with source.reader() as reader:

@@ -22,7 +22,7 @@ end."""
 _NAME = re.compile(r"(?=.*[A-Za-z])\w(?:[\w.-]{0,251}\w)?", re.ASCII)
 
 _NO_HOST = tuple(
-    ipaddress.ip_network(one) for one in ("0.0.0.0/8", "224.0.0.0/3", "::/128", "ff00::/8")
+    ipaddress.ip_network(network) for network in ("0.0.0.0/8", "224.0.0.0/3", "::/128", "ff00::/8")
 )
 """Addresses that no host has: unspecified, multicast and broadcast ones."""
 
@@ -70,7 +70,7 @@ class AddressSet:
     def __init__(self, spans: Iterable[Span]) -> None:
         self._spans: list[Span] = []
         key = _place
-        for span in sorted(spans, key=lambda one: (*key(one.first), one.last.number)):
+        for span in sorted(spans, key=lambda span: (*key(span.first), span.last.number)):
             before = self._spans[-1] if self._spans else None
             if (
                 before is not None
@@ -80,11 +80,11 @@ class AddressSet:
                 self._spans[-1] = Span(before.first, max(before.last, span.last))
             else:
                 self._spans.append(span)
-        self._firsts = [_place(one.first) for one in self._spans]
+        self._firsts = [_place(span.first) for span in self._spans]
 
     def __len__(self) -> int:
         """Return the number of addresses."""
-        return sum(one.size for one in self._spans)
+        return sum(span.size for span in self._spans)
 
     def __contains__(self, address: HostAddress) -> bool:
         """Return True if an address is in the set."""
@@ -183,13 +183,13 @@ def _read(text: str, *, whole: bool) -> Span | None:
 
 def _address(text: str) -> HostAddress | None:
     try:
-        found = ipaddress.ip_address(text)
+        address = ipaddress.ip_address(text)
     except ValueError:
         return None
-    scope = (found.scope_id or "") if isinstance(found, ipaddress.IPv6Address) else ""
+    scope = (address.scope_id or "") if isinstance(address, ipaddress.IPv6Address) else ""
     if scope:
         _interface(scope)
-    return HostAddress(found.version, int(found), scope)
+    return HostAddress(address.version, int(address), scope)
 
 
 def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: bool) -> Span:
@@ -203,7 +203,7 @@ def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: boo
 def _mapped(span: Span) -> Span:
     """Return IPv4 addresses in place of those written as IPv6; others unchanged."""
     if span.first.version == 6 and span.first.number >> 32 == span.last.number >> 32 == 0xFFFF:
-        first, last = (HostAddress(4, one.number & 0xFFFFFFFF) for one in span)
+        first, last = (HostAddress(4, address.number & 0xFFFFFFFF) for address in span)
         return Span(first, last)
     return span
 

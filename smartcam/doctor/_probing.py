@@ -1,8 +1,8 @@
-"""Ask an address for its language: protocols, transports and dialects, each on a fresh link.
+"""Find out the protocol, transport and dialect of an address, each try on a new link.
 
-Every try is a :class:`Trial` with all sent and received bytes, decoded if possible, and as hex in
-any case. A camera that closes the link without a byte is asked once more without the Disconnect
-before Connect (see :mod:`smartcam._client.handshake`).
+Every try is a :class:`Trial` with all sent and received bytes, as hex and, if possible, decoded. If
+a camera closes the link without a byte, the try is repeated without the Disconnect before Connect
+(see :mod:`smartcam._client.handshake`).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol differs from that of the given address.
+        other: whether the protocol differs from the given address' one.
     """
 
     address: Address
@@ -77,14 +77,14 @@ class Trial(Try):
     other: bool = False
 
     def __str__(self) -> str:
-        """One line for an error text."""
+        """Text of one line for an error."""
         text = super(Trial, self).__str__()
         return (
             f"{self.address.protocol} at port {self.address.port}: {text}" if self.other else text
         )
 
     def keep(self, entry: TraceEntry) -> None:
-        """Keep an entry, unless there are too many."""
+        """Keep an entry, up to :data:`MAX_FRAMES`."""
         if self.answer is None and len(self.frames) < MAX_FRAMES:
             self.frames.append(entry)
         elif self.answer is None:
@@ -106,8 +106,8 @@ def ways(address: Address) -> list[Way]:
     its protocol fails to load.
     """
     protocol, parameters = load_protocol(address.protocol), dict(address.parameters)
-    found: list[Way] = []
-    for scheme in sorted(protocol.schemes, key=lambda one: one != address.scheme):
+    ways_found: list[Way] = []
+    for scheme in sorted(protocol.schemes, key=lambda scheme: scheme != address.scheme):
         transport = protocol.schemes[scheme]
         groups = protocol.tries(transport, parameters=parameters)
         if address.dialect is not None:
@@ -115,27 +115,28 @@ def ways(address: Address) -> list[Way]:
             others = [tuple(d for d in group if d.name != address.dialect) for group in groups]
             groups = pinned + [group for group in others if group]
         at = address._replace(scheme=scheme)
-        found += [Way(at, transport, group) for group in groups]
-    return found
+        ways_found += [Way(at, transport, group) for group in groups]
+    return ways_found
 
 
 def other_ways(address: Address) -> list[Way]:
     """Return every way to speak to an address's host in the other registered protocols.
 
-    They use the address's port; if that is its protocol's default, each uses its own default.
+    They use the address's port. If that is the default of the address's protocol, each protocol
+    uses its own default.
     """
-    own = load_protocol(address.protocol)
-    found: list[Way] = []
+    own_protocol = load_protocol(address.protocol)
+    ways_found: list[Way] = []
     for protocol in known_protocols():
-        if protocol.name == own.name:
+        if protocol.name == own_protocol.name:
             continue
-        port = protocol.default_port if address.port == own.default_port else address.port
+        port = protocol.default_port if address.port == own_protocol.default_port else address.port
         scheme = next(iter(protocol.schemes))
         try:
-            found += ways(Address(protocol.name, scheme, address.host, port))
-        except ConfigurationError:  # it needs more than the URL has, such as a login
+            ways_found += ways(Address(protocol.name, scheme, address.host, port))
+        except ConfigurationError:  # the protocol needs more than the URL has, such as a login
             continue
-    return found
+    return ways_found
 
 
 async def trials(
@@ -146,7 +147,7 @@ async def trials(
     go_on: bool = False,
     every_protocol: bool = False,
 ) -> AsyncGenerator[Trial]:
-    """Try every way in turn and yield each try; the session of one that answers is ended first.
+    """Try every way in turn and yield each try; a session is ended before its try is yielded.
 
     The pinned options of ``address`` are tried first. ``timeout``: seconds for all tries; each has
     an equal share of the rest. ``trace``: called with every frame on the wire. ``go_on``: continue
@@ -157,18 +158,20 @@ async def trials(
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
-    found = ways(address)
+    ways_found = ways(address)
     if every_protocol:
-        first = found[0].transport
-        found = sorted([*found, *other_ways(address)], key=lambda way: way.transport is not first)
-    left = collections.deque((way, True) for way in found)
+        first = ways_found[0].transport
+        ways_found = sorted(
+            [*ways_found, *other_ways(address)], key=lambda way: way.transport is not first
+        )
+    left = collections.deque((way, True) for way in ways_found)
     while left:
         way, disconnect_first = left.popleft()
         share = max(0.0, deadline - loop.time()) / (len(left) + 1)
         trial = await _try(way, share, trace, disconnect_first=disconnect_first)
         trial.other = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
-            left.appendleft((way, False))  # perhaps it closed because of the Disconnect
+            left.appendleft((way, False))  # the camera may have closed because of the Disconnect
         _put_greeted_first(left, trial)
         yield trial
         if trial.answer is not None and not go_on:
@@ -181,7 +184,10 @@ def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) 
     if greeted is not None:
         place = (greeted, trial.address.port)
         order = sorted(
-            left, key=lambda one: (one[0].address.protocol, one[0].address.port) != place
+            left,
+            key=lambda way_and_flag: (
+                (way_and_flag[0].address.protocol, way_and_flag[0].address.port) != place
+            ),
         )
         left.clear()
         left.extend(order)
@@ -191,8 +197,8 @@ def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
     """Return the protocol whose greeting a try has received, None without one."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
-    heard = next((one.hex for one in trial.frames if one.direction == "!"), "")
-    start = bytes.fromhex(heard).lstrip()
+    first_frame = next((frame.hex for frame in trial.frames if frame.direction == "!"), "")
+    start = bytes.fromhex(first_frame).lstrip()
     return next((name for name in names if _greets(load_protocol(name), start)), None)
 
 
@@ -201,13 +207,13 @@ def _greets(protocol: Protocol, received: bytes) -> bool:
 
 
 async def locate(host: str, *, timeout: float) -> str:
-    """Return the URL of the camera at a bare ``HOST[:PORT]``, in the protocol that it answers.
+    """Return the URL of the camera at a bare ``HOST[:PORT]``, with the protocol that it answers.
 
-    The session for this is over then. ``timeout``: seconds for all ways together.
+    The session is ended before the return. ``timeout``: seconds for all ways together.
 
     Raises:
-        ConnectFailedError: the camera answered no protocol; the error has the most telling try, and
-            the cure.
+        ConnectFailedError: the camera answered no protocol; the error has the most informative
+            try, and the cure.
 
     Cancellation: the link is dropped.
     """
@@ -222,7 +228,7 @@ async def locate(host: str, *, timeout: float) -> str:
 
 
 def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
-    """Return the error for failed tries: the most telling one, and the cure."""
+    """Return the error for failed tries, with the most informative one and the cure."""
     ranked = by_telling(failed)
     where = ranked[0].address
     why = explain(ranked[:1], where, load_protocol(where.protocol))
@@ -234,11 +240,10 @@ def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectF
     )
 
 
-def by_telling(found: Iterable[Trial]) -> list[Trial]:
-    """Return failed tries, the most telling first.
+def by_telling(trials_made: Iterable[Trial]) -> list[Trial]:
+    """Return failed tries, the most informative first.
 
-    A refusal tells more than bytes that are no message, these more than other bytes, bytes more
-    than silence, and silence more than no link.
+    The order: a refusal, bytes of a frame that is no message, other bytes, silence, no link.
     """
 
     def rank(trial: Trial) -> tuple[bool, bool, bool, bool]:
@@ -247,7 +252,7 @@ def by_telling(found: Iterable[Trial]) -> list[Trial]:
         garbage = isinstance(trial.error, ProtocolError)
         return (not refused, not trial.received, not garbage, not linked)
 
-    return sorted(found, key=rank)
+    return sorted(trials_made, key=rank)
 
 
 async def _try(

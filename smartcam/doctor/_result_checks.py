@@ -87,8 +87,8 @@ def _places(layout: Layout, size: int, around: int) -> Iterator[tuple[int, str, 
         yield offset, field.name, field
         offset += field.size
     record, repeat = layout.size, layout.repeat
-    there = max(0, math.ceil((size - offset) / record))
-    count = 1 if repeat is None else repeat if isinstance(repeat, int) else there
+    records_fit = max(0, math.ceil((size - offset) / record))
+    count = 1 if repeat is None else repeat if isinstance(repeat, int) else records_fit
     first = min(max(0, (around - offset) // record - 1), max(0, count - 1))
     for number in range(first, count):
         begin = offset + number * record
@@ -147,7 +147,7 @@ def _compare(exam: Examination, interpreter: Interpreter, containers: list[Resul
     readings: list[Reading] = [result.value for result in containers]
     for result, reading in zip(containers, readings, strict=True):
         if reading.error is not None:
-            _say_misfit(exam, interpreter, result, reading, reading.error)
+            _report_misfit(exam, interpreter, result, reading, reading.error)
             return
     fit = "were read" if interpreter.layout is None else f"fit the layout '{interpreter.layout}'"
     exam.report("ok", f"{len(readings)} results {fit}", results=len(readings))
@@ -162,7 +162,7 @@ def _listed(sizes: Sequence[int]) -> str:
     return shown + (" ..." if len(sizes) > 8 else "")
 
 
-def _say_misfit(
+def _report_misfit(
     exam: Examination,
     interpreter: Interpreter,
     result: Result,
@@ -266,7 +266,7 @@ def _look_at_values(
     exam: Examination, layout: Layout, readings: list[Reading], *, integers: bool
 ) -> None:
     """Give a hint for each field whose values are not plausible in its unit, or without one."""
-    found: dict[str, float] = {}  # largest magnitude by field
+    values: dict[str, float] = {}  # largest magnitude by field
     # converted values, by unit
     converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERTED}
     nonsense: dict[str, float] = {}
@@ -282,7 +282,7 @@ def _look_at_values(
                 ):
                     nonsense.setdefault(field.name, value)
                 elif field.unit is None:
-                    found[field.name] = max(value, found.get(field.name, 0.0))
+                    values[field.name] = max(value, values.get(field.name, 0.0))
                 elif field.unit in CONVERTED and not field.wire.is_integer:
                     of_unit = converted[field.unit]
                     of_unit[field.name] = max(value, of_unit.get(field.name, 0.0))
@@ -298,8 +298,8 @@ def _look_at_values(
             field=name,
             value=value,
         )
-    for name, value in found.items():
-        rule = next((one for one in PLAUSIBLE if one.names.search(name)), None)
+    for name, value in values.items():
+        rule = next((rule for rule in PLAUSIBLE if rule.names.search(name)), None)
         if rule is not None and value > rule.most:
             kind = next(field for field in fields if field.name == name)
             exam.report(
@@ -315,12 +315,12 @@ def _look_at_values(
             )
 
 
-def _ask_for_si(exam: Examination, unit: str, found: Mapping[str, float]) -> None:
+def _ask_for_si(exam: Examination, unit: str, values: Mapping[str, float]) -> None:
     """Give a hint if the values of all fields with a unit look as if they had been SI already."""
-    rule, most = CONVERTED[unit], max(found.values(), default=0.0)
+    rule, most = CONVERTED[unit], max(values.values(), default=0.0)
     if not 0.0 < most <= rule.most:
         return
-    made, names = UNITS[unit], ", ".join(found)
+    made, names = UNITS[unit], ", ".join(values)
     symbol = SI_SYMBOLS[made.quantity]
     exam.report(
         "hint",

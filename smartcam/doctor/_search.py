@@ -1,7 +1,7 @@
 """Find cameras: search networks for addresses that listen on the ports of cameras.
 
-Ports are opened and not used: nothing is sent, unasked bytes are read. A caller that wants to
-know more allows asking, which speaks to the camera as ``smartcam probe`` does.
+A search opens ports and sends nothing; it reads bytes that a port sends by itself. If the caller
+allows it, the search also speaks to the found cameras, like ``smartcam probe``.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ MAX_SECONDS = 60.0
 """Largest number of seconds for one opening."""
 
 ASK_TIMEOUT = 10.0
-"""Seconds for asking one camera, all ways together."""
+"""Seconds for questions to one camera in all protocols together."""
 
-ASK_AT_ONCE = 16
+MAX_ASKED_AT_ONCE = 16
 """Number of cameras that are asked at the same time."""
 
 NAME_TIMEOUT = 5.0
@@ -93,14 +93,15 @@ async def find(
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
             network has at most 256 addresses.
-        ports: further ports to open; each of the protocols may be spoken there.
+        ports: further ports to open, which may serve any of the protocols.
         protocols: names of the protocols to look for; default: all that are known.
-        leave: addresses of cameras at work, which are not touched; written as ``networks``.
+        leave: addresses of working cameras that the search leaves out, in the form of
+            ``networks``.
         may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
         ask: also speak to the cameras that were found, which takes such a camera from its client.
         rate: largest number of openings per second.
         at_once: largest number of connections at a time.
-        timeout: seconds until a port is open, and as many again to read unasked bytes.
+        timeout: seconds to open a port, and again to read bytes that the port sends by itself.
         max_addresses: number of addresses above which a search is refused.
 
     Raises:
@@ -127,14 +128,14 @@ async def find(
 
 
 class CameraSearch:
-    """One search; its results stay, however it ends. Arguments as in :func:`find`.
+    """A search, whose results remain after its end or failure. Arguments as in :func:`find`.
 
     Attributes:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
-        counts: numbers of tries, by their outcome.
+        counts: numbers of tries by outcome.
         why: the first failure of this machine.
-        left: addresses that were left alone, by the texts that name them.
+        left: addresses that were left out, by the texts that name them.
         begun: whether the first port was tried.
     """
 
@@ -179,7 +180,7 @@ class CameraSearch:
         self._timeout = timeout
         self._max_addresses = max_addresses
         _check_size(self._networks, max_addresses)
-        self._found: dict[tuple[HostAddress, int], FoundPort] = {}
+        self._ports_found: dict[tuple[HostAddress, int], FoundPort] = {}
         self._busy = 0
         self.opened = 0
         self.total = 0
@@ -190,16 +191,16 @@ class CameraSearch:
 
     @property
     def exclusive(self) -> list[str]:
-        """Names of protocols whose cameras serve one client, and were found but not asked."""
+        """Names of protocols of found cameras that were not asked, since they serve one client."""
         if self._ask:
             return []
-        found = {name for one in self._found.values() for name in one.protocols}
+        names = {name for port in self._ports_found.values() for name in port.protocols}
         known = tcp_protocols()
-        return sorted(name for name in found if serves_one(known[name]))
+        return sorted(name for name in names if serves_one(known[name]))
 
     def results(self) -> list[FoundPort]:
         """Return the ports found so far, sorted by address."""
-        return [self._found[key] for key in sorted(self._found)]
+        return [self._ports_found[key] for key in sorted(self._ports_found)]
 
     async def run(self) -> None:
         """Search.
@@ -210,8 +211,12 @@ class CameraSearch:
 
         Cancellation: every connection is closed; the results stay.
         """
-        addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
-        leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
+        addresses = AddressSet([span for each in self._networks for span in await _spans(*each)])
+        leave = [
+            (text, left_span)
+            for text, span in self._leave
+            for left_span in await _spans(text, span)
+        ]
         _check_count(len(addresses), self._max_addresses)
         for text, span in leave:
             if span.size == 1 and span.first in addresses:
@@ -258,10 +263,10 @@ class CameraSearch:
         self.counts[opened.outcome] += 1
         self.why = self.why or opened.why
         if opened.outcome == "open":
-            self._found[address, port] = found_port(str(address), port, opened, protocols)
+            self._ports_found[address, port] = found_port(str(address), port, opened, protocols)
 
     async def _socket(self, address: HostAddress) -> socket.socket:
-        """Return a socket, as soon as the system has one."""
+        """Return a socket; wait until the system has a free one."""
         loop = asyncio.get_running_loop()
         until = loop.time() + 4 * self._timeout
         while True:
@@ -279,16 +284,16 @@ class CameraSearch:
             await asyncio.sleep(SCARCE_PAUSE)
 
     async def _ask_all(self) -> None:
-        places = asyncio.Semaphore(ASK_AT_ONCE)
+        places = asyncio.Semaphore(MAX_ASKED_AT_ONCE)
 
         async def ask(key: tuple[HostAddress, int]) -> None:
             async with places:
-                self._found[key] = await asked(self._found[key])
+                self._ports_found[key] = await asked(self._ports_found[key])
 
         async with asyncio.TaskGroup() as group:
-            for key, one in sorted(self._found.items()):
-                if one.protocols:
-                    group.create_task(ask(key), name=f"smartcam.find[{one.host}:{one.port}].ask")
+            for key, port in sorted(self._ports_found.items()):
+                if port.protocols:
+                    group.create_task(ask(key), name=f"smartcam.find[{port.host}:{port.port}].ask")
 
 
 # ---------------------------------------------------------------------- addresses
@@ -307,8 +312,8 @@ async def _spans(text: str, span: Span | None) -> list[Span]:
             f"no name server answers within {NAME_TIMEOUT:g} s"
         )
         raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
-    found = {address_of(str(one[4][0])) for one in resolved}
-    return [Span(address, address) for address in sorted(found)]
+    addresses = {address_of(str(entry[4][0])) for entry in resolved}
+    return [Span(address, address) for address in sorted(addresses)]
 
 
 def _check_size(networks: Iterable[tuple[str, Span | None]], most: int) -> None:
@@ -326,13 +331,13 @@ def _check_count(count: int, most: int) -> None:
 # ---------------------------------------------------------------------- asking
 
 
-async def asked(found: FoundPort) -> FoundPort:
-    """Ask a found camera, in each protocol that it may speak, and return the outcome."""
+async def asked(port: FoundPort) -> FoundPort:
+    """Ask a found camera in each possible protocol, and return the outcome."""
     failed: list[str] = []
-    for url in found.urls:
+    for url in port.urls:
         async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:
             async for trial in tries:
                 if trial.answer is not None:
-                    return dataclasses.replace(found, answer=trial.answer)
+                    return dataclasses.replace(port, answer=trial.answer)
                 failed.append(str(trial))
-    return dataclasses.replace(found, refusal="; ".join(failed))
+    return dataclasses.replace(port, refusal="; ".join(failed))

@@ -30,17 +30,17 @@ SESSION_COUNT = 5
 """Number of sessions made one after the other, for the spread of the connect time."""
 
 CONNECTS_WITHIN = 3.0
-"""Seconds after which no further session is begun: on a slow link one or two must suffice."""
+"""Seconds after which no further session is begun; on a slow link one or two suffice."""
 
-KNOCK_TIMEOUT = 1.0
+CONNECTION_TIMEOUT = 1.0
 """Seconds for a bare TCP connection, which tells an absent camera from one that closed the link."""
 
-KNOCK_AFTER = 0.25
-"""Seconds to wait before this connection: a camera going down closes its port a moment later."""
+CONNECTION_DELAY = 0.25
+"""Seconds to wait before the bare connection: a camera that shuts down closes its port later."""
 
 TAKEN_WITHIN = 10.0
-"""Seconds after its Connect within which a lost session was probably taken, by the client's own
-rule (see :mod:`smartcam._client.supervisor`)."""
+"""Seconds after Connect in which a lost session was probably taken, by the client's own rule (see
+:mod:`smartcam._client.supervisor`)."""
 
 
 # ---------------------------------------------------------------------- the name
@@ -53,7 +53,7 @@ async def resolve(exam: Examination) -> None:
     limit = exam.options.step(10.0)
     try:
         async with asyncio.timeout(limit):
-            found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            resolved = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
         why = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
         why = why or f"no name server answers within {limit:g} s"
@@ -64,7 +64,7 @@ async def resolve(exam: Examination) -> None:
             host=host,
         )
         return
-    addresses = sorted({str(info[4][0]) for info in found})
+    addresses = sorted({str(info[4][0]) for info in resolved})
     if addresses != [host]:
         text = f"{host} is {', '.join(addresses)}"
         exam.report("ok", text, host=host, addresses=addresses)
@@ -105,11 +105,11 @@ async def connect(exam: Examination) -> None:
         return
     exam.camera, exam.connected_at = camera, loop.time()
     if first is not None and len(times) > 1:
-        del times[0]  # it includes the search for the dialect
-    _say_session(exam, camera, first, times)
+        del times[0]  # the time includes the search for the dialect
+    _report_session(exam, camera, first, times)
 
 
-def _say_session(
+def _report_session(
     exam: Examination, camera: Camera, first: float | None, times: list[float]
 ) -> None:
     measured = figures(times)
@@ -133,13 +133,13 @@ def _say_session(
 
 async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Report why there is no session; return a camera if another way leads to one."""
-    own, found = exam.address, await _try_all(exam)
-    answer = found[-1].answer
+    address, trials_made = exam.address, await _try_all(exam)
+    answer = trials_made[-1].answer
     if answer is None:
-        _say_no_session(exam, found, None)
+        _report_no_session(exam, trials_made, None)
         return None
     exam.pin(answer.url)
-    if exam.address.scheme == own.scheme and own.dialect in {None, exam.address.dialect}:
+    if exam.address.scheme == address.scheme and address.dialect in {None, exam.address.dialect}:
         exam.report(
             "warning",
             f"no session at first ({failure}), and one a moment later",
@@ -148,7 +148,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
             attempts=list(failure.attempts),
         )
     else:
-        _say_no_session(exam, found, answer)
+        _report_no_session(exam, trials_made, answer)
     try:
         return await exam.make_camera().open()
     except ConnectFailedError as exc:
@@ -164,42 +164,44 @@ async def _try_all(exam: Examination) -> list[Trial]:
         return [trial async for trial in tries]
 
 
-def _say_no_session(exam: Examination, found: list[Trial], answer: CameraAnswer | None) -> None:
-    own = found[0].address
-    reason, trial = _reason(found, pinned=own.dialect is not None)
-    filled = words(trial, own, load_protocol(own.protocol))
+def _report_no_session(
+    exam: Examination, trials_made: list[Trial], answer: CameraAnswer | None
+) -> None:
+    address = trials_made[0].address
+    reason, trial = _reason(trials_made, pinned=address.dialect is not None)
+    filled = words(trial, address, load_protocol(address.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
-        others = [one for one in by_telling(found) if one is not trial]
+        others = [other for other in by_telling(trials_made) if other is not trial]
         also = f" Also tried: {_folded(others)}." if others else ""
         cure = reason.cure.format(**filled) + also
     exam.fail(
         reason.text.format(**filled),
         cure,
-        tries=[str(one) for one in found],
-        frames=[tuple(one.frames) for one in found],
+        tries=[str(trial) for trial in trials_made],
+        frames=[tuple(trial.frames) for trial in trials_made],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _reason(found: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
+def _reason(trials_made: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     """Return the reason why the URL gives no session, and the try that shows it."""
-    first = found[0]
-    own = [
+    first = trials_made[0]
+    trials_alike = [
         trial
-        for trial in found
+        for trial in trials_made
         if trial.transport == first.transport
         and not trial.other
         and (trial.dialect == first.dialect or not pinned)
     ]
-    return reason_for(own)
+    return reason_for(trials_alike)
 
 
-def _folded(found: list[Trial]) -> str:
+def _folded(trials_made: list[Trial]) -> str:
     """Return tries in one line, with equal outcomes of a transport's dialects together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for trial in found:
+    for trial in trials_made:
         at = f" at port {trial.address.port}" if trial.other else ""
         key = (f"{trial.transport.upper()}{at}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)
@@ -215,10 +217,9 @@ def _folded(found: list[Trial]) -> str:
 async def explain_loss(exam: Examination, error: SmartCamError) -> None:
     """Report why a session is over, without taking the camera.
 
-    A client that makes a new session and loses it again knows that it was taken
-    (ConnectionTakenError), but takes the camera back once for that. This function only opens a
-    bare TCP connection to see whether the camera is still there. A Connect takes a session
-    over, a connection does not (inferred).
+    A client can detect that its session was taken (ConnectionTakenError) only by taking the camera
+    back once. This function only opens a bare TCP connection, to see whether the camera still
+    listens. A Connect takes over a session, a connection does not (inferred).
     """
     age = asyncio.get_running_loop().time() - exam.connected_at
     cause = error.__cause__
@@ -262,9 +263,9 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
 
 async def _knock(exam: Examination) -> bool:
     """Return True if the camera's port accepts a TCP connection."""
-    await asyncio.sleep(KNOCK_AFTER)
+    await asyncio.sleep(CONNECTION_DELAY)
     try:
-        async with asyncio.timeout(KNOCK_TIMEOUT):
+        async with asyncio.timeout(CONNECTION_TIMEOUT):
             _, writer = await asyncio.open_connection(exam.address.host, exam.address.port)
     except (OSError, UnicodeError):
         return False

@@ -28,7 +28,7 @@ QUERIES_WITHIN = 3.0
 SLOW_ROUND_TRIP_TIME = 0.05
 """A round trip of this many seconds gives a hint: on a local network it takes milliseconds."""
 
-MAX_SEEN = 1000
+MAX_WATCHED_STATUSES = 1000
 """Largest number of statuses kept while watching; the last ones stay."""
 
 CLOCK_MAY_DIFFER = timedelta(minutes=1)
@@ -93,11 +93,13 @@ async def look_at_status(exam: Examination) -> None:
     camera = exam.connected_camera
     capable = camera.capabilities
     status = await camera.query_status() if capable.get_status else camera.status
-    wrong = [one for one in _CONDITIONS if one.bit in status]
-    for one in wrong:
-        sticky = one.bit is Status.OVERTRIGGERED and capable.reset_errors
-        cure = one.cure + (_STICKY if sticky else "")
-        exam.report(one.severity, one.text, cure, exit_code=one.exit_code, status=status)
+    wrong = [condition for condition in _CONDITIONS if condition.bit in status]
+    for reading in wrong:
+        sticky = reading.bit is Status.OVERTRIGGERED and capable.reset_errors
+        cure = reading.cure + (_STICKY if sticky else "")
+        exam.report(
+            reading.severity, reading.text, cure, exit_code=reading.exit_code, status=status
+        )
     if not wrong:
         exam.report("ok", f"no fault is reported: {status}", status=status)
 
@@ -136,7 +138,7 @@ _RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
         Exit.REFUSED,
     ),
     Diagnosis(
-        lambda seen: all(Status.BUSY in one for one in seen),
+        lambda seen: all(Status.BUSY in status for status in seen),
         "the camera was BUSY for all of the {seconds:g} s",
         "It loads an application, or somebody works on its pages. If it stays so for minutes, "
         "restart it.",
@@ -161,15 +163,17 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # this was reported already, and explains the rest
+        return  # the status was reported already, and explains the rest
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # it may have stopped meanwhile
-    if any(_waits(one) for one in seen) and not stopped:
+    stopped = _is_stopped(seen[-1])  # the camera may have stopped since
+    if any(_waits(status) for status in seen) and not stopped:
         exam.may_trigger = True
-        came = f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
-        text = f"{called(application)} runs and waits for triggers{came}"
+        results_text = (
+            f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
+        )
+        text = f"{called(application)} runs and waits for triggers{results_text}"
         exam.report("ok", text, **details, **_rate(witness))
     elif witness.results and not stopped:
         _report_free_run(exam, details)
@@ -207,7 +211,7 @@ def _report_free_run(exam: Examination, details: dict[str, Any]) -> None:
 
 async def _watch(exam: Examination, seconds: float) -> list[Status]:
     """Return every status within some seconds, the present one first."""
-    seen: deque[Status] = deque(maxlen=MAX_SEEN)
+    seen: deque[Status] = deque(maxlen=MAX_WATCHED_STATUSES)
 
     def note(status: Status) -> bool:
         seen.append(status)
@@ -275,31 +279,31 @@ async def look_at_clock(exam: Examination) -> None:
     now = datetime.now(UTC)
     local = now.astimezone().replace(tzinfo=None)
     clocks = {"local time": shown - local, "UTC": shown - now.replace(tzinfo=None)}
-    zone, off = min(clocks.items(), key=lambda item: abs(item[1]))
+    zone, difference = min(clocks.items(), key=lambda item: abs(item[1]))
     text = f"the camera's clock shows {shown:%Y-%m-%d %H:%M:%S}"
     details: dict[str, Any] = {
         "clock": shown,
-        "seconds_off": off.total_seconds(),
+        "seconds_off": difference.total_seconds(),
         "compared_with": zone,
     }
-    if abs(off) <= CLOCK_MAY_DIFFER:
+    if abs(difference) <= CLOCK_MAY_DIFFER:
         exam.report("ok", f"{text}, which is this machine's {zone}", **details)
         return
-    behind = "behind" if off < timedelta(0) else "ahead of"
+    behind = "behind" if difference < timedelta(0) else "ahead of"
     exam.report(
         "warning",
-        f"{text}, {_rounded(abs(off))} {behind} this machine's "
+        f"{text}, {_rounded(abs(difference))} {behind} this machine's "
         f"{zone}; it carries no time zone, and a restart of the camera loses it",
         _SET_CLOCK,
         **details,
     )
 
 
-def _rounded(off: timedelta) -> str:
+def _rounded(difference: timedelta) -> str:
     """Return a time in whole seconds, or in whole days if it is more than a week."""
-    if off > timedelta(days=7):
-        return f"{off.days} days"
-    return str(timedelta(seconds=round(off.total_seconds())))
+    if difference > timedelta(days=7):
+        return f"{difference.days} days"
+    return str(timedelta(seconds=round(difference.total_seconds())))
 
 
 _SET_CLOCK = (

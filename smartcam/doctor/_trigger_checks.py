@@ -106,7 +106,7 @@ async def trigger(exam: Examination) -> None:
             except InterpretationError:
                 break  # the check of the layout reports it
             except SmartCamError as exc:
-                _say_failed(exam, exc, len(times))
+                _report_failure(exam, exc, len(times))
                 break
             ended = loop.time()
             times.append(ended - sent_at if result.latency is None else result.latency)
@@ -126,7 +126,7 @@ async def trigger(exam: Examination) -> None:
         )
 
 
-def _say_failed(exam: Examination, error: SmartCamError, done: int) -> None:
+def _report_failure(exam: Examination, error: SmartCamError, done: int) -> None:
     which = f"trigger {done + 1}"
     if not isinstance(error, TriggerTimeoutError):
         exam.fail(

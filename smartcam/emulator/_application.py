@@ -203,11 +203,11 @@ class Application(EmulatorData):
     def _try_values(self) -> None:
         entries = self.cycle or ()
         for turn in range(max(1, len(entries))):
-            what = f"cycle.{turn}: " if entries else ""
+            prefix = f"cycle.{turn}: " if entries else ""
             try:
                 self.container(number=0, turn=turn, time=0.0, scene=TableScene())
             except SmartCamError as exc:
-                raise ValueError(f"{what}{exc}") from exc
+                raise ValueError(f"{prefix}{exc}") from exc
             except ENDS_PROGRAM:
                 raise
             except BaseException as exc:

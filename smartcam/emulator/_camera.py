@@ -138,19 +138,19 @@ class EmulatedCamera(WireCamera):
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
-        who = "emulator"
+        caller = "emulator"
         if port is not None:
-            port = check_port(port, who)
+            port = check_port(port, caller)
         if name is not None:
-            name = check_text(name, "name", who, most=200)
+            name = check_text(name, "name", caller, most=200)
         if active is not None:
-            active = check_application(active, "active", who)
+            active = check_application(active, "active", caller)
         if running is not None:
-            running = check_flag(running, "running", who)
+            running = check_flag(running, "running", caller)
         if seed is not None:
-            seed = check_seed(seed, who)
+            seed = check_seed(seed, caller)
         if builtins is not None:
-            builtins = check_flag(builtins, "builtins", who)
+            builtins = check_flag(builtins, "builtins", caller)
         plan = make_plan(
             scenario,
             applications,
@@ -208,14 +208,14 @@ class EmulatedCamera(WireCamera):
         seed: int | None = None,
     ) -> EmulatedCamera:
         """Return a camera of a scenario; the other arguments override it."""
-        own = plan.quirks.model_dump(exclude_unset=True)
+        own_quirks = plan.quirks.model_dump(exclude_unset=True)
         return cls(
             scenario=plan,
             host=host,
             port=port,
             transport=transport,
             dialect=dialect,
-            quirks={**own, **quirks} if quirks else None,
+            quirks={**own_quirks, **quirks} if quirks else None,
             clock=clock,
             seed=seed,
         )
@@ -234,19 +234,19 @@ class EmulatedCamera(WireCamera):
                 )
                 return ("applications", number, "id"), text
         if plan.active is not None and plan.active not in known:
-            there = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
+            ids_text = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
             more = ", ..." if len(known) > _MAX_NAMED_IDS else ""
-            asked = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
-            return ("active",), f"no application has {asked}; there are {there}{more}"
+            asked_text = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
+            return ("active",), f"no application has {asked_text}; there are {ids_text}{more}"
         try:
             spoken = dialect.with_quirks(plan.quirks.of_the_wire)
         except ConfigurationError as exc:
             return ("quirks",), str(exc)
         for number, cue in enumerate(plan.timeline):
             for place, fault in enumerate(cue.do):
-                found = misfit(fault, spoken, known)
-                if found is not None:
-                    return ("timeline", number, "do", place, found[0]), found[1]
+                misfit_text = misfit(fault, spoken, known)
+                if misfit_text is not None:
+                    return ("timeline", number, "do", place, misfit_text[0]), misfit_text[1]
         return None
 
     @classmethod
@@ -289,7 +289,9 @@ class EmulatedCamera(WireCamera):
     def table(self) -> TableScene | None:
         """The table that its pages show; None if all applications inspect real pictures."""
         applications = self.device.applications.values()
-        inspects = all(isinstance(one, InspectedApplication) for one in applications)
+        inspects = all(
+            isinstance(application, InspectedApplication) for application in applications
+        )
         return None if inspects else self.scene
 
     @property
@@ -324,7 +326,8 @@ class EmulatedCamera(WireCamera):
             "next_number": device.next_number,
             "queued_inputs": device.queued_inputs,
             "applications": [
-                {key: getattr(one, key) for key in SHOWN} for one in device.applications.values()
+                {key: getattr(application, key) for key in SHOWN}
+                for application in device.applications.values()
             ],
             "quirks": self.quirks,
             "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
@@ -379,7 +382,7 @@ class EmulatedCamera(WireCamera):
                 self._active = None
                 link.session_ended()
         self._collect()
-        self.device.tell_entered()
+        self.device.report_entered()
         if faults:
             self._act(faults, "after")
 
@@ -396,9 +399,9 @@ class EmulatedCamera(WireCamera):
         """Let another client connect; it gets the session unless a quirk refuses newcomers."""
         if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
             return
-        self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
+        self._hand_session(SecondClientSession(self.spoken, self._notified_second_client))
 
-    def _told_second_client(self, frame: Frame) -> None:
+    def _notified_second_client(self, frame: Frame) -> None:
         self._note(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
 
     def _connect(self, link: ClientLink) -> None:
@@ -452,9 +455,8 @@ class EmulatedCamera(WireCamera):
         if self.queue.device_on_camera:
             self._send_all(output, provoke=True)
         elif self._active is not None:
-            say = self._active.say
             for message in output:
-                say(message)
+                self._active.send(message)
 
     def _send_all(self, output: list[m.Message], *, provoke: bool) -> None:
         """Send messages to the client that has the session; they may trigger faults."""
@@ -462,11 +464,11 @@ class EmulatedCamera(WireCamera):
         for message in output:
             faults = self._provoke(self.queue.device_on_camera, message) if provoke else ()
             if session is not None and session is self._active and self.device.connected:
-                session.say(message)
+                session.send(message)
             self._act(faults, "after")
 
     def _settle(self) -> None:
-        self.device.tell_entered()
+        self.device.report_entered()
         self._collect()
         if self._active is not None:
             self._active.flush()

@@ -2,7 +2,7 @@
 
 The owner of a link makes the link's protocol machine, which has the camera's role. A link is faulty
 only while wire faults wait or hold messages back. The camera's messages then go
-``FaultyLink.say -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
+``FaultyLink.send -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
 ``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
@@ -115,7 +115,9 @@ class LinkOwner(Protocol):
         """Note that a connection has ended."""
         ...
 
-    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+    def traced(
+        self, link: ClientLink, sender: m.Sender, message: Frame | RemoteProtocolError
+    ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
@@ -136,8 +138,8 @@ class ClientLink(ABC):
         self.machine: CameraMachine = owner.make_machine(transport, self._trace)
         self._faulty: FaultyLink | None = None  # set while faults act
 
-    def say(self, message: m.Message) -> None:
-        """Add a message to those that :meth:`flush` will write."""
+    def send(self, message: m.Message) -> None:
+        """Add a message to the messages that :meth:`flush` will write."""
         if self._owner.queue.on_camera and self._faulty is None:
             self._enter_faulty()
         try:
@@ -146,7 +148,7 @@ class ClientLink(ABC):
             _log.warning("! %s: not sent: %s", self.peer, exc)
             return
         if self._faulty is not None:
-            self._faulty.say(message, b"".join(self.machine.data_to_send()))
+            self._faulty.send(message, b"".join(self.machine.data_to_send()))
 
     def flush(self) -> None:
         """Write all added messages."""
@@ -179,7 +181,7 @@ class ClientLink(ABC):
     def session_ended(self) -> None:  # noqa: B027  only TCP has an order of links
         """Note that the client has ended its session; the link may stay open."""
 
-    def heard(self) -> None:
+    def answer_received(self) -> None:
         """Write the camera's answers to the received messages."""
         self.flush()
 
@@ -235,9 +237,9 @@ class ClientLink(ABC):
         if self._faulty is not None:
             self._faulty.close()
 
-    def _trace(self, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+    def _trace(self, sender: m.Sender, message: Frame | RemoteProtocolError) -> None:
         if self._faulty is None or sender is m.Sender.CLIENT:
-            self._owner.traced(self, sender, what)
+            self._owner.traced(self, sender, message)
 
 
 @dataclass(eq=False)
@@ -269,7 +271,7 @@ class FaultyLink:
             wake=wake,
             carry=carry,
             end=self._end,
-            lost=lambda one: self._lose(sender, one),
+            lost=lambda message: self._lose(sender, message),
         )
 
     @property
@@ -301,7 +303,7 @@ class FaultyLink:
 
     # ------------------------------------------------------------------ out
 
-    def say(self, message: m.Message, data: bytes) -> None:
+    def send(self, message: m.Message, data: bytes) -> None:
         """Add a message of the camera, and its bytes; call :meth:`run` next."""
         dialect, queue = self._owner.codec, self._owner.queue
         frame = dialect.to_frame(message)
@@ -334,13 +336,13 @@ class FaultyLink:
         """Add bytes of the client: a part of a stream, or one datagram."""
         if self.dead:
             return
-        heard = self._owner.queue.on_client
+        is_heard = self._owner.queue.on_client
         if self.machine.transport is Transport.UDP:
             self._take_message(cut_datagram(data, self._owner.codec))
             return
         if self._framer is None:
-            data = self._finish_frame(data) if heard else data
-            if not heard or self.machine.buffered:
+            data = self._finish_frame(data) if is_heard else data
+            if not is_heard or self.machine.buffered:
                 self._link.feed(data)
                 return
             self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
@@ -353,8 +355,8 @@ class FaultyLink:
     def _stop_cutting(self) -> None:
         """Give an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
         if self._framer is not None and not self._owner.queue.on_client and not self._incoming:
-            rest, self._framer = self._framer.pending, None
-            self._link.feed(rest)
+            pending, self._framer = self._framer.pending, None
+            self._link.feed(pending)
 
     def _finish_frame(self, data: bytes) -> bytes:
         """Let the frame pass that was unfinished when the faults were given; return the rest."""
@@ -389,17 +391,17 @@ class FaultyLink:
         with self._owner.step():
             self._incoming.run()
             self._stop_cutting()
-            self._link.heard()
+            self._link.answer_received()
 
     # ------------------------------------------------------------------ both
 
     def _put(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
-        if line.size + sum(one.size for one in sent) > self._owner.write_limit:
+        if line.size + sum(message.size for message in sent) > self._owner.write_limit:
             self._link.overflow()
         outgoing = line is self._outgoing
         if self._link.closed or (outgoing and self.muted is not None):
-            for one in sent:
-                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, one)
+            for message in sent:
+                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, message)
         else:
             line.put(sent)
 
@@ -441,7 +443,7 @@ class SecondClientSession:
     _traced: Callable[[Frame], None]  # called with all messages to it; none is on a wire
     peer: ClassVar[str] = "second client"
 
-    def say(self, message: m.Message) -> None:
+    def send(self, message: m.Message) -> None:
         """Accept a message."""
         try:
             frame = self._dialect.to_frame(message)

@@ -44,9 +44,9 @@ def applications_of(
     Raises:
         ConfigurationError: a field is unknown or wrong.
     """
-    fields = [{"id": one} if isinstance(one, int) else one for one in given]
+    fields = [{"id": entry} if isinstance(entry, int) else entry for entry in given]
     try:
-        return [kind(**{**(defaults or {}), **one}) for one in fields]
+        return [kind(**{**(defaults or {}), **field}) for field in fields]
     except TypeError as exc:
         raise ConfigurationError(f"applications: {exc}") from exc
 
@@ -84,8 +84,10 @@ class EvaluatingCamera(LineCamera):
     def __init_subclass__(cls, **given: Any) -> None:
         """Collect the methods that answer requests, in order."""
         super().__init_subclass__(**given)
-        own = {one.form: one for one in vars(cls).values() if hasattr(one, "form")}
-        cls.requests = {**cls.requests, **own}
+        own_forms = {
+            member.form: member for member in vars(cls).values() if hasattr(member, "form")
+        }
+        cls.requests = {**cls.requests, **own_forms}
 
     def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:
         """Set the parts of each application by its number.
@@ -104,7 +106,7 @@ class EvaluatingCamera(LineCamera):
         if not all(parts.values()):
             raise ConfigurationError("parts: at least one was expected")
         self.parts: dict[int, Iterator[Any]] = {
-            number: itertools.cycle(some) for number, some in parts.items()
+            number: itertools.cycle(cycle_parts) for number, cycle_parts in parts.items()
         }
         self._numbers_of_applications = [*parts]
         self._asking_client: LineClient | None = None  # asked for the running evaluation
@@ -124,9 +126,9 @@ class EvaluatingCamera(LineCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a request of one of the forms, unless its method answers later."""
         for form, method in self.requests.items():
-            found = form.fullmatch(line)
-            if found is not None:
-                answer = method(self, client, *found.groups())
+            match = form.fullmatch(line)
+            if match is not None:
+                answer = method(self, client, *match.groups())
                 if answer is not None:
                     client.answer(answer)
                 return

@@ -31,8 +31,8 @@ class EmulatedFleet(Server):
     Args:
         scenarios: the path of a scenario file, or scenarios with different names.
         host: address to listen on; without a port.
-        transport: ``"tcp"`` or ``"udp"``; by default that of each scenario.
-        dialect: name of the wire dialect; by default that of each scenario.
+        transport: ``"tcp"`` or ``"udp"``; by default the scenario's.
+        dialect: name of the wire dialect; by default the scenario's.
         quirks: fields of :class:`~smartcam.emulator.Quirks` that override those of each scenario.
         clock: clock of all cameras; by default real time.
 

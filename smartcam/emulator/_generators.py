@@ -75,9 +75,9 @@ def find_generator(name: str) -> Generator:
         ConfigurationError: no generator has this name; the text lists the known names.
         PluginError: a plug-in's generator failed to load, or is no function.
     """
-    found = _FOUND.get(name)
-    if found is not None:
-        return found
+    generator = _FOUND.get(name)
+    if generator is not None:
+        return generator
     if name not in GENERATORS:
         raise ConfigurationError(
             f"generator {name!r} is unknown; known are {', '.join(generator_names())}"
@@ -86,8 +86,8 @@ def find_generator(name: str) -> Generator:
     loaded = GENERATORS.load(name)
     if not callable(loaded):
         raise PluginError(f"generator {name!r}: {loaded!r} is no function", name=name)
-    found = _FOUND[name] = cast("Generator", loaded)
-    return found
+    generator = _FOUND[name] = cast("Generator", loaded)
+    return generator
 
 
 def generator_names() -> list[str]:
@@ -136,13 +136,13 @@ def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dic
 
 def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
     """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
-    found = {seen.name: seen for seen in run.scene.measure()}
-    wanted: Sequence[str] = run.parameters.get("pieces", list(found))
+    features = {seen.name: seen for seen in run.scene.measure()}
+    wanted: Sequence[str] = run.parameters.get("pieces", list(features))
     names = {field.name for field in run.layout.fields}
     records = [
-        {key: value for key, value in record(found[name]).items() if key in names}
+        {key: value for key, value in record(features[name]).items() if key in names}
         for name in wanted
-        if name in found
+        if name in features
     ]
     if run.layout.repeat is None:
         return records[0] if records else zeros(run.layout.fields)

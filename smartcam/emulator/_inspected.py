@@ -22,7 +22,7 @@ class InspectionOrder(NamedTuple):
     Attributes:
         application: id of the program to run.
         number: sequence number of the run.
-        input: input data of the trigger; empty if none was ever given.
+        input: input data of the trigger; empty if none was ever sent.
     """
 
     application: int
@@ -31,7 +31,7 @@ class InspectionOrder(NamedTuple):
 
 
 class Inspector(ABC):
-    """Takes a picture for a run of a camera, and inspects it.
+    """An object that takes and inspects a picture for a run of a camera.
 
     The camera calls it in the event loop's thread, for one run at a time.
     """
@@ -43,21 +43,21 @@ class Inspector(ABC):
         seen: Callable[[], None],
         done: Callable[[Values | None], None],
     ) -> None:
-        """Begin an inspection of the first picture that is exposed from now on.
+        """Begin an inspection of the next exposed picture.
 
         Args:
             order: the run.
-            seen: function that is called when the picture is there.
+            seen: function that is called when the picture was taken.
             done: function that is called with the values of the application's layout; None if the
                 inspection failed and there is no result.
 
-        Both are called in the event loop's thread, later and not from inside this call. After
-        :meth:`cancel` neither is called.
+        Both functions are called in the event loop's thread, after this call has returned, and not
+        after :meth:`cancel`.
         """
 
     @abstractmethod
     def cancel(self) -> None:
-        """Give up the running inspection; do nothing without one."""
+        """Abandon the running inspection, if there is one."""
 
 
 class InspectedApplication(Application):
@@ -72,7 +72,7 @@ class InspectedApplication(Application):
 
     @property
     def period(self) -> int | None:
-        """None: each run makes its own container."""
+        """No common container: each run makes its own."""
         return None
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Emulate cameras that use lines of text: the base for those of plug-ins, and for In-Sight's."""
+"""Emulate cameras that use lines of text: the base for cameras of plug-ins, and for In-Sight's."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ class LineClient:
     def answer_later(self) -> Self:
         """Return a client that answers the current line later; the next line is read now."""
         self._kept = True
-        kept = copy.copy(self)
+        copied = copy.copy(self)
         self._kept = False
         self.end_line()
-        return kept
+        return copied
 
     @property
     def is_closed(self) -> bool:
@@ -192,7 +192,7 @@ class LineCamera(WireCamera):
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
         self._spoken_to: dict[ClientLink, None] = {}  # links with lines to write
-        cues = [validated(Cue, one, f"cue {at}") for at, one in enumerate(timeline, start=1)]
+        cues = [validated(Cue, cue, f"cue {at}") for at, cue in enumerate(timeline, start=1)]
         self.lines: LineCodec = self.make_codec()
         super().__init__(
             spoken=self.lines,
@@ -229,7 +229,7 @@ class LineCamera(WireCamera):
         """Return a camera of a scenario; arguments win over the scenario's fields.
 
         Raises:
-            ConfigurationError: an argument is wrong, or not supported by such a camera.
+            ConfigurationError: an argument is wrong, or not supported by this kind of camera.
         """
         options = dict(plan.options)
         if plan.active is not None or plan.running:
@@ -409,7 +409,7 @@ class LineCamera(WireCamera):
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
             faults = self._provoke(self.queue.device_on_camera, message)
-            link.say(message)
+            link.send(message)
             self._spoken_to[link] = None
             self._act(faults, "after")
 

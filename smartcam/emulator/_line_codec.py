@@ -103,11 +103,11 @@ class LineCodec:
 
     def row_of(self, text: str) -> int:
         """Return the number of the row of a client's line, 0 for none."""
-        return next((number for number, one in self._forms if one.read(text) is not None), 0)
+        return next((number for number, form in self._forms if form.read(text) is not None), 0)
 
     def row_of_word(self, word: str) -> int:
         """Return the number of the row with a word, 0 for none."""
-        return next((number for number, one in enumerate(self._rows, 1) if one.word == word), 0)
+        return next((number for number, row in enumerate(self._rows, 1) if row.word == word), 0)
 
     def request_key(self, data: bytes) -> str:
         """Return the word or ticket of the answer to a line, "" if only the order shows it."""
@@ -179,15 +179,15 @@ class LineCodec:
             except (ValueError, LookupError):
                 pass
             else:
-                found = messages if isinstance(messages, tuple) else (messages,)
-                return next((one for one in found if type(one) is kind), found[0])
+                decoded = messages if isinstance(messages, tuple) else (messages,)
+                return next((message for message in decoded if type(message) is kind), decoded[0])
         return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
     def _request(self, kind: type[m.Message], number: int, text: str) -> m.Message:
         """Return a request with the fields that its line gives, or zeros."""
         if kind is LineCommand:
             return LineCommand(line=text)
-        form = next(one for row, one in self._forms if row == number)
+        form = next(form for row, form in self._forms if row == number)
         fields = form.read(text) or {}
         values: dict[str, Any] = {}
         for name, wire in m.wire_fields(kind):

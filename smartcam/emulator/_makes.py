@@ -74,10 +74,10 @@ def check_options(kind: type[WireCamera], given: Iterable[str]) -> None:
 def options_of(kind: type[WireCamera]) -> frozenset[str]:
     """Return the names of the options of a class of emulated cameras."""
     names: set[str] = set()
-    for one in kind.__mro__:
-        if one is WireCamera:
+    for class_ in kind.__mro__:
+        if class_ is WireCamera:
             break
-        if "__init__" in vars(one):
-            parameters = inspect.signature(vars(one)["__init__"]).parameters.values()
+        if "__init__" in vars(class_):
+            parameters = inspect.signature(vars(class_)["__init__"]).parameters.values()
             names.update(p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
     return frozenset(names - {"self"})

@@ -82,8 +82,8 @@ class Port:
 
     async def _resolve(self) -> tuple[int, Any]:
         loop = asyncio.get_running_loop()
-        found = await loop.getaddrinfo(self._host, self.number, type=self._listener.kind)
-        return found[0][0], found[0][4]
+        addresses = await loop.getaddrinfo(self._host, self.number, type=self._listener.kind)
+        return addresses[0][0], addresses[0][4]
 
     def _bind(self) -> socket.socket:
         family, address = self._address
@@ -102,7 +102,7 @@ class Port:
         return sock
 
     async def _reopen(self, before: asyncio.Task[None] | None) -> None:
-        if before is not None:  # it was cancelled, and has to release its socket
+        if before is not None:  # the start was cancelled, and has to release its socket
             await asyncio.wait({before})
         while True:
             try:

@@ -153,7 +153,7 @@ class TicketedCamera(LineCamera):
     are read meanwhile.
 
     Attributes:
-        also_hears: requests of other clients, beside those of the dialect.
+        also_hears: requests of other clients, beside the dialect's own.
         client_class: class of its clients.
     """
 

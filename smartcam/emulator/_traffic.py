@@ -1,4 +1,4 @@
-"""The emulator's log of frames on the wire, and waits for an entry to appear in it."""
+"""The emulator's log of frames on the wire, and waits for entries."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ MAX_BYTES = 1 << 25
 10,000 results of seven parts, or 120 of the largest containers, 64 kB."""
 
 MAX_IDS = 1000
-"""Largest number of unknown message ids that are counted; those of the dialect always are. Only a
-client that sends anything at all uses more."""
+"""Largest number of unknown message ids that are counted; ids of the dialect are always counted.
+Only a client that sends arbitrary ids uses more."""
 
 _ENTRY_BYTES = 400  # bytes of an entry with its message, without the payload
-_PER_BYTE = 4  # bytes for each of a payload: one in the message, three in hex
+_PER_BYTE = 4  # bytes per byte of payload: one in the message, three in hex
 
 MAX_VISITS = 1000
 """Largest number of ended connections whose record is kept; the oldest are dropped first."""
@@ -54,11 +54,11 @@ class LogEntry(NamedTuple):
         hex: the frame's payload, or the first bytes that make no frame.
         error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
-        fault: kinds of the faults that acted on it, in order; followed by ``connection ended`` or
-            ``not sent`` if it was lost for that reason. None without faults. The entry of a message
-            is made when it has passed, or is lost. A message of the camera is logged as meant, a
-            message of a client as received.
-        wire: the bytes that really passed, header included, as hex; empty for nothing. None: the
+        fault: kinds of the faults that acted on the frame, in order; followed by ``connection
+            ended`` or ``not sent`` if it was lost for that reason. None without faults. An entry is
+            made when the frame has passed or is lost. A frame of the camera is logged as it was
+            before the faults, a frame of a client as it was received.
+        wire: the bytes that were really transferred, with header, as hex; empty for none. None: the
             bytes of the frame.
     """
 
@@ -74,7 +74,7 @@ class LogEntry(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Text of a camera that uses lines; a client's line is without its end."""
+        """Text of a line, for a camera that uses lines; a client's line is without its end."""
         text = bytes.fromhex(self.hex).decode("latin-1")
         return text.rstrip("\r\n\0") if self.direction == "in" else text
 
@@ -104,8 +104,8 @@ _DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out
 class Log(Sequence[LogEntry]):
     """The last frames in both directions, oldest first; the oldest are dropped when it is full.
 
-    Entries are made when they are read: until then a frame is kept as it went over the wire. The
-    bounds do not depend on that.
+    Entries are made when they are read; until then the log keeps the bytes of a frame. The bounds
+    do not depend on this.
 
     Args:
         dialect: dialect in which frames are decoded.
@@ -127,10 +127,10 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # frames after those, not yet read
-        self._weights: deque[int] = deque()  # sizes of both, in the same order, bytes
-        self._size = 0  # sum of these, bytes
-        self._gone = 0  # number of entries removed before them
+        self._unread: deque[LogEntry | _Traced] = deque()  # later frames, not yet read
+        self._weights: deque[int] = deque()  # sizes of all entries in order, bytes
+        self._size = 0  # sum of the sizes, bytes
+        self._gone = 0  # number of entries removed so far
 
     def __repr__(self) -> str:
         return f"Log({list(self)!r})"
@@ -160,7 +160,7 @@ class Log(Sequence[LogEntry]):
         return self._size
 
     def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
-        """Add a frame that passed unchanged; as :meth:`append`."""
+        """Add a frame that was transferred unchanged, like :meth:`append`."""
         self._unread.append((time, peer, sender, frame, fault, None))
         weight = _ENTRY_BYTES + _PER_BYTE * len(frame[1])
         if fault is not None:
@@ -175,9 +175,9 @@ class Log(Sequence[LogEntry]):
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
             weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
-        else:  # its size once it is read
-            _, _, _, what, fault, wire = entry
-            size = len(what.payload if isinstance(what, Frame) else what)
+        else:  # size of the entry once it is read
+            _, _, _, message, fault, wire = entry
+            size = len(message.payload if isinstance(message, Frame) else message)
             weight = _ENTRY_BYTES + _PER_BYTE * size
             if fault is not None or wire is not None:
                 weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
@@ -232,15 +232,15 @@ class Log(Sequence[LogEntry]):
         self._size = self.pushed_out = 0
 
     def _forget_oldest(self) -> None:
-        """Remove the oldest entry from the account."""
+        """Subtract the size of the oldest entry."""
         self._gone += 1
         self._size -= self._weights.popleft()
 
     def _read(self) -> deque[LogEntry]:
         unread, entries = self._unread, self._entries
         while unread:
-            one = unread.popleft()
-            entries.append(one if isinstance(one, LogEntry) else self._entry(*one))
+            entry = unread.popleft()
+            entries.append(entry if isinstance(entry, LogEntry) else self._entry(*entry))
         return entries
 
     def _entry(
@@ -248,16 +248,16 @@ class Log(Sequence[LogEntry]):
         time: float,
         peer: str,
         sender: Sender,
-        what: Frame | bytes,
+        content: Frame | bytes,
         fault: str | None,
         wire: bytes | None,
     ) -> LogEntry:
         passed = None if wire is None else wire.hex(" ")
-        if isinstance(what, bytes):
-            message_id, message, payload = None, None, what
+        if isinstance(content, bytes):
+            message_id, message, payload = None, None, content
         else:
-            message_id, payload = what
-            message = _decode(self._dialect, sender, what)
+            message_id, payload = content
+            message = _decode(self._dialect, sender, content)
         direction, data = _DIRECTIONS[sender], payload.hex(" ")
         return LogEntry(time, direction, peer, message_id, message, data, None, fault, passed)
 
@@ -278,19 +278,19 @@ class TrafficLog:
         time: float,
         peer: str,
         sender: Sender,
-        what: Frame | bytes | RemoteProtocolError,
+        message: Frame | bytes | RemoteProtocolError,
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
         """Add a frame, bytes that make no frame, or the reason why they are ignored."""
-        if isinstance(what, RemoteProtocolError):
-            # only its text: the error keeps its traceback alive
-            data, error = what.data.hex(" "), str(what)
+        if isinstance(message, RemoteProtocolError):
+            # keep only the text, since the error keeps its traceback alive
+            data, error = message.data.hex(" "), str(message)
             self.entries.append(
                 LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
             )
         else:
-            self.entries.append((time, peer, sender, what, fault, wire))
+            self.entries.append((time, peer, sender, message, fault, wire))
 
     async def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0

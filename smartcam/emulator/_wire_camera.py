@@ -150,18 +150,18 @@ class WireCamera(Server):
         timeline: Sequence[Cue],
         applications: Container[int] = (),
     ) -> None:
-        who = "emulator"
-        host = check_text(host, "host", who, least=1, most=300)
-        port = check_port(port, who)
-        name = check_text(name, "name", who, most=200)
+        caller = "emulator"
+        host = check_text(host, "host", caller, least=1, most=300)
+        port = check_port(port, caller)
+        name = check_text(name, "name", caller, most=200)
         if clock is not None:
-            check_kind(clock, Clock, "clock", "a Clock", who)
+            check_kind(clock, Clock, "clock", "a Clock", caller)
         self.host: str = host
         self.transport: Literal["tcp", "udp"] = transport
         self.dialect: str = dialect
         self.name: str = name
         self.clock: Clock = clock if clock is not None else RealClock()
-        self.seed: int = check_seed(seed, who)
+        self.seed: int = check_seed(seed, caller)
         self.fault_kinds: frozenset[str] = kinds_of(device)
         self.codec: WireCodec = spoken
         self._cues = timeline
@@ -202,7 +202,7 @@ class WireCamera(Server):
         """Return a camera of a scenario; the other arguments override it.
 
         Raises:
-            ConfigurationError: an argument is wrong, or not supported by such a camera.
+            ConfigurationError: an argument is wrong, or not supported by this kind of camera.
         """
 
     @classmethod
@@ -355,7 +355,7 @@ class WireCamera(Server):
             what = check_integer(what, "what", 0, 0xFFFFFFFF, "wait_received")
         elif not issubclass(what, m.Message):
             raise wrong_argument("what", "a message's id or type", what, "wait_received")
-        count = check_integer(count, "count", 0, who="wait_received")
+        count = check_integer(count, "count", 0, caller="wait_received")
         timeout = check_seconds(timeout, "timeout", "wait_received")
         await self._traffic.wait_received(what, count=count, timeout=timeout)
 
@@ -411,7 +411,7 @@ class WireCamera(Server):
     # ------------------------------------------------------------------ faults
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
-        """Add faults after those that wait; faults that wait for no message happen now.
+        """Add faults after the waiting ones; faults that wait for no message happen now.
 
         Call it in the event loop's thread. Before the emulator's start they wait for it.
 
@@ -438,7 +438,7 @@ class WireCamera(Server):
         self._timeline.command(check_text(name, "name", "command", most=200))
 
     def clear_faults(self) -> None:
-        """Forget the faults that wait, and end those that last.
+        """Forget waiting faults, and end lasting ones.
 
         BUSY is cleared, the port opens, the second client leaves, connections that are half open or
         stalled are reset. Delayed messages come at their time, and a reboot takes its time.
@@ -476,7 +476,7 @@ class WireCamera(Server):
         self._act(self.queue.at_once(), None)
 
     def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
-        """Run the device faults that come before a message; return all that it triggers."""
+        """Run the device faults that come before a message; return all triggered faults."""
         if not waiting:
             return ()
         faults = self.queue.by_message(waiting, message)
@@ -516,17 +516,19 @@ class WireCamera(Server):
         by: Literal["client", "camera"] = "client" if by_client else "camera"
         self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
 
-    def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+    def traced(
+        self, link: ClientLink, sender: m.Sender, message: Frame | RemoteProtocolError
+    ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         traffic, now = self._traffic, self._step_at
         if now is None:
             now = self.clock.now
-        if isinstance(what, Frame):
-            traffic.entries.keep(now, link.peer, sender, what, link.input_faults)
+        if isinstance(message, Frame):
+            traffic.entries.keep(now, link.peer, sender, message, link.input_faults)
             if sender is _CLIENT:
-                traffic.count(what)
+                traffic.count(message)
         else:
-            traffic.add(now, link.peer, sender, what, link.input_faults)
+            traffic.add(now, link.peer, sender, message, link.input_faults)
         if self._shows:
             self._show_last()
 
@@ -539,11 +541,11 @@ class WireCamera(Server):
         self,
         peer: str,
         sender: m.Sender,
-        what: Frame | bytes,
+        message: Frame | bytes,
         fault: str | None,
         wire: bytes | None,
     ) -> None:
-        self._traffic.add(self.clock.now, peer, sender, what, fault, wire)
+        self._traffic.add(self.clock.now, peer, sender, message, fault, wire)
         if _log.isEnabledFor(logging.DEBUG):
             self._show_last()
 

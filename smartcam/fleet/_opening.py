@@ -99,7 +99,7 @@ def open(
     return Fleet(bus.end(), None, server.file.fleet, server, connect_timeout, options)
 
 
-SESSIONS_OWN = frozenset(
+SESSION_OPTIONS = frozenset(
     {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
 )
 """Options of the session with the camera, which are set in the agent's file."""
@@ -122,10 +122,10 @@ def fleet_camera(
             "smartcam.fleet.open() takes the fleet"
         )
     settings = CameraSettings.of(address.of(address.camera), options)
-    theirs = sorted(SESSIONS_OWN & options.keys())
-    if theirs:
+    refused = sorted(SESSION_OPTIONS & options.keys())
+    if refused:
         raise UnsupportedError(
-            f"{url}: {', '.join(theirs)}: these are options of the camera's session, which its "
+            f"{url}: {', '.join(refused)}: these are options of the camera's session, which its "
             "agent has: set them in fleet.yaml"
         )
     program = Program(_end(address), address.fleet, address.camera, called=address.program)

@@ -39,8 +39,8 @@ class FleetOutlets(Server):
 
     Args:
         server: server of the cameras; not started yet.
-        tell: function that is called with an outlet's name and its trouble, and with "" at the end
-            of the trouble.
+        report: function that is called with an outlet's name and its trouble, and with "" at the
+            end of the trouble.
 
     Attributes:
         outlets: the outlets.
@@ -50,7 +50,7 @@ class FleetOutlets(Server):
     """
 
     def __init__(
-        self, server: FleetServer, tell: Callable[[str, str], None] = lambda _name, _why: None
+        self, server: FleetServer, report: Callable[[str, str], None] = lambda _name, _why: None
     ) -> None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
             from smartcam.outlets import Outlets
@@ -64,7 +64,7 @@ class FleetOutlets(Server):
             server.folder,
             columns=self._columns,
             command=self._command,
-            on_trouble=tell,
+            on_trouble=report,
             cameras=self._cameras,
             names=self._names,
         )
@@ -98,7 +98,7 @@ class FleetOutlets(Server):
             await program.close()
         await self.outlets.stop()
 
-    async def stored(self, asked: StoredRequest) -> dict[str, dict[str, Any]]:
+    async def stored(self, request: StoredRequest) -> dict[str, dict[str, Any]]:
         """Return the answers of the stores, by the outlet's name.
 
         Raises:
@@ -106,10 +106,10 @@ class FleetOutlets(Server):
 
         Cancellation: its thread finishes its work.
         """
-        since = None if asked.since is None else datetime.fromisoformat(asked.since)
-        question = self._question(since, asked.failed, asked.camera, asked.most)
+        since = None if request.since is None else datetime.fromisoformat(request.since)
+        question = self._question(since, request.failed, request.camera, request.most)
         answers = await asyncio.to_thread(self.outlets.stored, question)
-        return {name: {"rows": one.rows, **one.summary} for name, one in answers.items()}
+        return {name: {"rows": answer.rows, **answer.summary} for name, answer in answers.items()}
 
     def reading(self, camera: str) -> Interpretation | None:
         """Return the interpretation of a camera's results; None for a camera that is not known."""
@@ -127,7 +127,7 @@ class FleetOutlets(Server):
                 spec = host.settings.interpret_as
             elif seeing:  # waiting entries of an earlier run may be requested first
                 made = software_camera(camera, entry.software or {}, self._server.folder)
-                spec = {number: one.interpret_as for number, one in made.programs.items()}
+                spec = {number: program.interpret_as for number, program in made.programs.items()}
             read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
             known = self._readings[camera] = of, read
         return known[1]
@@ -139,7 +139,7 @@ class FleetOutlets(Server):
 
     def _cameras(self) -> dict[str, bool | None]:
         plan = self._server.reloads.now.plan
-        return {name: one.entry.emulated is not None for name, one in plan.items()}
+        return {name: planned.entry.emulated is not None for name, planned in plan.items()}
 
     def _names(self, camera: str) -> Mapping[str, int]:
         host = self._server.hosts.get(camera)

@@ -45,7 +45,7 @@ class _SeenCamera(FleetCamera[Any]):
     Its calibration applies only to applications whose results are localizations.
     """
 
-    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+    def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         return super()._interpretation(spec)
 
     async def switch_application(
@@ -175,11 +175,11 @@ class RosFleet(Server):
             full = node_names([*self._of.keys() - {name}, name])[name]
         except ValueError as exc:
             raise SmartCamError(str(exc)) from exc
-        namespace, _, own = full.rpartition("/")
+        namespace, _, node_name = full.rpartition("/")
         above = self._section.namespace.rstrip("/")
         if isinstance(self.context, RosContext):
-            return Node(own, namespace=f"{above}/{namespace}", context=self.context)
-        return NativeNode(own, namespace=f"{above}/{namespace}", context=self.context)
+            return Node(node_name, namespace=f"{above}/{namespace}", context=self.context)
+        return NativeNode(node_name, namespace=f"{above}/{namespace}", context=self.context)
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
         options = self._camera_options.get(name, RosCamera.model_validate({}))
@@ -200,7 +200,7 @@ class RosFleet(Server):
     @property
     def names(self) -> list[str]:
         """The full names of the nodes."""
-        return sorted(one.node.full_name for one in self.nodes.values())
+        return sorted(node.node.full_name for node in self.nodes.values())
 
     async def stop(self) -> None:
         """Close all nodes. Idempotent, bounded."""

@@ -86,19 +86,19 @@ class FrameAddress:
         Raises:
             ConfigurationError: a parameter is unknown, or given twice.
         """
-        found: dict[str, str] = {}
+        parameters: dict[str, str] = {}
         for name, value in parse_qsl(self.query if part is None else part, keep_blank_values=True):
             if name not in known:
                 raise ConfigurationError(
                     f"frame source {self.shown!r}: unknown parameter {name!r}; known are "
                     f"{', '.join(known)}{did_you_mean(name, known)}"
                 )
-            if name in found:
+            if name in parameters:
                 raise ConfigurationError(
                     f"frame source {self.shown!r}: parameter {name!r} is given twice"
                 )
-            found[name] = value
-        return found
+            parameters[name] = value
+        return parameters
 
     def size(self, text: str) -> tuple[int, int]:
         """Parse ``WIDTHxHEIGHT``.
@@ -106,10 +106,10 @@ class FrameAddress:
         Raises:
             ConfigurationError: the text has another form.
         """
-        found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
-        if found is None:
+        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
+        if match is None:
             raise self.wrong("size", "WIDTHxHEIGHT, such as 640x480", text)
-        return int(found[1]), int(found[2])
+        return int(match[1]), int(match[2])
 
     def number(self, name: str, text: str, least: float, most: float) -> float:
         """Return a parameter's number.
@@ -125,10 +125,10 @@ class FrameAddress:
             raise self.wrong(name, f"a number from {least:g} to {most:g}", text)
         return value
 
-    def wrong(self, name: str, expected: str, got: str) -> ConfigurationError:
+    def wrong(self, name: str, expected: str, actual: str) -> ConfigurationError:
         """Return the error for a wrong parameter."""
         return ConfigurationError(
-            f"frame source {self.shown!r}: {name}: expected {expected}, got {got!r}"
+            f"frame source {self.shown!r}: {name}: expected {expected}, got {actual!r}"
         )
 
 

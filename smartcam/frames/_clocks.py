@@ -138,4 +138,4 @@ def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:
 
 def _lowest(points: list[tuple[float, float]], slope: float) -> tuple[float, float]:
     """Return the lowest point relative to a line of the given slope."""
-    return min(points, key=lambda one: one[1] - slope * one[0])
+    return min(points, key=lambda point: point[1] - slope * point[0])

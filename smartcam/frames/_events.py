@@ -72,14 +72,14 @@ class FrameEvents:
     ) -> None:
         if not 0 < len(names) <= MAX_EVENT_NAMES:
             raise wrong_argument("names", f"1 to {MAX_EVENT_NAMES} names", names, "events")
-        self._names = tuple(check_text(one, "name", "events", most=200) for one in names)
+        self._names = tuple(check_text(name, "name", "events", most=200) for name in names)
         self._timeout = check_seconds_or_none(timeout, "timeout", "events")
         size = check_integer(size, "size", 1, MAX_QUEUED_EVENTS, "events")
         self._source = source
         self._queue: collections.deque[FrameEvent] = collections.deque()
         self._size = size
         self._lost = 0
-        self._came = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._end: Callable[[], Coroutine[Any, Any, None]] | None = None
         self._over: tuple[FrameSourceError | None] | None = None
 
@@ -122,8 +122,8 @@ class FrameEvents:
                 while not self._queue:
                     if self._over is not None:
                         raise self._over[0] or StopAsyncIteration
-                    self._came.clear()
-                    await self._came.wait()
+                    self._arrived.clear()
+                    await self._arrived.wait()
         except FrameSourceError:
             raise
         except TimeoutError as exc:
@@ -141,8 +141,8 @@ class FrameEvents:
             self._queue.popleft()
             self._lost += 1
         self._queue.append(event)
-        self._came.set()
+        self._arrived.set()
 
     def _ended(self, error: FrameSourceError | None) -> None:
         self._over = self._over or (error,)
-        self._came.set()
+        self._arrived.set()

@@ -133,7 +133,7 @@ class DeviceFeatures(ABC):
 
 def spelled(name: str) -> str:
     """Return a name's letters and digits, which are equal for all spellings of the name."""
-    return "".join(one for one in name.lower() if one.isalnum())
+    return "".join(character for character in name.lower() if character.isalnum())
 
 
 class FrameFeatures:
@@ -220,8 +220,10 @@ class FrameFeatures:
         Cancellation: the device may have executed it.
         """
         given = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
-        found = {spelled(name): name for name in await self.names(timeout=timeout)}
-        name = found.get("usersetdefault", found.get("usersetdefaultselector", "UserSetDefault"))
+        features = {spelled(name): name for name in await self.names(timeout=timeout)}
+        name = features.get(
+            "usersetdefault", features.get("usersetdefaultselector", "UserSetDefault")
+        )
         await self[name].set(given, timeout=timeout)
 
     async def _with_set(self, user_set: str, command: str, timeout: float) -> None:
@@ -324,8 +326,8 @@ def checked_value(value: object) -> FeatureValue:
 
 
 @contextlib.asynccontextmanager
-async def _within(timeout: object, what: str) -> AsyncIterator[None]:
-    """Limit the time of a block; raise FrameTimeoutError that names ``what`` was awaited."""
+async def _within(timeout: object, label: str) -> AsyncIterator[None]:
+    """Limit the time of a block; raise FrameTimeoutError that names ``label`` was awaited."""
     seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
     try:
         async with asyncio.timeout(seconds):
@@ -333,4 +335,4 @@ async def _within(timeout: object, what: str) -> AsyncIterator[None]:
     except FrameSourceError:
         raise
     except TimeoutError as exc:
-        raise FrameTimeoutError(f"expected {what} within {seconds:g} s, got no answer") from exc
+        raise FrameTimeoutError(f"expected {label} within {seconds:g} s, got no answer") from exc

@@ -102,7 +102,7 @@ class Frame:
 
     def __reduce__(self) -> tuple[Callable[[], Frame], tuple[()]]:
         """Return a function that makes a copy with its own bytes, also in another process."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
         return partial(type(self), **(values | {"data": bytes(self.data)})), ()
 
     @property
@@ -159,7 +159,7 @@ class Frame:
 
 _data: Final = JoinedOnUse(vars(Frame)["data"])
 setattr(Frame, "data", _data)  # noqa: B010 - type checkers use the field
-_NAMES: Final = tuple(one.name for one in fields(Frame))
+_NAMES: Final = tuple(attribute.name for attribute in fields(Frame))
 _OTHERS: Final = tuple(name for name in _NAMES if name != "data")
 _values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_OTHERS)
 _setters: Final = tuple(getattr(Frame, name).__set__ for name in _OTHERS)

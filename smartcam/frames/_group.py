@@ -104,7 +104,7 @@ class FrameGroup:
         timeout: float | None = FRAME_TIMEOUT,
     ) -> None:
         check_kind(sources, Mapping, "group of frame sources", "a mapping from name to source")
-        if not sources or len({id(one) for one in sources.values()}) < len(sources):
+        if not sources or len({id(source) for source in sources.values()}) < len(sources):
             raise ConfigurationError(
                 f"group of frame sources: expected one or more, each once, got {list(sources)}"
             )
@@ -113,13 +113,13 @@ class FrameGroup:
         self._sources = dict(sources)
         self._readers: dict[str, _GroupReader] = {}
         self._open = False
-        self._kept: dict[str, collections.deque[Frame]] = {
+        self._queues: dict[str, collections.deque[Frame]] = {
             name: collections.deque() for name in sources
         }
         self._alone = dict.fromkeys(sources, 0)
         self._next: FrameSet | None = None
         self._over: tuple[FrameSourceError | None] | None = None
-        self._came = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._offered = self._delivered = self._skipped = 0
         self._skew = 0.0
 
@@ -138,7 +138,7 @@ class FrameGroup:
         """
         if self._within is not None:
             return self._within
-        rates = [rate for one in self._sources.values() for rate in one.format.rates[:1]]
+        rates = [rate for source in self._sources.values() for rate in source.format.rates[:1]]
         return 0.5 * (1 / max(rates) if rates else UNKNOWN_PERIOD)
 
     def statistics(self) -> GroupStatistics:
@@ -164,8 +164,8 @@ class FrameGroup:
         try:
             await asyncio.gather(*opening)
         except BaseException:
-            for one in opening:
-                one.cancel()
+            for task in opening:
+                task.cancel()
             await asyncio.wait(opening)
             await self._close_all()
             raise
@@ -207,8 +207,8 @@ class FrameGroup:
         try:
             async with asyncio.timeout(self._timeout):
                 while self._next is None and self._over is None:
-                    self._came.clear()
-                    await self._came.wait()
+                    self._arrived.clear()
+                    await self._arrived.wait()
         except TimeoutError:
             raise FrameTimeoutError(self._silence(), source=", ".join(self._sources)) from None
         if self._next is not None:
@@ -229,51 +229,53 @@ class FrameGroup:
             }
 
     def _silence(self) -> str:
-        came = ", ".join(
+        counts = ", ".join(
             f"{name} {reader.statistics().offered}" for name, reader in self._readers.items()
         )
         return (
             f"frames of {' and '.join(self._sources)}: expected a set within "
             f"{self.within * 1e3:.3g} ms of each other in {self._timeout:g} s, got none; frames "
-            f"that came in all: {came}"
+            f"that came in all: {counts}"
         )
 
     def _take(self, name: str, frame: Frame) -> None:
         """Add a camera's frame, and deliver a set if it is complete."""
-        kept = self._kept[name]
-        kept.append(frame)
-        if len(kept) > MAX_WAITING_FRAMES:
-            kept.popleft()
+        queue = self._queues[name]
+        queue.append(frame)
+        if len(queue) > MAX_WAITING_FRAMES:
+            queue.popleft()
             self._alone[name] += 1
-        found = {name: frame}
-        for other, waiting in self._kept.items():
+        frames = {name: frame}
+        for other, waiting in self._queues.items():
             if other != name:
                 if not waiting:
                     return
-                found[other] = min(waiting, key=lambda one: abs(one.captured - frame.captured))
-        moments = [one.captured for one in found.values()]
+                frames[other] = min(
+                    waiting, key=lambda candidate: abs(candidate.captured - frame.captured)
+                )
+        moments = [member.captured for member in frames.values()]
         skew = max(moments) - min(moments)
         if skew > self.within:
             return
-        for other, one in found.items():
-            self._drop_until(other, one)
+        for other, member in frames.items():
+            self._drop_until(other, member)
         self._offered += 1
         self._skew = max(self._skew, skew)
         if self._next is not None:
             self._skipped += 1
-        self._next = FrameSet({key: found[key] for key in self._sources}, skew)
-        self._came.set()
+        self._next = FrameSet({key: frames[key] for key in self._sources}, skew)
+        self._arrived.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
         """Drop a frame that is in a set, and earlier frames, which cannot be in a set any more."""
-        kept = self._kept[name]
-        while kept.popleft() is not frame:
+        queue = self._queues[name]
+        while queue.popleft() is not frame:
             self._alone[name] += 1
 
     def _end(self, error: FrameSourceError | None) -> None:
         if self._over is None:
             self._over = (error,)
-        self._came.set()
+        self._arrived.set()
 
 
 class _GroupReader(FrameReader):

@@ -31,7 +31,7 @@ OWN_PARAMETERS = ("fps", "name", "timeout")
 class InSightDriver(FrameDriver):
     """A source that polls the last picture of a smart camera: ``insight://admin@HOST?fps=2``.
 
-    Further parameters are those of the camera's URL in :func:`smartcam.connect`. The session with
+    Further parameters are as in the camera's URL in :func:`smartcam.connect`. The session with
     the camera exists only while there are readers.
 
     - ``fps``: requests per second; by default 2.
@@ -48,17 +48,17 @@ class InSightDriver(FrameDriver):
         super().__init__(address)
         parts = urlsplit(address.url)
         given = parse_qsl(parts.query, keep_blank_values=True)
-        own = urlencode([one for one in given if one[0] in OWN_PARAMETERS])
-        query = urlencode([one for one in given if one[0] not in OWN_PARAMETERS])
-        mine = address.parameters(OWN_PARAMETERS, own)
-        self._rate = address.number("fps", mine.get("fps", "2"), 0.001, 100)
-        self._timeout = address.number("timeout", mine.get("timeout", "10"), 0.05, 600)
+        own_query = urlencode([field for field in given if field[0] in OWN_PARAMETERS])
+        query = urlencode([field for field in given if field[0] not in OWN_PARAMETERS])
+        own_parameters = address.parameters(OWN_PARAMETERS, own_query)
+        self._rate = address.number("fps", own_parameters.get("fps", "2"), 0.001, 100)
+        self._timeout = address.number("timeout", own_parameters.get("timeout", "10"), 0.05, 600)
         self._settings = CameraSettings.make(
             urlunsplit(parts._replace(query=query)),
             None,
             {"connect_timeout": self._timeout, "reconnect": None},
         )
-        self._name = mine.get("name") or self._settings.name
+        self._name = own_parameters.get("name") or self._settings.name
         self._camera: SmartCamera[Any] | None = None
         self._task: asyncio.Task[None] | None = None
         self._number = 0
@@ -144,13 +144,13 @@ class InSightDriver(FrameDriver):
         due, asked_before, last = loop.time(), -math.inf, b""
         try:
             while True:
-                asked = time.monotonic()
+                asked_at = time.monotonic()
                 data = await self._read()
                 if data != last:
                     pixels = await asyncio.to_thread(self._pixels, data)
                     sink.frame(self._frame(pixels, asked_before))
                     last = data
-                asked_before = asked
+                asked_before = asked_at
                 due = max(due + 1 / self._rate, loop.time())
                 await asyncio.sleep(due - loop.time())
         except FrameSourceError as error:

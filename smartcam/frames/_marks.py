@@ -1,4 +1,4 @@
-"""Marks on a picture: what a tool saw there, for people."""
+"""Marks on a picture, which show people what a tool found."""
 
 from __future__ import annotations
 

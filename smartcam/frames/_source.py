@@ -62,7 +62,7 @@ class SourceStatistics:
 
     Attributes:
         streaming: whether the device streams now.
-        readers: number of present readers.
+        readers: number of current readers.
         started: number of starts of the device's stream.
         frames: number of received frames, with or without a reader.
         lost: number of frames lost in the camera or on the way.
@@ -118,7 +118,7 @@ class FrameSource(FrameSink):
         self._took = asyncio.Event()  # set when a reader takes a frame or is closed
         self._held_up = False  # whether the driver waits for readers
         self._streaming = False
-        # error that the driver ended with, in a tuple
+        # error with which the driver ended, in a tuple
         self._over: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
@@ -244,7 +244,9 @@ class FrameSource(FrameSink):
             return
         self._task = None
         if task.cancelled() or task.exception() is not None:
-            self._tell(FrameSourceError(f"{self.name}: its task was cancelled", source=self.name))
+            self._end_readers(
+                FrameSourceError(f"{self.name}: its task was cancelled", source=self.name)
+            )
         elif self._readers:
             self._begin(self._loop)
 
@@ -376,9 +378,9 @@ class FrameSource(FrameSink):
             OvertriggeredError: the device reports that it missed the trigger.
             FrameLostError: the picture was certainly or possibly lost on the way.
             TriggerTimeoutError: no picture came within ``timeout``.
-            FrameSourceError: the device does not stream, or is gone.
+            FrameSourceError: the device does not stream, or was lost.
 
-        Cancellation: the source goes on; a late picture goes only to readers.
+        Cancellation: the source continues; a late picture is passed only to readers.
         """
         seconds = check_seconds(timeout, "timeout", "trigger", above=True)
         check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
@@ -386,9 +388,9 @@ class FrameSource(FrameSink):
             check_callable(fire, "fire", "trigger")
         if self._loop is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`, then trigger")
-        return self._seen(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
+        return self._with_lens(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
 
-    def _seen(self, frame: Frame) -> Frame:
+    def _with_lens(self, frame: Frame) -> Frame:
         """Return a frame with the source's lens added."""
         if self._camera_info is None or frame.camera_info is not None:
             return frame
@@ -411,7 +413,7 @@ class FrameSource(FrameSink):
     # called by the driver
 
     def trigger_failed(self, error: SmartCamError) -> None:
-        """Fail the pending trigger, whose picture will not come."""
+        """Fail the pending trigger, whose picture was lost."""
         self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:
@@ -419,11 +421,11 @@ class FrameSource(FrameSink):
         if frame.lost:
             self.lost(frame.lost)
         self._last_came = asyncio.get_running_loop().time()
-        frame = self._seen(self._timed(frame, time.monotonic()))
+        frame = self._with_lens(self._timed(frame, time.monotonic()))
         self._frames += 1
         self._newest = frame
         if frame.trigger is not None:
-            self._triggers.came(frame)
+            self._triggers.on_frame(frame)
         for reader in self._alive():
             reader._offer(frame)  # noqa: SLF001 - its own reader
 
@@ -460,7 +462,7 @@ class FrameSource(FrameSink):
             reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
-        """Record that no more frames come."""
+        """Record that there will be no more frames."""
         self._over = (error,)
         self._changed.set()
 
@@ -476,10 +478,10 @@ class FrameSource(FrameSink):
             self._last_came = asyncio.get_running_loop().time()
 
     def _alive(self) -> list[FrameReader]:
-        return [reader for one in self._readers if (reader := one()) is not None]
+        return [reader for reference in self._readers if (reader := reference()) is not None]
 
-    def _dropped(self, one: weakref.ref[FrameReader]) -> None:
-        self._readers.discard(one)
+    def _dropped(self, reference: weakref.ref[FrameReader]) -> None:
+        self._readers.discard(reference)
         if not self._readers and self._loop is not None:
             self._idle_since = self._loop.time()
         self._changed.set()
@@ -494,14 +496,14 @@ class FrameSource(FrameSink):
             try:
                 await self._stream()
             except FrameSourceError as error:
-                self._tell(error)
+                self._end_readers(error)
             except asyncio.CancelledError:
                 raise
             except ENDS_PROGRAM:
                 raise
             except BaseException as error:  # noqa: BLE001 - a driver may be a plug-in
                 _log.exception("%s: its driver failed", self.name)
-                self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
+                self._end_readers(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
     async def _stream(self) -> None:
         """Stream until there are no readers, or the device ends."""
@@ -524,10 +526,10 @@ class FrameSource(FrameSink):
             await self._driver.stop()
         over, self._over = self._over, None
         if over is not None:
-            self._tell(over[0])
+            self._end_readers(over[0])
 
     async def _while_read(self) -> None:
-        """Wait until the driver ends or is stuck, or the linger after the last reader is over."""
+        """Wait until the driver ends or is stuck, or the linger has passed."""
         while self._over is None and not self._again:
             if not self._readers:
                 left = self._idle_since + self._linger - asyncio.get_running_loop().time()
@@ -565,7 +567,7 @@ class FrameSource(FrameSink):
             self._changed.clear()
             await self._changed.wait()
 
-    def _tell(self, error: FrameSourceError | None) -> None:
+    def _end_readers(self, error: FrameSourceError | None) -> None:
         """End all readers; a later reader starts the device again."""
         if error is not None:
             self._triggers.failed(error)

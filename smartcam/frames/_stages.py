@@ -88,7 +88,7 @@ class Rectifier:
     ) -> None:
         cv2 = load("cv2")
         self._names, self._size = (left, right), tuple(size)
-        self._maps = tuple(cv2.convertMaps(one, None, cv2.CV_16SC2) for one in rectification.maps)
+        self._maps = tuple(cv2.convertMaps(map_, None, cv2.CV_16SC2) for map_ in rectification.maps)
 
     def __call__(self, pair: FrameSet, *, colour: bool = False) -> tuple[NDArray[Any], ...]:
         """Return both rectified pictures, the left one first; pixels without a source are 0.

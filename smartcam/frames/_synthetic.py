@@ -127,10 +127,10 @@ _FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes | memoryview]]] = 
 
 
 def _format(address: FrameAddress, name: str) -> PixelFormat:
-    found = find_format(name)
-    if found.name not in _FORMATS:
+    pixel_format = find_format(name)
+    if pixel_format.name not in _FORMATS:
         raise address.wrong("format", f"one of {', '.join(_FORMATS)}", name)
-    return found
+    return pixel_format
 
 
 def stripes(width: int, height: int) -> NDArray[np.uint8]:
@@ -173,6 +173,7 @@ def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
         return None
     weights = [1 << place for place in range(STAMP_BITS)]
     number, nanoseconds = (
-        sum(weight for weight, one in zip(weights, row, strict=True) if one) for row in bits[0::2]
+        sum(weight for weight, square in zip(weights, row, strict=True) if square)
+        for row in bits[0::2]
     )
     return number, nanoseconds

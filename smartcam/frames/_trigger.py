@@ -86,11 +86,11 @@ class TriggerQueue:
                     self._number += 1
                     pending.number = self._number
                     doing.append("triggering")
-                    return await self._one(pending, fire)
+                    return await self._trigger_once(pending, fire)
         except FrameSourceError:
             raise
         except TimeoutError as exc:
-            notes = "".join(f"; {one}" for one in pending.notes[:MAX_NOTES])
+            notes = "".join(f"; {note}" for note in pending.notes[:MAX_NOTES])
             waits = self._source.driver.waits_for
             raise TriggerTimeoutError(
                 f"{name}: no picture of the trigger within {seconds:g} s, which ran out while "
@@ -98,7 +98,7 @@ class TriggerQueue:
                 waited=seconds,
             ) from exc
 
-    async def _one(
+    async def _trigger_once(
         self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
     ) -> Frame:
         driver = self._source.driver
@@ -107,17 +107,17 @@ class TriggerQueue:
             try:
                 await driver.trigger(pending, fire)
             except FrameSourceError:
-                if not _came(pending):  # only the answer to the trigger was lost
+                if not _has_arrived(pending):  # only the answer to the trigger was lost
                     raise
             return await pending.outcome
         finally:
             self._pending = None
             driver.disarm()
-            self.settled = self.settled and (pending.fired is None or _came(pending))
+            self.settled = self.settled and (pending.fired is None or _has_arrived(pending))
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
                 pending.outcome.exception()  # mark the error as retrieved
 
-    def came(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         """Pass the frame of the pending trigger to its caller."""
         pending = self._pending
         if (
@@ -134,6 +134,6 @@ class TriggerQueue:
             self._pending.outcome.set_exception(error)
 
 
-def _came(pending: AwaitedTrigger) -> bool:
+def _has_arrived(pending: AwaitedTrigger) -> bool:
     outcome = pending.outcome
     return outcome.done() and not outcome.cancelled() and outcome.exception() is None

@@ -96,8 +96,8 @@ class NotWritableError(ValueError):
 
 def _behind_blanks(data: bytes, at: int) -> int:
     """Return the place of the first byte, from a place on, that is no blank or line end."""
-    found = _BLANK_RUN.match(data, at)
-    return found.end() if found else at
+    blanks = _BLANK_RUN.match(data, at)
+    return blanks.end() if blanks else at
 
 
 class RequestReader:
@@ -112,7 +112,7 @@ class RequestReader:
 
     def __init__(self, form: str) -> None:
         self._xml = form == "xml"
-        self._rest = b""
+        self._unread = b""
 
     def feed(self, data: bytes) -> list[RobotRequest]:
         """Add received bytes; return the requests that are complete now.
@@ -120,17 +120,17 @@ class RequestReader:
         Raises:
             NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
-        data, found = self._rest + data, []
+        data, lines = self._unread + data, []
         at = _behind_blanks(data, 0)
         while (end := self._end(data, at)) > 0 and end - at <= MAX_LINE_BYTES:
             line = data[at:end].strip(_BLANKS)
             if line:
-                found.append(self._read(line))
+                lines.append(self._read(line))
             at = _behind_blanks(data, end)
-        self._rest = data[at:].lstrip(_BLANKS)
-        if len(self._rest) > MAX_LINE_BYTES:
+        self._unread = data[at:].lstrip(_BLANKS)
+        if len(self._unread) > MAX_LINE_BYTES:
             raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
-        return found
+        return lines
 
     def _end(self, data: bytes, at: int) -> int:
         """Return the place after the request that begins at ``at``; 0 if it is incomplete."""
@@ -139,8 +139,8 @@ class RequestReader:
             mark = _LINE_END.search(data, at)
             return mark.end() if mark else 0
         closing = b"</" + begin[1] + b">"
-        found = data.find(closing, at)
-        return 0 if found < 0 else found + len(closing)
+        end = data.find(closing, at)
+        return 0 if end < 0 else end + len(closing)
 
     def _read(self, line: bytes) -> RobotRequest:
         given = line.decode("ascii", "backslashreplace")[:40]
@@ -180,7 +180,7 @@ class AnswerWriter:
             NotWritableError: the answer has no room for the values.
         """
         style = self._style
-        values = [self._value(one) for one in answer.values]
+        values = [self._value(value) for value in answer.values]
         line = getattr(self, f"_{style.form}")(answer, values, tag)
         data: bytes = line.encode("ascii", "replace")
         end = style.line_end.encode()
@@ -190,7 +190,10 @@ class AnswerWriter:
 
     def _value(self, value: float | str) -> str:
         if isinstance(value, str):
-            return "".join(" " if one == self._style.separator else one for one in plain(value))
+            return "".join(
+                " " if character == self._style.separator else character
+                for character in plain(value)
+            )
         if not abs(value) < MAX_NUMBER:
             raise NotWritableError(f"{value} is no number that a controller reads")
         if isinstance(value, int):
@@ -199,7 +202,7 @@ class AnswerWriter:
 
     def _text(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
         style = self._style
-        head = [str(one) for one in (tag, int(answer.code), answer.left) if one is not None]
+        head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
         line = style.separator.join([*head, *values])
         room = style.longest - len(style.line_end)
         if len(line) > room:
@@ -212,7 +215,7 @@ class AnswerWriter:
         if answer.words and not answer.code.is_error:
             return plain(answer.words)[: self._style.longest]  # the reason that WHY asked for
         filled = values + ["0"] * (len(self.names) - len(values))
-        head = [str(one) for one in (tag, int(answer.code), answer.left) if one is not None]
+        head = [str(item) for item in (tag, int(answer.code), answer.left) if item is not None]
         if len(head) + len(filled) > MAX_BRACKETED_NUMBERS:
             raise NotWritableError(
                 f"a part has {len(head) + len(filled)} numbers, {MAX_BRACKETED_NUMBERS} are read"
@@ -240,4 +243,4 @@ class AnswerWriter:
 
 def plain(words: str) -> str:
     """Return a text on one line, of printable characters."""
-    return " ".join("".join(one if one.isprintable() else " " for one in words).split())
+    return " ".join("".join(word if word.isprintable() else " " for word in words).split())

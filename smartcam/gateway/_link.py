@@ -1,4 +1,4 @@
-"""A robot's connection, whose requests are answered one by one."""
+"""A robot's connection, on which one request is answered after the other."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from smartcam.gateway._requests import GatewayCamera
 
 MAX_WAITING_REQUESTS: Final = 8
-"""Largest number of requests with a number that wait while another one is being answered."""
+"""Largest number of numbered requests that wait while another one is being answered."""
 
 MAX_UNSENT_BYTES: Final = 1 << 16
-"""Largest number of bytes that a robot which reads nothing may leave unsent."""
+"""Largest number of unsent bytes for a robot that does not read."""
 
 _KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
 """Seconds without a byte until the system checks the connection, and the repetitions."""
@@ -38,8 +38,8 @@ class RobotLink(asyncio.Protocol):
         acceptor: acceptor that gives the connection its place.
 
     Attributes:
-        settled: whether the robot has asked for a part: then it keeps its place. A robot that has
-            not asked makes room for a newcomer.
+        settled: whether the robot has asked for a part. Then it keeps its place; otherwise it may
+            lose the place to a newcomer.
     """
 
     _transport: asyncio.Transport
@@ -61,7 +61,7 @@ class RobotLink(asyncio.Protocol):
     # ------------------------------------------------------------------ from the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take a place, or report that there is none."""
+        """Take a place, or report that all are taken."""
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
@@ -94,11 +94,11 @@ class RobotLink(asyncio.Protocol):
                 self._take(request)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End the open requests; parts that no robot asked for are forgotten."""
+        """End the open requests, and forget parts that were not requested."""
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
     def turn_away(self, why: str) -> None:
-        """End the link at once, for another connection."""
+        """End the link at once, to make room for another connection."""
         self._close(why, abort=True)
 
     # ------------------------------------------------------------------ requests
@@ -112,7 +112,7 @@ class RobotLink(asyncio.Protocol):
             self._account.open += 1
             self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
         elif request.tag is None:
-            # the robot has given up waiting, and would take the earlier answer for this request's
+            # the robot no longer waits for the earlier answer, and would take it for this request's
             self._account.abandoned += 1
             self._close("a request without a number came before the answer to the one before")
         elif len(self._waiting) >= MAX_WAITING_REQUESTS:
@@ -124,7 +124,7 @@ class RobotLink(asyncio.Protocol):
             self._waiting.append((request, deadline))
 
     async def _serve(self, request: RobotRequest, deadline: float) -> None:
-        """Answer a request, and the requests that came meanwhile."""
+        """Answer a request, and the requests that arrive while it is answered."""
         while True:
             answer = await self._robot.answer(request, deadline)
             self._account.open -= 1
@@ -156,7 +156,9 @@ class RobotLink(asyncio.Protocol):
     def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            self._account.abandoned += 1  # the robot would take another request's answer for its
+            self._account.abandoned += (
+                1  # without an answer, the robot would take the next one for it
+            )
             return
         self._account.errors += 1
         self._write(answer, tag)

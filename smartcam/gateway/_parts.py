@@ -56,8 +56,8 @@ class Parts:
         """
         if type(value).__module__ == "numpy":
             value = _records_of(value)
-        one = isinstance(value, (Localization, Mapping)) or hasattr(value, "_asdict")
-        items = [value] if one else value
+        single = isinstance(value, (Localization, Mapping)) or hasattr(value, "_asdict")
+        items = [value] if single else value
         if not isinstance(items, Sequence) or isinstance(items, (str, bytes, bytearray)):
             raise InterpretationError(
                 f"the result is {type(value).__name__}, which has no parts: expected localizations "
@@ -90,8 +90,8 @@ class Parts:
             np.array(part.pose.position, dtype=np.float64),
         )
         numbers = pose_to(self._style.pose, pose)
-        position = [self._lengths * one / self._convention.metre for one in numbers[:3]]
-        turned = [one * self._angle_factor for one in numbers[3:]]
+        position = [self._lengths * number / self._convention.metre for number in numbers[:3]]
+        turned = [number * self._angle_factor for number in numbers[3:]]
         return [*position, *turned, *(getattr(part, name) for name in self._settings.also)]
 
     @property
@@ -99,8 +99,8 @@ class Parts:
         """Factor for the convention's own angles; 1 for quaternions."""
         if "q1" in self._convention.numbers:
             return 1.0
-        own = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
-        return self._angles / own
+        factor = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
+        return self._angles / factor
 
     def _scaled(self, value: object, field: Field | None) -> float | str:
         quantity = UNITS[field.unit].quantity if field is not None and field.unit else ""
@@ -114,13 +114,13 @@ def _layouts(spec: object) -> dict[int | None, Layout]:
     """Return the layouts in ``interpret_as``, by application; None: for any application."""
     if spec is None:
         return {}
-    one = spec if isinstance(spec, Mapping) else {None: spec}
-    found: dict[int | None, Layout] = {}
-    for application, each in cast("Mapping[int | None, Any]", one).items():
+    by_kind = spec if isinstance(spec, Mapping) else {None: spec}
+    layouts: dict[int | None, Layout] = {}
+    for application, each in cast("Mapping[int | None, Any]", by_kind).items():
         interpreter = resolve(each)
         if isinstance(interpreter, Interpreter) and interpreter.layout is not None:
-            found[application] = interpreter.layout
-    return found
+            layouts[application] = interpreter.layout
+    return layouts
 
 
 def _records_of(table: Any) -> object:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.gateway._settings import GatewaySettings
     from smartcam.models import Result
 
-GRACE: Final = 0.2
+CANCEL_GRACE: Final = 0.2
 """Seconds after the deadline after which a call that has not ended by itself is cancelled."""
 
 ASKING_FOR_PARTS = ("TRIGGER", "NEXT", "WAIT")
@@ -96,14 +96,14 @@ class RobotRequests:
         self._rows: list[Row] | None = None  # rows of the last result; None without one
         self._until = 0.0  # loop time until which the rows may be asked for
         self._last = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._given = False  # the answer being written has the first row
+        self._has_given = False  # the answer being written has the first row
 
     # ------------------------------------------------------------------ a request
 
     async def answer(self, request: RobotRequest, deadline: float) -> RobotAnswer:
-        """Return the answer to a request, no later than :data:`GRACE` after the deadline."""
+        """Return the answer to a request, no later than :data:`CANCEL_GRACE` after the deadline."""
         try:
-            async with asyncio.timeout_at(deadline + GRACE):
+            async with asyncio.timeout_at(deadline + CANCEL_GRACE):
                 answer = await self._answer(request, deadline)
         except (SmartCamError, TimeoutError) as exc:
             code = next((code for kind, code in CODES if isinstance(exc, kind)), AnswerCode.FAULT)
@@ -164,26 +164,26 @@ class RobotRequests:
             return RobotAnswer(AnswerCode.NO_RESULT, words=f"the result is older than {age:g} s")
         if not self._rows:
             return RobotAnswer(AnswerCode.NONE)
-        self._given = True
+        self._has_given = True
         return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
 
     def sent(self) -> None:
         """Count the part of the last answer as delivered; called when it was written."""
-        if self._given and self._rows:
+        if self._has_given and self._rows:
             del self._rows[0]
             self._shared.account.waiting -= 1
             self._shared.account.delivered += 1
-        self._given = False
+        self._has_given = False
 
     def failed(self, words: str) -> RobotAnswer:
-        """Return the answer that replaces one that cannot be written; the result is forgotten."""
+        """Return the answer instead of one that cannot be written; the result is forgotten."""
         self.forget()
         self._last = RobotAnswer(AnswerCode.UNREADABLE, words=words)
         return self._last
 
     def forget(self) -> None:
         """Forget the last result: a newer one is asked for, or the robot has disconnected."""
-        rows, self._rows, self._given = self._rows or [], None, False
+        rows, self._rows, self._has_given = self._rows or [], None, False
         self._shared.account.waiting -= len(rows)
         self._shared.account.forgotten += len(rows)
 

@@ -71,8 +71,8 @@ STYLES: Mapping[str, Style] = {
 
 
 def _listen(text: str) -> str:
-    found = _LISTEN.fullmatch(text)
-    if found is None or int(found[2]) > 0xFFFF:
+    match = _LISTEN.fullmatch(text)
+    if match is None or int(match[2]) > 0xFFFF:
         raise ValueError(f"expected tcp/HOST:PORT such as {DEFAULT_LISTEN}, got {text!r:.80}")
     return text
 
@@ -89,7 +89,7 @@ Seconds = Annotated[float, Field(gt=0, le=MAX_SECONDS, allow_inf_nan=False)]
 
 
 class GatewaySettings(BaseModel):
-    """The settings of a gateway; options without a value are those of the robot's make."""
+    """The settings of a gateway; options without a value get the values of the robot's make."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True)
 
@@ -152,9 +152,9 @@ class GatewaySettings(BaseModel):
         given = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.pose is not None:
             metre = ROBOTS[self.pose].metre
-            own = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
-            own["angle"] = "rad" if self.pose == "ur" else "deg"
-            given = {**own, **given}
+            defaults = {"length": "m" if metre == 1.0 else "mm", "angle": "rad"}
+            defaults["angle"] = "rad" if self.pose == "ur" else "deg"
+            given = {**defaults, **given}
         if self.line_end is not None:
             given["line_end"] = LINE_ENDS[self.line_end]
         if self.width:
@@ -208,8 +208,8 @@ class GatewayFile(GatewaySettings):
     def settings(self, **changes: Any) -> GatewaySettings:
         """Return the settings of the gateway alone, with changes."""
         names = GatewaySettings.model_fields
-        mine = {name: getattr(self, name) for name in names if name in self.model_fields_set}
-        return GatewaySettings.model_validate({**mine, **changes})
+        chosen = {name: getattr(self, name) for name in names if name in self.model_fields_set}
+        return GatewaySettings.model_validate({**chosen, **changes})
 
 
 def _mistake(file: GatewayFile) -> tuple[Sequence[int | str], str] | None:

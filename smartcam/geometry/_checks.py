@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def check_choice(value: object, among: Sequence[str], what: str) -> None:
+def check_choice(value: object, among: Sequence[str], label: str) -> None:
     """Raise SHAPE if an option is not in the list of known ones."""
     word = plain(value)  # a user's class may hash and compare in any way
     if not isinstance(word, str) or word not in among:
         known = list(among)
-        text = f"{what}: expected one of {known}, got {shown(value)}"
+        text = f"{label}: expected one of {known}, got {shown(value)}"
         raise Code.SHAPE.refusal(text, known, value)
 
 
 def check_size(values: Any, called: str) -> None:
     """Raise SHAPE unless a value is an image's width and height, pixels."""
-    whole = (int, np.integer)
+    integers = (int, np.integer)
     plain = isinstance(values, tuple | list) and len(values) == 2
-    if not plain or not all(isinstance(one, whole) and one > 0 for one in values):
+    if not plain or not all(isinstance(value, integers) and value > 0 for value in values):
         expected = f"{called}: size: expected width and height in pixels"
         raise Code.SHAPE.unexpected(expected, "(width, height)", values)

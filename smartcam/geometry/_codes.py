@@ -60,7 +60,7 @@ class Code(enum.StrEnum):
     WRONG_FRAME = "WRONG_FRAME"
     """A pose is given in another frame than the calibration's."""
     PLANE_MOVED = "PLANE_MOVED"
-    """The camera moved in a way that moves the plane it sees."""
+    """The camera's motion changed the plane in its view."""
     INSUFFICIENT_ROTATION = "INSUFFICIENT_ROTATION"
     """The poses are turned too little against each other."""
     POSES_TOO_SIMILAR = "POSES_TOO_SIMILAR"
@@ -84,7 +84,7 @@ class Code(enum.StrEnum):
     WRONG_SIZE = "WRONG_SIZE"
     """An image of another size than the camera's, or than the other images."""
     DIFFERENT_TARGETS = "DIFFERENT_TARGETS"
-    """Views of several targets where those of one are expected."""
+    """Views of several targets instead of a single one."""
     BAD_VIEW = "BAD_VIEW"
     """A view that fits far worse than the others and is left out."""
     SWAPPED_SIDES = "SWAPPED_SIDES"
@@ -157,10 +157,10 @@ class Code(enum.StrEnum):
     ) -> CalibrationError:
         """Return an error; ``text`` names the expected value, and ``got`` is appended."""
         try:
-            came = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
+            described = f"{got!s:.{MAX_VALUE_CHARACTERS}}"
         except Exception:  # noqa: BLE001 - a foreign class may raise any
-            came = shown(got)
-        return self.refusal(f"{text}, got {came}", expected, got)
+            described = shown(got)
+        return self.refusal(f"{text}, got {described}", expected, got)
 
     def remark(self, text: str) -> Remark:
         """Return a remark with this code."""

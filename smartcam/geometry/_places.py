@@ -1,4 +1,4 @@
-"""Patterns of places in rows, columns and layers, such as those of parts on a pallet."""
+"""Patterns of places in rows, columns and layers, such as the places of parts on a pallet."""
 
 from __future__ import annotations
 
@@ -58,17 +58,19 @@ class PlacePattern(Sequence[Transform]):
 
     def __post_init__(self) -> None:
         """Check the counts, and the pitch along each direction with more than one place."""
-        who = "PlacePattern"
-        as_motion(self.frame, f"{who}: frame", "robot", "place")
+        caller = "PlacePattern"
+        as_motion(self.frame, f"{caller}: frame", "robot", "place")
         for name in ("rows", "columns", "layers"):
-            count = check_integer(getattr(self, name), name, 1, MAX_PLACES, who)
+            count = check_integer(getattr(self, name), name, 1, MAX_PLACES, caller)
             object.__setattr__(self, name, count)
         if not isinstance(self.pitch, tuple | list) or len(self.pitch) != 3:
-            raise wrong_argument("pitch", "distances of columns, rows and layers", self.pitch, who)
+            raise wrong_argument(
+                "pitch", "distances of columns, rows and layers", self.pitch, caller
+            )
         counts = (self.columns, self.rows, self.layers)
         pitch = [
-            check_number(plain(one), "pitch", 0, 1e3, who, above=count > 1)
-            for one, count in zip(self.pitch, counts, strict=True)
+            check_number(plain(step), "pitch", 0, 1e3, caller, above=count > 1)
+            for step, count in zip(self.pitch, counts, strict=True)
         ]
         object.__setattr__(self, "pitch", tuple(pitch))
 
@@ -104,10 +106,10 @@ class PlacePattern(Sequence[Transform]):
             CalibrationError: ``SHAPE``, ``NOT_FINITE``; ``NOT_RIGID``: the three points nearly
                 coincide, or lie on one line.
         """
-        who = "PlacePattern.from_touches"
-        rows = check_integer(rows, "rows", 2, MAX_PLACES, who)
-        columns = check_integer(columns, "columns", 2, MAX_PLACES, who)
-        target = check_text(robot_frame, "robot_frame", who)
+        caller = "PlacePattern.from_touches"
+        rows = check_integer(rows, "rows", 2, MAX_PLACES, caller)
+        columns = check_integer(columns, "columns", 2, MAX_PLACES, caller)
+        target = check_text(robot_frame, "robot_frame", caller)
         corner = as_vector(first, 3, "first")
         along = as_vector(row_end, 3, "row_end") - corner
         across = as_vector(column_end, 3, "column_end") - corner
@@ -116,7 +118,7 @@ class PlacePattern(Sequence[Transform]):
         sine = float(np.linalg.norm(normal)) / max(lengths[0] * lengths[1], 1e-300)
         if not sine >= MIN_SINE:
             raise Code.NOT_RIGID.refusal(
-                f"{who}: expected a row and a column at 30 degrees or more to each other, got "
+                f"{caller}: expected a row and a column at 30 degrees or more to each other, got "
                 f"{math.degrees(math.asin(min(sine, 1.0))):.3g} degrees",
                 MIN_SINE,
                 sine,
@@ -140,9 +142,9 @@ class PlacePattern(Sequence[Transform]):
     @overload
     def __getitem__(self, index: slice) -> list[Transform]: ...
     def __getitem__(self, index: int | slice) -> Transform | list[Transform]:
-        """Return the pose of a place by its number, from 0, or those of several."""
+        """Return the pose of a place by its number, from 0, or the poses of several places."""
         if isinstance(index, slice):
-            return [self._place(one) for one in range(len(self))[index]]
+            return [self._place(number) for number in range(len(self))[index]]
         return self._place(range(len(self))[index])
 
     def at(self, number: int) -> tuple[int, int, int]:

@@ -5,7 +5,7 @@ their exponential and logarithm are those of SciPy's ``Rotation``.
 
 A small step ``(w, d)`` is a rotation vector and a shift. The shift is always added to ``t``, along
 the axes of the target frame. The turn is on either side of R: ``exp([w]x) R`` turns about the
-target frame's axes, ``R exp([w]x)`` about those of the source frame.
+target frame's axes, ``R exp([w]x)`` about the source frame's axes.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Rigid(NamedTuple):
     def stacked(cls, motions: Iterable[Rigid]) -> Rigid:
         """Return single motions as one array."""
         rows = list(motions)
-        rotations = np.array([one.rotation for one in rows], dtype=np.float64)
-        translations = np.array([one.translation for one in rows], dtype=np.float64)
+        rotations = np.array([row.rotation for row in rows], dtype=np.float64)
+        translations = np.array([row.translation for row in rows], dtype=np.float64)
         return cls(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3))
 
     @property

@@ -1,7 +1,8 @@
 """Rotations, frames and lines in space, over arrays.
 
 Right-handed, metres, radians. Quaternions are Hamilton's of unit length with the real part last,
-arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of b into those of a.
+arrays of shape (..., 4) in the order x, y, z, w. ``R_a_b`` turns coordinates of b into coordinates
+of a.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ MAX_COORDINATE = 1e100
 """Largest accepted coordinate; a product of three such coordinates is still finite."""
 
 
-def as_points(values: ArrayLike, columns: int, what: str) -> Array:
+def as_points(values: ArrayLike, columns: int, label: str) -> Array:
     """Return ``values`` as float64 of shape (N, ``columns``); raise SHAPE or NOT_FINITE.
 
-    ``what`` names the points in the text.
+    ``label`` names the points in the text.
     """
     try:
         if np.iscomplexobj(values):
@@ -41,49 +42,49 @@ def as_points(values: ArrayLike, columns: int, what: str) -> Array:
         points = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.refusal(
-            f"{what}: expected numbers of shape (N, {columns}): {exc!s:.200}", f"(N, {columns})"
+            f"{label}: expected numbers of shape (N, {columns}): {exc!s:.200}", f"(N, {columns})"
         ) from exc
     if points.ndim != 2 or points.shape[1] != columns:
         raise Code.SHAPE.unexpected(
-            f"{what}: expected shape (N, {columns})", f"(N, {columns})", points.shape
+            f"{label}: expected shape (N, {columns})", f"(N, {columns})", points.shape
         )
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))
         raise Code.NOT_FINITE.refusal(
-            f"{what}: expected finite numbers, got {points[row].tolist()} in row {row}",
+            f"{label}: expected finite numbers, got {points[row].tolist()} in row {row}",
             "finite numbers",
             points[row].tolist(),
         )
     if points.size and not np.abs(points).max() <= MAX_COORDINATE:
         raise Code.NOT_FINITE.refusal(
-            f"{what}: expected numbers up to {MAX_COORDINATE:g}, got {np.abs(points).max():g}",
+            f"{label}: expected numbers up to {MAX_COORDINATE:g}, got {np.abs(points).max():g}",
             MAX_COORDINATE,
             float(np.abs(points).max()),
         )
     return points
 
 
-def as_vector(values: ArrayLike, length: int, what: str) -> Array:
+def as_vector(values: ArrayLike, length: int, label: str) -> Array:
     """Return ``values`` as float64 of shape (``length``,); raise SHAPE or NOT_FINITE."""
-    one: Any = [values]
-    vector: Array = as_points(one, length, what)[0]
+    listed: Any = [values]
+    vector: Array = as_points(listed, length, label)[0]
     return vector
 
 
-def check_finite(values: Array, what: str) -> None:
-    """Raise NOT_FINITE if a calibration's result is not finite; ``what`` names the result."""
+def check_finite(values: Array, label: str) -> None:
+    """Raise NOT_FINITE if a calibration's result is not finite; ``label`` names the result."""
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-        raise not_finite(what, np.atleast_1d(values[row]).tolist())
+        raise not_finite(label, np.atleast_1d(values[row]).tolist())
 
 
-def not_finite(what: str, got: object) -> CalibrationError:
+def not_finite(label: str, actual: object) -> CalibrationError:
     """Return the error for a calibration's result that is not finite."""
     return Code.NOT_FINITE.refusal(
-        f"{what}: expected finite numbers, the calibration gives {got}: it is damaged, or this is "
-        "far outside of what it was made for",
+        f"{label}: expected finite numbers, the calibration gives {actual}: it is damaged, or this "
+        "is far outside of what it was made for",
         "finite numbers",
-        got,
+        actual,
     )
 
 

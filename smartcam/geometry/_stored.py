@@ -79,8 +79,8 @@ class AsList:
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         items = handler.generate_schema(get_args(kind)[0])
-        found = core_schema.list_schema(items, min_length=self.least)
-        return _made_of(found, read=lambda found, _: tuple(found), write=list)
+        schema = core_schema.list_schema(items, min_length=self.least)
+        return _made_of(schema, read=lambda fields, _: tuple(fields), write=list)
 
 
 class AsMapping:
@@ -94,7 +94,7 @@ class AsMapping:
         }
         return _made_of(
             core_schema.typed_dict_schema(fields, extra_behavior="forbid"),
-            read=lambda found, _: kind(**found),
+            read=lambda fields, _: kind(**fields),
             write=lambda value: value._asdict(),
         )
 
@@ -104,7 +104,7 @@ def _made_of(
 ) -> CoreSchema:
     """Return the schema of values that are made of parts with forms of their own."""
     return core_schema.with_info_after_validator_function(
-        lambda found, info: read(found, info.context),
+        lambda fields, info: read(fields, info.context),
         parts,
         serialization=core_schema.wrap_serializer_function_ser_schema(
             lambda value, plain: plain(write(value)), schema=parts
@@ -147,13 +147,13 @@ class Stored:
             CalibrationError: SHAPE: the data have another structure; NOT_FINITE or NOT_RIGID:
                 numbers that are not possible.
         """
-        found: Self = _checked(cls, data, cls._called, **known)
-        return found
+        value: Self = _checked(cls, data, cls._called, **known)
+        return value
 
     @classmethod
     def __get_pydantic_core_schema__(cls, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         hints = get_type_hints(cls, include_extras=True)
-        attributes = [one.name for one in dataclasses.fields(kind)]
+        attributes = [field.name for field in dataclasses.fields(kind)]
         names: dict[str, str] = {cls._keys.get(name, name): name for name in attributes}
         names.pop("", None)
         types = {key: hint for key, (hint, _) in cls._others.items()}
@@ -165,28 +165,28 @@ class Stored:
                 schema = core_schema.with_info_after_validator_function(_share(key), schema)
             return core_schema.typed_dict_field(schema, required=key not in cls._later)
 
-        def write(one: Stored) -> dict[str, Any]:
-            others = {key: value(one) for key, (_, value) in cls._others.items()}
-            return others | {key: getattr(one, name) for key, name in names.items()}
+        def write(instance: Stored) -> dict[str, Any]:
+            others = {key: value(instance) for key, (_, value) in cls._others.items()}
+            return others | {key: getattr(instance, name) for key, name in names.items()}
 
-        def read(found: dict[str, Any], context: Context) -> Stored:
-            return cls._read({names.get(key, key): one for key, one in found.items()}, context)
+        def read(fields: dict[str, Any], context: Context) -> Stored:
+            return cls._read({names.get(key, key): field for key, field in fields.items()}, context)
 
         fields = {key: field(key) for key in types}
         parts = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
         return _made_of(parts, read, write)
 
     @classmethod
-    def _read(cls, found: dict[str, Any], context: Context) -> Self:
+    def _read(cls, fields: dict[str, Any], context: Context) -> Self:
         """Return an object made of the values found for its fields and ``_others``.
 
         Raises SHAPE: the fields do not fit together.
         """
-        made = cls(**{name: value for name, value in found.items() if name not in cls._others})
-        made._check(found, context["called"])
+        made = cls(**{name: value for name, value in fields.items() if name not in cls._others})
+        made._check(fields, context["called"])
         return made
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         """Raise if fields do not fit together, or do not fit the values of ``_others``."""
 
 
@@ -215,16 +215,16 @@ def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
         raise refused(called, f"{where}: {first['msg']}", first["input"]) from exc
 
 
-def refused(called: str, text: str, got: object) -> CalibrationError:
+def refused(called: str, text: str, actual: object) -> CalibrationError:
     """Return the error for stored data that are not valid."""
-    return Code.SHAPE.refusal(f"stored {called}: {text}", got=got)
+    return Code.SHAPE.refusal(f"stored {called}: {text}", got=actual)
 
 
-def check_counts(found: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
+def check_counts(fields: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
     """Raise SHAPE if a field does not have ``count`` items."""
     for name in names:
-        if len(found[name]) != count:
-            raise refused(called, f"{name}: expected {count}", len(found[name]))
+        if len(fields[name]) != count:
+            raise refused(called, f"{name}: expected {count}", len(fields[name]))
 
 
 def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
@@ -301,7 +301,9 @@ def _lists(values: Array) -> Any:
     """Return an array as nested lists, None for NaN."""
     if not np.isnan(values).any():
         return values.tolist()
-    return [_lists(one) for one in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
+    return (
+        [_lists(value) for value in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
+    )
 
 
 Vector2 = Annotated[Array, Form(Pair, as_array, _tolist)]
@@ -351,7 +353,7 @@ def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
     """Return the form of a transform without the names of its frames, which ``frames`` gives."""
     return Form(
         Annotated[_Motion, AsMapping()],
-        read=lambda found, context: Transform(*frames(context), *found),
+        read=lambda fields, context: Transform(*frames(context), *fields),
         write=motion_to_data,
     )
 

@@ -85,14 +85,14 @@ class Transform:
                 (rotation.shape, translation.shape),
             )
         with np.errstate(all="ignore"):
-            off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
             turn = float(np.linalg.det(rotation))
-        far = not np.abs(translation).max() <= MAX_COORDINATE
-        if not (off < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or far:
+        too_far = not np.abs(translation).max() <= MAX_COORDINATE
+        if not (error < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or too_far:
             mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
             raise Code.NOT_RIGID.refusal(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
-                f"determinant {turn:.6g}{mirror}, off by {off:.3g}, and {translation.tolist()}",
+                f"determinant {turn:.6g}{mirror}, off by {error:.3g}, and {translation.tolist()}",
                 "a rotation, determinant 1",
                 turn,
             )
@@ -250,39 +250,39 @@ class Transform:
         return Transform(self.target, self.source, self.rotation @ step, translation, at)
 
 
-def _numbers(values: ArrayLike, what: str) -> Array:
+def _numbers(values: ArrayLike, label: str) -> Array:
     """Return a copy as float64; raise NOT_RIGID if it holds no numbers."""
     try:
         if np.iscomplexobj(values):
             raise TypeError("got complex numbers")
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.NOT_RIGID.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.NOT_RIGID.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
 
 
-def _rows(values: ArrayLike, count: int, what: str) -> Array:
+def _rows(values: ArrayLike, count: int, label: str) -> Array:
     """Return numbers (..., ``count``), NaN included; raise SHAPE."""
     try:
         if np.iscomplexobj(values):
             raise TypeError("got complex numbers")
         rows = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
-        raise Code.SHAPE.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+        raise Code.SHAPE.refusal(f"{label}: expected numbers: {exc!s:.200}", "numbers") from exc
     if rows.shape[-1:] != (count,):
         raise Code.SHAPE.unexpected(
-            f"{what}: expected shape (..., {count})", f"(..., {count})", rows.shape
+            f"{label}: expected shape (..., {count})", f"(..., {count})", rows.shape
         )
     return rows
 
 
-def as_motion(value: object, what: str, target: str, source: str) -> Transform:
+def as_motion(value: object, label: str, target: str, source: str) -> Transform:
     """Return the value if it is a :class:`Transform`, else raise an error of the code SHAPE."""
     if isinstance(value, Transform):
         return value
     shape = np.shape(value) if isinstance(value, np.ndarray) else ()
     kind = "None" if value is None else type(value).__name__
     raise Code.SHAPE.refusal(
-        f"{what}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
+        f"{label}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
         f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
         "Transform",
         kind,

@@ -155,11 +155,11 @@ class CellCamera:
         Raises:
             ConfigurationError: there is no such application.
         """
-        application = check_application_or_name(application, who="program")
+        application = check_application_or_name(application, caller="program")
         for number, program in self.programs.items():
             if application in (number, str(number), program.name):
                 return program
-        known = [f"{number} ({one.name})" for number, one in self.programs.items()]
+        known = [f"{number} ({program.name})" for number, program in self.programs.items()]
         raise ConfigurationError(
             f"{self.name}: no application {application!r:.60}; there are {', '.join(known)}"
         )

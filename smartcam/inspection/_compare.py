@@ -147,8 +147,8 @@ class Compare(Tool[CompareSettings]):
         steep = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
         over = cv2.absdiff(taught, seen) - EDGE_TOLERANCE_PX * steep
         differs = (over >= level) & covered
-        kept, allowed = self._large(differs), self.settings.allowed
-        differing = int(kept[:, cv2.CC_STAT_AREA].sum())
+        large, allowed = self._large(differs), self.settings.allowed
+        differing = int(large[:, cv2.CC_STAT_AREA].sum())
         unknown = int(self._large(hidden & ~differs)[:, cv2.CC_STAT_AREA].sum())
         ok = differing + unknown <= allowed
         reason = f"{differing} pixels differ, allowed {allowed}"
@@ -162,14 +162,14 @@ class Compare(Tool[CompareSettings]):
             reason="" if ok else reason,
             values={
                 "differing": differing,
-                "count": min(len(kept), 0xFFFF),
+                "count": min(len(large), 0xFFFF),
                 **self._moved(motion),
             },
             drawings=[
                 Drawing(
                     "polygon", tuple((float(x), float(y)) for x, y in view.region.corners), "region"
                 ),
-                *(self._drawn(one, motion, view) for one in kept[:MAX_DRAWN_DIFFERENCES]),
+                *(self._drawn(label, motion, view) for label in large[:MAX_DRAWN_DIFFERENCES]),
             ],
         )
 
@@ -184,7 +184,7 @@ class Compare(Tool[CompareSettings]):
         """Return the upright region in the size of the taught picture."""
         width, height = self._size
         if not view.follows:
-            x, y = (round(one) for one in self._corner)
+            x, y = (round(coordinate) for coordinate in self._corner)
             return view.picture.grey[y : y + height, x : x + width]
         cv2 = load("cv2", "inspection needs")
         corners = self._to_picture(np.array([(0, 0), (1, 0), (0, 1)], float), view)
@@ -218,7 +218,7 @@ class Compare(Tool[CompareSettings]):
         fine = motion.copy()
         try:
             cv2.findTransformECC(self._taught, patch, fine, cv2.MOTION_EUCLIDEAN, end, None, 5)
-        except cv2.error:  # it did not converge
+        except cv2.error:  # the registration did not converge
             return motion
         turn = abs(math.atan2(fine[1, 0], fine[0, 0]))
         middle = np.array(self._size) / 2
@@ -278,11 +278,11 @@ def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, f
     in bad light.
     """
     step = max(taught.size // MAX_LIGHT_PIXELS, 1) | 1  # an odd step samples all columns
-    x, y = (one.ravel()[::step].astype(np.float64) for one in (taught, seen))
-    kept = np.ones(x.shape, bool)
+    x, y = (light.ravel()[::step].astype(np.float64) for light in (taught, seen))
+    chosen = np.ones(x.shape, bool)
     gain, offset = 1.0, 0.0
     for _ in range(LIGHT_FIT_ROUNDS):
-        a, b = x[kept], y[kept]
+        a, b = x[chosen], y[chosen]
         da, db = a - a.mean(), b - b.mean()
         both, one, other = float(da @ db), float(da @ da), float(db @ db)
         alike = both > MIN_LIGHT_CORRELATION * math.sqrt(one * other) and one > len(a)
@@ -290,6 +290,6 @@ def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, f
             return 1.0, 0.0
         gain = min(max(both / one, 1 / MAX_GAIN), MAX_GAIN)
         offset = float(np.median(b - gain * a))
-        rest = np.abs(y - gain * x - offset)
-        kept = rest <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(rest)), 3.0)
+        residuals = np.abs(y - gain * x - offset)
+        chosen = residuals <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(residuals)), 3.0)
     return gain, offset

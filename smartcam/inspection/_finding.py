@@ -73,7 +73,7 @@ class Inspection:
     @property
     def drawings(self) -> tuple[Drawing, ...]:
         """The marks of all tools, and the verdict as a text in the upper left corner."""
-        marks = [mark for found in self.findings.values() for mark in found.drawings]
+        marks = [mark for finding in self.findings.values() for mark in finding.drawings]
         verdict = "ok" if self.ok else f"not ok: {self.reason}"
         place = (0.0, 22.0 * stroke_width(*self.picture.size))
         role: Literal["found", "wrong"] = "found" if self.ok else "wrong"

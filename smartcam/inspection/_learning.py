@@ -78,44 +78,50 @@ def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspectio
         tools: settings of the tools by their keys.
         good: inspections of good pictures by these tools, with the pictures' names as keys.
     """
-    found = {key: dict(given) for key, given in tools.items()}
+    learned_tools = {key: dict(given) for key, given in tools.items()}
     remarks = []
-    for key, settings in found.items():
+    for key, settings in learned_tools.items():
         kind, name = split_name(key)
         if kind not in _LEARNERS:
             remarks.append(f"{key}: a tool of this kind has no tolerance to learn.")
             continue
-        seen = {one: had.findings[name] for one, had in good.items() if name in had.findings}
-        asked = {one: had for one, had in seen.items() if had.values or had.records or had.details}
-        left_out = {one: had.reason for one, had in seen.items() if one not in asked}
-        changes, remark = _LEARNERS[kind](asked, settings) if asked else _NOTHING
+        seen = {
+            picture: had.findings[name] for picture, had in good.items() if name in had.findings
+        }
+        measured = {
+            picture: had
+            for picture, had in seen.items()
+            if had.values or had.records or had.details
+        }
+        left_out = {picture: had.reason for picture, had in seen.items() if picture not in measured}
+        changes, remark = _LEARNERS[kind](measured, settings) if measured else _NOTHING
         settings.update(changes)
         remarks.append(f"{key}: {remark}{_left_out(left_out)}")
-    return Lesson(found, remarks)
+    return Lesson(learned_tools, remarks)
 
 
 def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     findings = [*seen.values()]
-    counts = [int(one.values.get("count", 0)) for one in findings]
-    found: dict[str, Any] = {"count": [min(counts), max(counts)]}
+    counts = [int(finding.values.get("count", 0)) for finding in findings]
+    tolerances: dict[str, Any] = {"count": [min(counts), max(counts)]}
     many = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
     remark = f"{many} spots in {_pictures(len(seen))}"
-    each = [one.records or (one.values,) for one in findings]
+    each = [finding.records or (finding.values,) for finding in findings]
     areas = [float(record["area"]) for records in each for record in records if record.get("area")]
     if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
         least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
-        found["area"] = [max(1, math.floor(least)), math.ceil(most)]
+        tolerances["area"] = [max(1, math.floor(least)), math.ceil(most)]
         remark += (
             f", of {min(areas):.0f} to {max(areas):.0f} pixels; area allows {AREA_MARGIN:.0%} less "
             "and more"
         )
     elif any(counts):  # the area of spots outside of the result is unknown
         remark += "; area stays as it is, since `most` leaves some of them out of the result"
-    return _Learned(found, f"{remark}.")
+    return _Learned(tolerances, f"{remark}.")
 
 
 def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
-    most = max(int(one.values.get("differing", 0)) for one in seen.values())
+    most = max(int(finding.values.get("differing", 0)) for finding in seen.values())
     allowed = math.ceil(DIFFERENCE_MARGIN * most)
     remark = f"at most {most} pixels differ in {_pictures(len(seen))}; {allowed} are allowed."
     return _Learned({"allowed": allowed}, remark)
@@ -123,10 +129,10 @@ def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
 
 def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     texts = {
-        str(one["text"])
-        for found in seen.values()
-        for one in (found.records or (found.values,))
-        if one.get("text")
+        str(values["text"])
+        for finding in seen.values()
+        for values in (finding.records or (finding.values,))
+        if values.get("text")
     }
     if len(texts) != 1:
         return _Learned({}, f"{len(texts)} texts in {_pictures(len(seen))}: expect stays as it is.")
@@ -139,24 +145,28 @@ def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
 
 def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
     """Return the tolerance of measured values, in the form and unit of the old tolerance."""
-    measured = {name: one.details for name, one in seen.items() if _is_number(one.details)}
+    measured = {
+        name: picture.details for name, picture in seen.items() if _is_number(picture.details)
+    }
     left_out = {
-        name: one.reason.partition(":")[0] for name, one in seen.items() if name not in measured
+        name: picture.reason.partition(":")[0]
+        for name, picture in seen.items()
+        if name not in measured
     }
     before = settings.get("tolerance")
     old = Tolerance.parse(before) if isinstance(before, str) else None
-    unit, factor = _unit(old, next((one.unit for one in measured.values()), "px"))
-    values = np.array([one.value for one in measured.values()]) / factor
-    sigmas = np.array([one.sigma for one in measured.values()]) / factor
+    unit, factor = _unit(old, next((measurement.unit for measurement in measured.values()), "px"))
+    values = np.array([measurement.value for measurement in measured.values()]) / factor
+    sigmas = np.array([measurement.sigma for measurement in measured.values()]) / factor
     if unit == "deg":
         values = _unwrapped(values)
-    far = _outliers(values, sigmas)
+    outlying = _outliers(values, sigmas)
     names = np.array([*measured], dtype=object)
     left_out |= {
         name: f"{value:.6g} {unit} is far from the others"
-        for name, value in zip(names[far], values[far], strict=True)
+        for name, value in zip(names[outlying], values[outlying], strict=True)
     }
-    values, sigmas = values[~far], sigmas[~far]
+    values, sigmas = values[~outlying], sigmas[~outlying]
     if len(values) < MIN_VALUES:
         return _Learned(
             {},
@@ -191,10 +201,10 @@ def _unwrapped(values: Array) -> Array:
     """Return directions in degrees without jumps of 360."""
     if not len(values):
         return values
-    turns = np.array([math.remainder(one - values[0], 360.0) for one in values.tolist()])
+    turns = np.array([math.remainder(angle - values[0], 360.0) for angle in values.tolist()])
     middle = math.remainder(float(values[0] + np.median(turns)), 360.0)
-    near: Array = turns - np.median(turns) + middle
-    return near
+    turns_near: Array = turns - np.median(turns) + middle
+    return turns_near
 
 
 def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -204,10 +214,10 @@ def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_
     away = np.abs(values - np.median(values))
     # for normal values the median distance is 0.6745 standard deviations
     spread = max(float(np.median(away)) / 0.6745, float(np.median(sigmas)))
-    found: np.ndarray[Any, np.dtype[np.bool_]] = (
+    outlying: np.ndarray[Any, np.dtype[np.bool_]] = (
         away > OUTLIER_SPREADS * (1 + SMALL_SAMPLE / len(values)) * spread
     )
-    return found
+    return outlying
 
 
 def _text(values: Array, spread: float, guard: float, old: Tolerance | None, unit: str) -> str:
@@ -238,7 +248,9 @@ def _tolerance_factor(number: int, *, sided: bool) -> float:
     degrees = number - 1
     if sided:
         # quantiles of the normal distribution
-        z_part, z_sure = (float(special.ndtri(one)) for one in (TOLERANCE_COVERAGE, CONFIDENCE))
+        z_part, z_sure = (
+            float(special.ndtri(probability)) for probability in (TOLERANCE_COVERAGE, CONFIDENCE)
+        )
         a, b = 1 - z_sure**2 / (2 * degrees), z_part**2 - z_sure**2 / number
         return (z_part + math.sqrt(z_part**2 - a * b)) / a
     z_part = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))

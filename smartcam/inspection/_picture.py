@@ -167,10 +167,10 @@ class Picture:
         off_by = 0 if sent else 1  # converted colours may be off by one level
         bright = colours.max(axis=2) > 2**depth // 4
         mask = np.zeros(bright.shape, dtype=bool)
-        for one in range(3):
-            black, white = _ends(colours[:, :, one], depth)
-            mask |= colours[:, :, one] >= white - off_by
-            mask |= bright & (colours[:, :, one] <= black + off_by)
+        for channel in range(3):
+            black, white = _ends(colours[:, :, channel], depth)
+            mask |= colours[:, :, channel] >= white - off_by
+            mask |= bright & (colours[:, :, channel] <= black + off_by)
         return mask
 
     @cached_property

@@ -79,15 +79,15 @@ def _region(given: object) -> Region:
     if isinstance(given, Region):
         return given
     items: list[Any] = list(given) if isinstance(given, (list, tuple)) else []
-    if len(items) == 4 and all(_is_coordinate(one) for one in items):
+    if len(items) == 4 and all(_is_coordinate(item) for item in items):
         x, y, width, height = map(float, items)
         if width <= 0 or height <= 0:
             raise ValueError(f"expected a width and a height above 0, got {width:g} x {height:g}")
         right, below = x + width, y + height
         return Region(((x, y), (right, y), (right, below), (x, below)))
     if 3 <= len(items) <= MAX_CORNERS and all(
-        isinstance(one, (list, tuple)) and len(one) == 2 and all(map(_is_coordinate, one))
-        for one in items
+        isinstance(item, (list, tuple)) and len(item) == 2 and all(map(_is_coordinate, item))
+        for item in items
     ):
         return Region((float(x), float(y)) for x, y in items)
     raise ValueError(

@@ -62,8 +62,8 @@ class PresentSettings(ToolSettings):
     @model_validator(mode="after")
     def _one_of(self) -> PresentSettings:
         if (self.grey is None) == (self.colour is None):
-            got = "neither" if self.grey is None else "both"
-            raise ValueError(f"expected either grey or colour, got {got}")
+            actual = "neither" if self.grey is None else "both"
+            raise ValueError(f"expected either grey or colour, got {actual}")
         return self
 
 
@@ -123,19 +123,21 @@ class Present(Tool[PresentSettings]):
         ok = not blind and self._least <= count <= self._most
         wanted = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
         reason = "the picture has no colours" if blind else f"{count} spots, expected {wanted}"
-        kept = spots[: self.settings.most]
-        alone = dict(kept[0].values()) if kept and self.settings.most == 1 else {}
+        spots_kept = spots[: self.settings.most]
+        alone = dict(spots_kept[0].values()) if spots_kept and self.settings.most == 1 else {}
         return Finding(
             ok=ok,
             reason="" if ok else reason,
             values={"count": min(count, 0xFFFF), **alone},
-            records=[] if self.settings.most == 1 else [spot.values() for spot in kept],
+            records=[] if self.settings.most == 1 else [spot.values() for spot in spots_kept],
             drawings=[
                 Drawing("polygon", _corners(view.region.corners), "region"),
                 *(_drawn(spot, ok=ok) for spot in spots[:MAX_SPOTS]),
             ],
-            reference=PixelPose(kept[0].x, kept[0].y, _or_zero(kept[0].angle)) if kept else None,
-            details=tuple(kept),
+            reference=PixelPose(spots_kept[0].x, spots_kept[0].y, _or_zero(spots_kept[0].angle))
+            if spots_kept
+            else None,
+            details=tuple(spots_kept),
         )
 
     def _spots(self, view: View) -> list[Spot]:
@@ -150,9 +152,11 @@ class Present(Tool[PresentSettings]):
         _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
         least, most = self.settings.area
         areas = stats[1:, cv2.CC_STAT_AREA]
-        kept = 1 + np.flatnonzero((areas >= least) & (areas <= most))
-        kept = kept[np.argsort(-stats[kept, cv2.CC_STAT_AREA], kind="stable")]
-        return [_spot(labels, int(one), stats[one], centres[one], view) for one in kept]
+        labels_kept = 1 + np.flatnonzero((areas >= least) & (areas <= most))
+        labels_kept = labels_kept[np.argsort(-stats[labels_kept, cv2.CC_STAT_AREA], kind="stable")]
+        return [
+            _spot(labels, int(label), stats[label], centres[label], view) for label in labels_kept
+        ]
 
 
 def _spot(

@@ -140,7 +140,7 @@ class Program:
         picture = Picture.of(source)
         findings, seconds = self._run(picture, input)
         values: dict[str, Any] = {
-            "ok": all(found.ok for found in findings.values()),
+            "ok": all(finding.ok for finding in findings.values()),
             "reason": "",
         }
         if self.layout.sequence_field is not None:
@@ -198,20 +198,22 @@ class FollowedApplication(Tool[ToolSettings]):
         findings: dict[str, Finding] = {}
         for step in self._steps:
             findings[step.name] = _finding_of(step.tool, view.picture, view.input, findings)
-        references = [one.reference for one in findings.values() if one.reference is not None]
+        references = [
+            finding.reference for finding in findings.values() if finding.reference is not None
+        ]
         return Finding(
-            ok=all(one.ok for one in findings.values()),
+            ok=all(finding.ok for finding in findings.values()),
             reason=_reason(findings),
-            drawings=[mark for one in findings.values() for mark in one.drawings],
+            drawings=[mark for finding in findings.values() for mark in finding.drawings],
             reference=references[-1] if references else None,
         )
 
 
 def _reason(findings: Mapping[str, Finding]) -> str:
     """Return the first reason among findings; "" if all are ok."""
-    for name, found in findings.items():
-        if not found.ok:
-            why = found.reason or "not ok"
+    for name, finding in findings.items():
+        if not finding.ok:
+            why = finding.reason or "not ok"
             return f"{name}: {why}" if len(findings) > 1 else why
     return ""
 
@@ -255,25 +257,27 @@ def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
         if field.name in OWN_FIELDS or field.sequence:
             raise ConfigurationError(f"{step.name}: a tool may not have the field {field.name!r}")
     if several:
-        own = Field("ok", "bool")
-        fields = tuple(replace(one, name=f"{step.name}_{one.name}") for one in (own, *fields))
+        verdict = Field("ok", "bool")
+        fields = tuple(
+            replace(field, name=f"{step.name}_{field.name}") for field in (verdict, *fields)
+        )
     return replace(step, fields=fields, records=records)
 
 
-def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, Any]:
+def _values(step: ProgramStep, finding: Finding, *, several: bool) -> dict[str, Any]:
     """Return a finding's values by their names in the result; missing values are left empty."""
     if not step.own:
         return {}
     prefix = f"{step.name}_" if several else ""
-    given = {**found.values, "ok": found.ok} if several else found.values
+    given = {**finding.values, "ok": finding.ok} if several else finding.values
     values = {
         field.name: given.get(field.name.removeprefix(prefix), _empty_value(field))
         for field in step.fields
     }
     if step.records:
         values[step.name] = [
-            {field.name: one.get(field.name, _empty_value(field)) for field in step.records}
-            for one in found.records
+            {field.name: record.get(field.name, _empty_value(field)) for field in step.records}
+            for record in finding.records
         ]
     return values
 
@@ -342,7 +346,7 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
         settings = model.model_validate({} if given is None else given)
     except ValidationError as exc:
         errors = exc.errors(include_url=False)  # a missing key may be a misspelled one
-        first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+        first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
         text = first["msg"].removeprefix("Value error, ") + hint(
             first, _known_settings(model, first["loc"])
         )
@@ -360,7 +364,7 @@ def _known_settings(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
     for key in place[:-1]:
         field = getattr(model, "model_fields", {}).get(key)
         inner = () if field is None else (field.annotation, *get_args(field.annotation))
-        model = next((one for one in inner if hasattr(one, "model_fields")), None)
+        model = next((model for model in inner if hasattr(model, "model_fields")), None)
     return getattr(model, "model_fields", ())
 
 

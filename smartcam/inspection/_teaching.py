@@ -68,12 +68,12 @@ class Teaching:
     def __init__(self, path: str | Path, camera: str, application: int | str) -> None:
         self.path: Path = check_path(path, "path", "Teaching")
         self.camera: str = check_text(camera, "camera", "Teaching")
-        application = check_application_or_name(application, who="Teaching")
+        application = check_application_or_name(application, caller="Teaching")
         software = self._software(self._read())
         self.application: int = self._number(software["applications"], application)
         self.frames: str = Software.model_validate(software).frames_address(self.path.parent)
-        found = software["applications"].get(self.application, {})
-        self._entry: dict[str, Any] = found if isinstance(found, dict) else {}
+        stored = software["applications"].get(self.application, {})
+        self._entry: dict[str, Any] = stored if isinstance(stored, dict) else {}
 
     @property
     def name(self) -> str:
@@ -103,15 +103,15 @@ class Teaching:
         try:
             made = make_camera(self.camera, checked, self.path.parent)
         except ProgramError as exc:
-            place = [str(one) for one in exc.place if one not in {"applications", self.application}]
+            place = [str(key) for key in exc.place if key not in {"applications", self.application}]
             text = f"{'.'.join(place)}: {exc}" if place else str(exc)
             raise ConfigurationError(text) from exc
         return made.programs[self.application]
 
     def _changed(self, tools: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         """Return the application's entry with the given tools."""
-        own = {key: one for key, one in self._entry.items() if key in OWN_KEYS}
-        return {**own, **{key: dict(given) for key, given in tools.items()}}
+        own_entries = {key: value for key, value in self._entry.items() if key in OWN_KEYS}
+        return {**own_entries, **{key: dict(given) for key, given in tools.items()}}
 
     def save(self, tools: Mapping[str, Mapping[str, Any]]) -> None:
         """Write the tools into the file, and leave the rest, comments included, unchanged.
@@ -129,14 +129,14 @@ class Teaching:
         text = self._text()
         if re.search(r"^( *)[^\s#-].*:\s*(#.*)?\n\1 +- ", text, re.MULTILINE):
             yaml.indent(mapping=2, sequence=4, offset=2)
-        whole = yaml.load(text)
-        applications = whole["cameras"][self.camera]["software"]["applications"]
+        document = yaml.load(text)
+        applications = document["cameras"][self.camera]["software"]["applications"]
         if isinstance(applications.get(self.application), dict):
             _update(applications[self.application], entry)
         else:
             applications[self.application] = _flow(entry)
         written = io.StringIO()
-        yaml.dump(whole, written)
+        yaml.dump(document, written)
         self._check_written(written.getvalue(), entry)
         try:
             replace_file(self.path, written.getvalue().encode())
@@ -148,7 +148,7 @@ class Teaching:
         """Raise if another YAML reader would read other settings from the text."""
         wanted = self._read()
         self._software(wanted)["applications"][self.application] = entry
-        if _plain(load_yaml(text, what=str(self.path))) != _plain(wanted):
+        if _plain(load_yaml(text, label=str(self.path))) != _plain(wanted):
             raise ConfigurationError(
                 f"{self.path}: the settings cannot be written without changing other lines; write "
                 f"them by hand: {entry!r}"
@@ -166,7 +166,7 @@ class Teaching:
 
     def _read(self) -> Any:
         try:
-            return load_yaml(self._text(), what=str(self.path))
+            return load_yaml(self._text(), label=str(self.path))
         except BadYamlError as exc:
             raise ConfigurationError(f"{self.path}: {exc}") from exc
 
@@ -189,9 +189,9 @@ class Teaching:
             )
         return names[application]
 
-    def _software(self, whole: Any) -> dict[str, Any]:
+    def _software(self, document: Any) -> dict[str, Any]:
         """Return the mapping ``software:`` of the camera in a file."""
-        cameras = whole.get("cameras") if isinstance(whole, dict) else None
+        cameras = document.get("cameras") if isinstance(document, dict) else None
         entry = cameras.get(self.camera) if isinstance(cameras, dict) else None
         software = entry.get("software") if isinstance(entry, dict) else None
         if not isinstance(software, dict) or not isinstance(software.get("applications"), dict):
@@ -206,9 +206,9 @@ class Teaching:
 def _plain(value: Any) -> Any:
     """Return a value as a YAML reader returns it: tuples become lists."""
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     return value
 
 
@@ -227,9 +227,9 @@ def _flow(value: Any) -> Any:
     """Return a value that YAML writes on one line."""
     kinds = load("ruamel.yaml.comments", "teaching needs")
     if isinstance(value, dict):
-        made = kinds.CommentedMap({key: _flow(one) for key, one in value.items()})
+        made = kinds.CommentedMap({key: _flow(item) for key, item in value.items()})
     elif isinstance(value, (list, tuple)):
-        made = kinds.CommentedSeq([_flow(one) for one in value])
+        made = kinds.CommentedSeq([_flow(item) for item in value])
     else:
         return value
     made.fa.set_flow_style()
@@ -245,7 +245,7 @@ def tool_settings() -> dict[str, dict[str, str]]:
     for info in TOOLS.available():
         kind: Any = TOOLS.load(info.name)
         fields = kind.settings_model.model_fields
-        descriptions[info.name] = {name: one.description or "" for name, one in fields.items()}
+        descriptions[info.name] = {name: field.description or "" for name, field in fields.items()}
     return descriptions
 
 
@@ -255,16 +255,16 @@ def read_settings(given: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str,
     Raises:
         ConfigurationError: a text is no YAML.
     """
-    found: dict[str, dict[str, Any]] = {}
+    settings_read: dict[str, dict[str, Any]] = {}
     for key, settings in given.items():
-        found[key] = {}
+        settings_read[key] = {}
         for name, text in settings.items():
             if text.strip():
                 try:
-                    found[key][name] = load_yaml(text, what=f"{key}: {name}")
+                    settings_read[key][name] = load_yaml(text, label=f"{key}: {name}")
                 except BadYamlError as exc:
                     raise ConfigurationError(f"{key}: {name}: {exc}") from exc
-    return found
+    return settings_read
 
 
 def setting_text(value: Any) -> str:

@@ -186,20 +186,20 @@ class Reader:
             )
         return range(0, len(self.data), size)
 
-    def _get(self, first_byte: int, code: str, what: str) -> Any:
+    def _get(self, first_byte: int, code: str, label: str) -> Any:
         number = _number(code, self.context.byte_order)
-        return number.unpack(self._take(first_byte, number.size, what))[0]
+        return number.unpack(self._take(first_byte, number.size, label))[0]
 
-    def _take(self, first_byte: int, length: int, what: str) -> bytes:
+    def _take(self, first_byte: int, length: int, label: str) -> bytes:
         end = first_byte + length
         if first_byte < 0 or length < 0 or end > len(self.data):
-            got = max(0, len(self.data) - max(0, first_byte))
+            available = max(0, len(self.data) - max(0, first_byte))
             raise InterpretationError(
-                f"offset {first_byte}: expected {what} of {length} bytes, got {got} "
+                f"offset {first_byte}: expected {label} of {length} bytes, got {available} "
                 f"(the container has {len(self.data)})",
                 offset=first_byte,
                 expected=length,
-                got=got,
+                got=available,
             )
         return self.data[first_byte:end]
 
@@ -434,13 +434,13 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
 
 def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
     """Return the interpreter's name and the layout of a text."""
-    head, colon, rest = spec.partition(":")
+    head, colon, arguments = spec.partition(":")
     name = head.strip()
     if not colon and "(" not in spec:
         return name, None
-    if colon and name in INTERPRETERS and not _is_type(rest):
+    if colon and name in INTERPRETERS and not _is_type(arguments):
         return name, Layout(spec, lenient=lenient, start=len(head) + 1)
-    _check_name(spec, name, rest)
+    _check_name(spec, name, arguments)
     return "record", Layout(spec, lenient=lenient)
 
 
@@ -450,20 +450,20 @@ SURE_SLIP = 0.8
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
 
-def _is_type(rest: str) -> bool:
+def _is_type(arguments: str) -> bool:
     """Return True if a field's type follows: ``table: int32`` is a field named ``table``."""
-    word = _FIRST_WORD.match(rest)
+    word = _FIRST_WORD.match(arguments)
     return word is not None and word[1] in TYPES and not word[2]
 
 
-def _check_name(spec: str, name: str, rest: str) -> None:
+def _check_name(spec: str, name: str, arguments: str) -> None:
     """Raise for a mistyped interpreter's name, if no layout text would begin with it."""
-    word = _FIRST_WORD.match(rest)
+    word = _FIRST_WORD.match(arguments)
     another_colon = word is not None and word[2] and word[1] not in TYPES
     if re.fullmatch(r"[\w.-]+", name) and (another_colon or not name.isidentifier()):
         _fail_name(spec, name)
     # "localization: (...)*" is a valid layout text with a named group, but surely a slip
-    if rest.lstrip().startswith("(") and name != "records":
+    if arguments.lstrip().startswith("(") and name != "records":
         known = [info.name for info in INTERPRETERS.available()]
         close = closest(name, known, least=SURE_SLIP)
         if close:

@@ -31,7 +31,7 @@ _DEFAULTS: dict[str, Any] = {
 }
 """Defaults of the fields that a layout may leave out, except ``z``.
 
-The order is that of the default layout.
+Their order is as in the default layout.
 """
 
 _QUANTITIES = {
@@ -127,12 +127,12 @@ class LocalizationsInterpreter(PlainInterpreter):
             rows = map(self._pick, rows)
         heights = self._heights(data, context) if self._z is not None else None
         total, skipped, z = 0.0, 0, 0.0
-        found: list[Localization] = []
+        parts: list[Localization] = []
         try:
             for text, quality, photo_index, x, y, theta in rows:
                 if heights is not None:
                     z = next(heights)
-                if not x and self._is_empty(data, len(found) + skipped):
+                if not x and self._is_empty(data, len(parts) + skipped):
                     skipped += 1
                     continue
                 if scales is not None:
@@ -148,7 +148,7 @@ class LocalizationsInterpreter(PlainInterpreter):
                 feature_id = names.get(text)
                 if feature_id is None:
                     feature_id = self._name(text)
-                found.append(new(Localization, (feature_id, quality, photo_index, pose)))
+                parts.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
             self._check_numbers(data, context)
             raise
@@ -158,7 +158,7 @@ class LocalizationsInterpreter(PlainInterpreter):
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
-        return found if self._sigmas is None else self._with_sigmas(found, data, context)
+        return parts if self._sigmas is None else self._with_sigmas(parts, data, context)
 
     def read_all(self, containers: Sequence[bytes], context: Context) -> Sequence[object]:
         """Return the parts of each container: by columns, if nothing about them is unusual."""
@@ -188,9 +188,9 @@ class LocalizationsInterpreter(PlainInterpreter):
             return None
         if self._scales is not None:
             scales = zip((quality, x, y, theta), *self._scales, strict=False)
-            quality, x, y, theta = ([one * by / over for one in of] for of, by, over in scales)
+            quality, x, y, theta = ([value * by / over for value in of] for of, by, over in scales)
         if context.y_down:
-            y, theta = ([0.0 - one for one in of] for of in (y, theta))  # avoids minus zero
+            y, theta = ([0.0 - value for value in of] for of in (y, theta))  # avoids minus zero
         total = sum(quality) + sum(x) + sum(y) + sum(theta)  # not finite if one is not
         if not math.isfinite(total) or min(quality) < 0.0 or max(quality) > MAX_QUALITY:
             return None
@@ -220,14 +220,14 @@ class LocalizationsInterpreter(PlainInterpreter):
         return name
 
     def _with_sigmas(
-        self, found: list[Localization], data: bytes, context: Context
+        self, localizations: list[Localization], data: bytes, context: Context
     ) -> list[Localization]:
         """Return localizations with the errors of their poses, if these are numbers."""
         use = cast("_SigmaUse", self._sigmas)
         rows = self.layout.wire_records(data, context.byte_order)
         taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
         result: list[Localization] = []
-        for part, row in zip(found, taken, strict=True):
+        for part, row in zip(localizations, taken, strict=True):
             x, y, theta = (row[place] * scale for place, scale in use.sigmas)
             xy, xt, yt = (0.0 if place is None else row[place] for place in use.correlations)
             if context.y_down:
@@ -319,7 +319,7 @@ def _use_of(layout: tuple[Field, ...]) -> _Use:
         None if places == [*range(len(names))] else operator.itemgetter(*places),
         [*fields].index("z") if "z" in fields else None,
         _scales(fields),
-        any(one.type in {"string", "bool"} and one.name != "feature_id" for one in layout),
+        any(field.type in {"string", "bool"} and field.name != "feature_id" for field in layout),
         _sigma_use(fields),
     )
 
@@ -329,7 +329,7 @@ def _sigma_use(fields: dict[str, Field]) -> _SigmaUse | None:
     if not set(_SIGMAS) <= set(names):
         return None
     units = [UNITS[unit] if (unit := fields[name].unit) else None for name in _SIGMAS]
-    scales = [one.multiply / one.divide if one else 1.0 for one in units]
+    scales = [unit.multiply / unit.divide if unit else 1.0 for unit in units]
     return _SigmaUse(
         tuple((names.index(name), scale) for name, scale in zip(_SIGMAS, scales, strict=True)),
         tuple(names.index(name) if name in fields else None for name in _CORRELATIONS),

@@ -207,7 +207,7 @@ class Layout:
             self._count(payload, head, records)
             return records.read_one(payload)
         rows = self.wire_records(payload, byte_order)
-        values = records.read(rows, payload, head.size, what="record")
+        values = records.read(rows, payload, head.size, label="record")
         if self._is_list:
             return values
         front = head.read_one(payload) if self.head else ()
@@ -234,7 +234,7 @@ class Layout:
                 if self._is_list:
                     return lists
                 whole = self._whole_class()
-                return [Record.__new__(whole, (one,)) for one in lists]
+                return [Record.__new__(whole, (items,)) for items in lists]
         return [self.parse(payload, byte_order) for payload in payloads]
 
     def wire_rows(
@@ -248,7 +248,7 @@ class Layout:
         size, fixed = codec.size, self._fixed
         if self._spec.head:
             return None
-        counts = [len(one) // size for one in payloads]
+        counts = [len(payload) // size for payload in payloads]
         data = b"".join(payloads)
         if sum(counts) * size != len(data):
             return None
@@ -266,7 +266,7 @@ class Layout:
         """
         head, records = self._codecs[byte_order]
         rows = self.wire_records(payload, byte_order)
-        return records.read(rows, payload, head.size, what=self._record_word)
+        return records.read(rows, payload, head.size, label=self._record_word)
 
     def wire_records(self, payload: Payload, byte_order: ByteOrder = "little") -> Rows:
         """Return the unconverted values of the same records, one record after the other.
@@ -300,7 +300,7 @@ class Layout:
             InterpretationError: the payload does not fit, or a byte is no bool.
         """
         view = self._views.get(byte_order)
-        if view is not None and type(payload) is bytes:  # from bytes numpy makes read-only tables
+        if view is not None and type(payload) is bytes:  # numpy makes read-only tables of bytes
             try:
                 rows: np.ndarray[tuple[int], np.dtype[np.void]] = self._frombuffer(payload, view)
             except ValueError:
@@ -310,7 +310,7 @@ class Layout:
                     return rows
         head, records = self._codecs[byte_order]
         count = self._count(payload, head, records)
-        return self._table(byte_order).read(payload, head.size, count, what=self._record_word)
+        return self._table(byte_order).read(payload, head.size, count, label=self._record_word)
 
     def parse_tables(
         self, payloads: Sequence[bytes], byte_order: ByteOrder = "little"
@@ -321,7 +321,7 @@ class Layout:
             try:
                 return [make(payload, view) for payload in payloads]
             except ValueError:
-                pass  # one of them has not whole records, or is empty
+                pass  # a payload has no whole records, or is empty
         return [self.parse_table(payload, byte_order) for payload in payloads]
 
     def sequence(self, payload: Payload, byte_order: ByteOrder = "little") -> int | None:
@@ -376,8 +376,8 @@ class Layout:
         padding = self._padding(len(records), slots)
         parts = [head.write(front, "")] if self.head else []
         for number, record in enumerate(records):
-            what = f"record {number}: "
-            parts.append(codec.write(codec.take(record, what, forced), what))
+            prefix = f"record {number}: "
+            parts.append(codec.write(codec.take(record, prefix, forced), prefix))
         return b"".join((*parts, bytes(padding * codec.size)))
 
     # -- numpy, pydantic, files --------------------------------------------------------------
@@ -481,55 +481,57 @@ class Layout:
 
     def _count(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
         """Check the size of a payload, and return the number of records to read."""
-        got = len(payload)
-        count, remainder = divmod(got - head.size, codec.size)
+        available = len(payload)
+        count, remainder = divmod(available - head.size, codec.size)
         fixed, repeat = self._fixed, self._spec.repeat
-        if got < head.size:
-            raise self._misfit(head, got, 0, None)
+        if available < head.size:
+            raise self._misfit(head, available, 0, None)
         if remainder or (fixed is not None and fixed != count):
-            raise self._misfit(codec, got, head.size, fixed)
+            raise self._misfit(codec, available, head.size, fixed)
         if not isinstance(repeat, str) or repeat == "*":
             return count
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
-        found = int(head.read_field(payload, 0, index))
-        if not 0 <= found <= count:
+        records_stated = int(head.read_field(payload, 0, index))
+        if not 0 <= records_stated <= count:
             more = f", as many records of {codec.size} bytes as the container holds"
-            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", found, more=more)
-        return found
+            raise misfit(
+                head.fields[index], head.offsets[index], f"0 to {count}", records_stated, more=more
+            )
+        return records_stated
 
     def _misfit(
-        self, codec: RecordCodec, got: int, start: int, count: int | None
+        self, codec: RecordCodec, actual: int, start: int, count: int | None
     ) -> InterpretationError:
         """Return the error for a payload of the wrong length: a truncated field or surplus bytes.
 
-        ``codec``: codec of the record (or the head) that does not fit. ``got``: number of bytes of
-        the payload. ``start``: offset of the first record. ``count``: required number of records,
-        or None for any.
+        ``codec``: codec of the record (or the head) that does not fit. ``actual``: number of bytes
+        of the payload. ``start``: offset of the first record. ``count``: required number of
+        records, or None for any.
         """
-        full = max(0, got - start) // codec.size
+        full = max(0, actual - start) // codec.size
         at = start + codec.size * (full if count is None else min(full, count))
         if count is not None and full >= count:
             hint = "; for several records write ( ... )*" if self._spec.repeat is None else ""
             expected = start + count * codec.size
             return InterpretationError(
-                f"container: expected {expected} bytes, got {got}: "
-                f"{got - expected} too many from offset {at}{hint}",
+                f"container: expected {expected} bytes, got {actual}: "
+                f"{actual - expected} too many from offset {at}{hint}",
                 offset=at,
                 expected=expected,
-                got=got,
+                got=actual,
             )
-        field, offset = codec.field_at(got - at)
+        field, offset = codec.field_at(actual - at)
         expected = at + codec.size if count is None else start + count * codec.size
         record = (
             "" if self._spec.repeat is None or codec.fields is self.head else f"record {full}: "
         )
         return InterpretationError(
             f"{record}{field.label} at offset {at + offset}: expected {field.size} bytes, "
-            f"got {got - at - offset} (the container has {got} bytes, expected {expected})",
+            f"got {actual - at - offset} (the container has {actual} bytes, expected {expected})",
             field=field.name,
             offset=at + offset,
             expected=expected,
-            got=got,
+            got=actual,
         )
 
     # -- building ----------------------------------------------------------------------------

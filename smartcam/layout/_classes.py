@@ -79,7 +79,7 @@ def read_class(kind: Any) -> ClassLayout:
         )
     if record is None:
         return _read_record(kind)
-    repeat = next((one for one in _metadata(kind) if isinstance(one, str)), "*")
+    repeat = next((text for text in _metadata(kind) if isinstance(text, str)), "*")
     inner = _read_record(record, nested=True)
     return ClassLayout(_checked(record, f"({inner.text}){repeat}"), _make_list(inner.make))
 
@@ -122,7 +122,7 @@ def _members(kind: type) -> list[_Member]:
         ) from exc
     members: list[_Member] = []
     for name in names:
-        text = next((one for one in _metadata(hints[name]) if isinstance(one, str)), None)
+        text = next((text for text in _metadata(hints[name]) if isinstance(text, str)), None)
         members.append(_Member(name, _without_metadata(hints[name]), text))
     return members
 
@@ -141,9 +141,9 @@ def _field(kind: type, member: _Member) -> Field:
     fitting = _types(field)
     # a model converts values by itself
     if not _is_model(kind) and member.hint not in (*fitting, Any, object):
-        expected = " or ".join(one.__name__ for one in fitting)
-        got = getattr(member.hint, "__name__", member.hint)
-        raise _error(kind, member, f"expected the type {expected} for {text!r}, got {got}")
+        expected = " or ".join(type_.__name__ for type_ in fitting)
+        actual = getattr(member.hint, "__name__", member.hint)
+        raise _error(kind, member, f"expected the type {expected} for {text!r}, got {actual}")
     return field
 
 
@@ -253,7 +253,7 @@ def _model_maker(kind: type[BaseModel], names: list[str]) -> Make:
 
 
 def values_of(value: object) -> dict[str, Any] | None:
-    """Return the fields of an object of such a class by name; None for other objects."""
+    """Return the fields of an object of a layout's class by name; None for other objects."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
     kind = type(value)

@@ -165,17 +165,17 @@ class RecordCodec:
         """Return the unconverted values of ``count`` records; the caller has checked the size."""
         return self.unpack_all(payload[offset : offset + count * self.size])
 
-    def read(self, rows: Rows, payload: Payload, offset: int, *, what: str = "") -> list[Record]:
+    def read(self, rows: Rows, payload: Payload, offset: int, *, label: str = "") -> list[Record]:
         """Return the records with the unconverted values ``rows``.
 
         ``rows`` come from :meth:`unpack` or :attr:`unpack_all`; the first is at ``offset``.
-        ``what`` names a record in errors. Raises InterpretationError if a byte is no bool, or a
+        ``label`` names a record in errors. Raises InterpretationError if a byte is no bool, or a
         text is not UTF-8.
         """
         try:
             return self.convert(rows)
         except (KeyError, UnicodeDecodeError) as exc:
-            raise self.locate(payload, offset, what) from exc
+            raise self.locate(payload, offset, label) from exc
 
     def convert(self, rows: Rows) -> list[Record]:
         """Return the records with the unconverted values ``rows``.
@@ -211,10 +211,10 @@ class RecordCodec:
         """Return the unconverted value of one field of the record at ``offset``."""
         return self._singles[index].unpack_from(payload, offset + self.offsets[index])[0]
 
-    def write(self, values: Sequence[Any], what: str) -> bytes:
+    def write(self, values: Sequence[Any], label: str) -> bytes:
         """Return the bytes of one record; ``values`` are in the order of the fields.
 
-        Raises ConfigurationError if a value does not fit its field; ``what`` names the record.
+        Raises ConfigurationError if a value does not fit its field; ``label`` names the record.
         """
         wire: list[Any] = []
         for field, value in zip(self.fields, values, strict=True):
@@ -222,22 +222,23 @@ class RecordCodec:
                 wire.append(_to_wire(field, value))
             except (ArithmeticError, TypeError, ValueError) as exc:
                 raise ConfigurationError(
-                    f"layout: {what}{field.label}: expected {_expected(field)}, got {_shown(value)}"
+                    f"layout: {label}{field.label}: expected {_expected(field)}, "
+                    f"got {_shown(value)}"
                 ) from exc
         return self._struct.pack(*wire)
 
-    def take(self, value: object, what: str, forced: Mapping[str, Any]) -> list[Any]:
+    def take(self, value: object, label: str, forced: Mapping[str, Any]) -> list[Any]:
         """Return the values of one record in the order of the fields.
 
-        ``value``: mapping, record, or sequence of the values in order. ``what`` names a record in
-        errors. ``forced``: values of some fields that override those of ``value``. Raises
+        ``value``: mapping, record, or sequence of the values in order. ``label`` names a record in
+        errors. ``forced``: values of some fields that override values of ``value``. Raises
         ConfigurationError if a field is missing or unknown, or if there are too few or too many
         values.
         """
         names = [field.name for field in self.fields]
-        given = named(value, names, what)
+        given = named(value, names, label)
         given.update({name: forced[name] for name in names if name in forced})
-        check_names(given, names, what)
+        check_names(given, names, label)
         return [given[name] for name in names]
 
     def field_at(self, position: int) -> tuple[Field, int]:
@@ -245,7 +246,7 @@ class RecordCodec:
         index = bisect.bisect_right(self.offsets, position) - 1
         return self.fields[index], self.offsets[index]
 
-    def locate(self, payload: Payload, offset: int, what: str) -> InterpretationError:
+    def locate(self, payload: Payload, offset: int, label: str) -> InterpretationError:
         """Return the error for the first value that cannot be converted; there must be one."""
         for number, start in enumerate(range(offset, len(payload), self.size)):
             for index, convert, _ in self._converters:
@@ -254,24 +255,26 @@ class RecordCodec:
                     convert(value)
                 except (KeyError, UnicodeDecodeError) as exc:
                     at = start + self.offsets[index]
-                    where = f"{what} {number}: " if what else ""
+                    where = f"{label} {number}: " if label else ""
                     if isinstance(exc, UnicodeDecodeError):
-                        got = f"{hex_excerpt(value)} ({exc.reason})"
-                        return misfit(self.fields[index], at + exc.start, "UTF-8 text", got, where)
-                    expected, got = "0x00 or 0xFF for a bool", f"0x{value:02X}"
-                    return misfit(self.fields[index], at, expected, got, where)
+                        excerpt = f"{hex_excerpt(value)} ({exc.reason})"
+                        return misfit(
+                            self.fields[index], at + exc.start, "UTF-8 text", excerpt, where
+                        )
+                    expected, excerpt = "0x00 or 0xFF for a bool", f"0x{value:02X}"
+                    return misfit(self.fields[index], at, expected, excerpt, where)
         raise AssertionError("the fast way failed and the slow way did not")
 
 
 def split_rows(items: list[T], counts: list[int]) -> list[list[T]]:
     """Return items of several payloads as a list for each, by the number of items of each."""
     if counts.count(1) == len(counts):
-        return [[one] for one in items]
+        return [[item] for item in items]
     left = iter(items)
     return [list(itertools.islice(left, count)) for count in counts]
 
 
-def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
+def named(value: object, names: Sequence[str], label: str) -> dict[str, Any]:
     """Return a mapping's, a record's or a sequence's values by name.
 
     Raises ConfigurationError if it is none of these, or a sequence of another length.
@@ -286,23 +289,23 @@ def named(value: object, names: Sequence[str], what: str) -> dict[str, Any]:
         return fields
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes, bytearray)):
         raise ConfigurationError(
-            f"layout: {what}expected a mapping or a sequence of values, got {_shown(value)}"
+            f"layout: {label}expected a mapping or a sequence of values, got {_shown(value)}"
         )
     if len(given) != len(names):
         raise ConfigurationError(
-            f"layout: {what}expected {len(names)} values ({', '.join(names)}), got {len(given)}"
+            f"layout: {label}expected {len(names)} values ({', '.join(names)}), got {len(given)}"
         )
     return dict(zip(names, given, strict=True))
 
 
-def check_names(given: Mapping[str, Any], names: Sequence[str], what: str) -> None:
+def check_names(given: Mapping[str, Any], names: Sequence[str], label: str) -> None:
     """Raise ConfigurationError unless ``given`` has exactly these names."""
     if set(given) == set(names):
         return
     missing = [name for name in names if name not in given]
     unknown = [str(name) for name in given if name not in names]
     raise ConfigurationError(
-        f"layout: {what}expected the fields {', '.join(names)}"
+        f"layout: {label}expected the fields {', '.join(names)}"
         + (f"; missing: {', '.join(missing)}" if missing else "")
         + (f"; unknown: {', '.join(unknown)}" if unknown else "")
     )
@@ -318,7 +321,7 @@ def _offsets(fields: tuple[Field, ...]) -> list[int]:
 
 
 def _converters(field: Field, *, lenient: bool) -> tuple[Convert, ConvertAll] | None:
-    """Return the converter of a single wire value, and that of a column of values.
+    """Return the converter of a single wire value, and the converter of a column of values.
 
     A converter is None if values stay as they are. For columns, a comprehension takes a third of
     the time of a function call per value.
@@ -382,9 +385,9 @@ def _from_si(unit: Unit, si: float) -> float:
     value = si * unit.divide / unit.multiply
     if math.isinf(value) and math.isfinite(si):
         raise OverflowError("out of range")
-    for near in (value, math.nextafter(value, math.inf), math.nextafter(value, -math.inf)):
-        if near * unit.multiply / unit.divide == si:
-            return near
+    for neighbour in (value, math.nextafter(value, math.inf), math.nextafter(value, -math.inf)):
+        if neighbour * unit.multiply / unit.divide == si:
+            return neighbour
     return value
 
 
@@ -411,8 +414,10 @@ def _expected(field: Field) -> str:
         return "True or False"
     if field.type == "string":
         return f"a text of at most {field.length} bytes in UTF-8, without a zero character"
-    what = "a number in range" if not wire.is_integer else f"{wire.low} to {wire.high}"
-    return what if field.unit is None else f"{what} on the wire ({UNITS[field.unit].si} here)"
+    expected = "a number in range" if not wire.is_integer else f"{wire.low} to {wire.high}"
+    return (
+        expected if field.unit is None else f"{expected} on the wire ({UNITS[field.unit].si} here)"
+    )
 
 
 def _shown(value: object) -> str:

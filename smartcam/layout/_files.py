@@ -114,7 +114,7 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     Raises LayoutError if it is neither.
     """
     try:
-        loaded: Any = load(text, what="layout: YAML")
+        loaded: Any = load(text, label="layout: YAML")
     except BadYamlError as exc:
         # "x: int32, y: int32" is no YAML; a broken document is no layout text either
         try:
@@ -128,7 +128,7 @@ def load_yaml(text: str) -> dict[str, Any] | str:
     given: Any = loaded
     if isinstance(loaded, str):
         return loaded
-    # "x: int32" is also a YAML mapping; that of a layout file has other values than texts
+    # "x: int32" is also a YAML mapping; a layout file has other values than texts
     is_data = isinstance(loaded, dict) and not all(isinstance(v, str) for v in given.values())
     return given if is_data else text
 

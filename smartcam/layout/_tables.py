@@ -45,10 +45,10 @@ class TableCodec:
         self._converts = any(field.type == "bool" or field.unit is not None for field in fields)
         self.is_view: bool = self._native == self.dtype and not self._converts
 
-    def read(self, payload: Payload, offset: int, count: int, *, what: str) -> Rows:
+    def read(self, payload: Payload, offset: int, count: int, *, label: str) -> Rows:
         """Return ``count`` records, beginning at ``offset``, read-only and if possible as a view.
 
-        The caller has checked that the ``payload`` has them. ``what`` names a record in errors.
+        The caller has checked that the ``payload`` has them. ``label`` names a record in errors.
         Raises InterpretationError if a byte is no bool.
         """
         dtype = self.dtype
@@ -56,7 +56,7 @@ class TableCodec:
         rows: Rows = np.frombuffer(payload, dtype, count, offset) if count else np.empty(0, dtype)
         for name in self._bools:
             if not _all_bools(rows[name]):
-                raise self._codec.locate(payload, offset, what)
+                raise self._codec.locate(payload, offset, label)
         if self._converts:
             rows = self._converted(rows)
         elif not self.is_view:

@@ -234,7 +234,7 @@ def _check_length(text: str, length: int, start: int, form: str = "") -> None:
 
 
 def misfit(
-    field: Field, offset: int, expected: str, got: object, where: str = "", more: str = ""
+    field: Field, offset: int, expected: str, actual: object, where: str = "", more: str = ""
 ) -> InterpretationError:
     """Return the error for a value that does not match its field.
 
@@ -242,11 +242,11 @@ def misfit(
     precedes the field and ``more`` follows ``expected``.
     """
     return InterpretationError(
-        f"{where}{field.label} at offset {offset}: expected {expected}{more}, got {got}",
+        f"{where}{field.label} at offset {offset}: expected {expected}{more}, got {actual}",
         field=field.name,
         offset=offset,
         expected=expected,
-        got=got,
+        got=actual,
     )
 
 
@@ -277,8 +277,8 @@ class _Parser:
         fields: list[Field] = []
         group: LayoutSpec | None = None
         while True:
-            here = self._peek()
-            if here.kind == "end" and (fields or group):
+            token = self._peek()
+            if token.kind == "end" and (fields or group):
                 break
             if group is not None:
                 self._unexpected("the end, a group comes last")
@@ -348,17 +348,17 @@ class _Parser:
             )
         return name
 
-    def _field(self, what: str) -> Field:
-        name = self._name(what)
+    def _field(self, label: str) -> Field:
+        name = self._name(label)
         self._expect(":", f"':' and a type after {name!r}")
         type_, length = self._type()
         unit = self._unit(type_)
         return Field(name, type_, length, unit, self._sequence(type_, unit))
 
-    def _name(self, what: str) -> str:
+    def _name(self, label: str) -> str:
         token = self._take()
         if token.kind != "name":
-            self._unexpected(what, token)
+            self._unexpected(label, token)
         # normalized, as Python does with the names of attributes
         name = unicodedata.normalize("NFKC", token.text)
         if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
@@ -411,11 +411,11 @@ class _Parser:
         self._has_sequence = True
         return True
 
-    def _number(self, token: _Lexeme, what: str) -> int:
+    def _number(self, token: _Lexeme, label: str) -> int:
         digits = token.text.lstrip("0")
         # check the length first: int() refuses some thousand digits with an error of its own
         if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
-            self._unexpected(f"a number of {what} from 1 to {MAX_COUNT}", token)
+            self._unexpected(f"a number of {label} from 1 to {MAX_COUNT}", token)
         return int(digits)
 
     def _expect_end(self, last: Field | None) -> None:
@@ -473,9 +473,9 @@ class _Parser:
 
     def _fail_after(self, field: Field, expected: str) -> NoReturn:
         """Raise the error after a whole field, naming the parts that could have followed."""
-        here = self._peek()
-        if here.kind == "name":
-            self._fail(f"expected {expected}, got {here}: a comma is missing before it", here)
+        token = self._peek()
+        if token.kind == "name":
+            self._fail(f"expected {expected}, got {token}: a comma is missing before it", token)
         extras = "" if field.unit or not field.wire.is_number else "a unit, "
         self._unexpected(f"{extras}{expected}")
 

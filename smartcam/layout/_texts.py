@@ -58,7 +58,7 @@ def pack_texts(layout: Layout, cells: Sequence[tuple[str, str | None]]) -> bytes
         parts.append(part)
         offset += len(part)
         if index < len(layout.head) and field.name == layout.repeat and text is not None:
-            used = len(layout.head) + _whole(text) * len(layout.fields)
+            used = len(layout.head) + _integer(text) * len(layout.fields)
     return b"".join(parts)
 
 
@@ -89,13 +89,13 @@ def _pack(field: Field, text: str | None) -> bytes:
             raise ValueError(f"at most {field.size} bytes of UTF-8 were expected")
         return raw.ljust(field.size, b"\0")
     if field.type == "bool":
-        number = _whole(text)
+        number = _integer(text)
         if number not in {0, 1}:
             raise ValueError("neither 0 nor 1")
         return b"\xff" if number else b"\0"
     low, high = field.wire.low, field.wire.high
     if low is not None and high is not None:
-        number = _whole(text)
+        number = _integer(text)
         if not low <= number <= high:
             raise ValueError(f"{low} to {high} was expected")
         return struct.pack("<" + field.wire.code, number)
@@ -112,7 +112,7 @@ def _real(text: str) -> float:
     return number
 
 
-def _whole(text: str) -> int:
+def _integer(text: str) -> int:
     """Parse an integer, perhaps with decimals that are zeros; raise ValueError for others."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None or match["whole"] is None:

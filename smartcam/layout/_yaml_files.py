@@ -39,7 +39,7 @@ def file_schema(kind: type[BaseModel], what: str) -> dict[str, Any]:
 
 def read_model(
     path: str | Path,
-    what: str,
+    label: str,
     kind: type[M],
     such_as: str,
     mistake: Callable[[M], tuple[Sequence[int | str], str] | None],
@@ -48,7 +48,7 @@ def read_model(
 
     Args:
         path: path of the file.
-        what: kind of the file for errors, such as ``scenario``.
+        label: kind of the file for errors, such as ``scenario``.
         kind: model of the file's fields.
         such_as: name of a field, as an example for errors.
         mistake: function that returns the place of a value that cannot work and the reason, or
@@ -59,8 +59,8 @@ def read_model(
             line and field.
         MissingExtraError: PyYAML is not installed.
     """
-    path = check_path(path, "path", what)
-    named = f"{what} {path}"
+    path = check_path(path, "path", label)
+    named = f"{label} {path}"
     try:
         with path.open(encoding="utf-8") as stream:
             text = stream.read(MAX_YAML_TEXT_CHARACTERS + 1)
@@ -70,7 +70,7 @@ def read_model(
         meant = did_you_mean(path.name, _beside(path)) if isinstance(exc, FileNotFoundError) else ""
         raise ConfigurationError(f"{named}: {exc.strerror or exc}{meant}") from exc
     try:
-        root = compose(text, what=f"a {what} file")
+        root = compose(text, label=f"a {label} file")
         if root is not None:
             _refuse_twice(root, named)
         data = None if root is None else construct(root)
@@ -85,14 +85,14 @@ def read_model(
         findings = (
             (
                 item["loc"],
-                item["msg"].removeprefix("Value error, ") + _got(item) + _meant(kind, item),
+                item["msg"].removeprefix("Value error, ") + _actual_text(item) + _meant(kind, item),
             )
             for item in exc.errors(include_url=False)
         )
         raise ConfigurationError(_texts(named, root, findings)) from exc
-    found = mistake(model)
-    if found is not None:
-        raise ConfigurationError(_texts(named, root, [found]))
+    problem = mistake(model)
+    if problem is not None:
+        raise ConfigurationError(_texts(named, root, [problem]))
     return model
 
 
@@ -105,14 +105,14 @@ def _beside(path: Path) -> list[str]:
         return []
 
 
-def _got(item: ErrorDetails) -> str:
+def _actual_text(item: ErrorDetails) -> str:
     """Return an addition to pydantic's error with the given value, if its text lacks it."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
-    came: object = item["input"]
-    if isinstance(came, dict):
+    received: object = item["input"]
+    if isinstance(received, dict):
         return " (got fields)"
-    return " (got a list)" if isinstance(came, list) else f" (got {shown(came)})"
+    return " (got a list)" if isinstance(received, list) else f" (got {shown(received)})"
 
 
 def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
@@ -121,11 +121,13 @@ def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
         return hint(item, ())
     *place, _ = item["loc"]
     schema = _schema(kind)
-    found = [*_branches(schema, schema)]
+    branches = [*_branches(schema, schema)]
     for part in place:
-        children = [child for one in found for child in _children(schema, one, part)]
-        found = children or found  # pydantic's path also has the types of a union in it
-    return hint(item, dict.fromkeys(name for one in found for name in one.get("properties", {})))
+        children = [child for branch in branches for child in _children(schema, branch, part)]
+        branches = children or branches  # pydantic's path also has the types of a union in it
+    return hint(
+        item, dict.fromkeys(name for branch in branches for name in branch.get("properties", {}))
+    )
 
 
 @functools.cache
@@ -133,12 +135,12 @@ def _schema(kind: type[BaseModel]) -> dict[str, Any]:
     return kind.model_json_schema()
 
 
-def _children(schema: Any, one: Any, part: int | str) -> list[Any]:
-    kinds = [one["items"]] if isinstance(part, int) and "items" in one else []
-    if part in one.get("properties", {}):
-        kinds = [one["properties"][part]]
-    elif isinstance(one.get("additionalProperties"), dict):
-        kinds = [one["additionalProperties"]]
+def _children(schema: Any, schema_part: Any, part: int | str) -> list[Any]:
+    kinds = [schema_part["items"]] if isinstance(part, int) and "items" in schema_part else []
+    if part in schema_part.get("properties", {}):
+        kinds = [schema_part["properties"][part]]
+    elif isinstance(schema_part.get("additionalProperties"), dict):
+        kinds = [schema_part["additionalProperties"]]
     return [branch for kind in kinds for branch in _branches(schema, kind)]
 
 
@@ -169,8 +171,8 @@ def _field(place: Sequence[int | str]) -> list[str]:
 def _line(node: Any, loc: Sequence[int | str]) -> int:
     """Return the line of the deepest node on the path to ``loc`` that is in the file."""
     for part in loc:
-        found = _child(node, part)  # pydantic's path also has the kinds of faults in it
-        node = node if found is None else found
+        node_found = _child(node, part)  # pydantic's path also has the kinds of faults in it
+        node = node if node_found is None else node_found
     return int(node.start_mark.line) + 1
 
 

@@ -43,24 +43,24 @@ class BadYamlError(ConfigurationError):
         self.line = line
 
 
-def load(text: str, *, what: str = "YAML") -> Any:
+def load(text: str, *, label: str = "YAML") -> Any:
     """Return the data of a document; None for an empty one.
 
-    ``what``: the feature that needs PyYAML, for the error. Raises BadYamlError if it is no YAML, or
-    exceeds a bound; MissingExtraError if PyYAML is not installed.
+    ``label``: the feature that needs PyYAML, for the error. Raises BadYamlError if it is no YAML,
+    or exceeds a bound; MissingExtraError if PyYAML is not installed.
     """
-    root = compose(text, what=what)
+    root = compose(text, label=label)
     return None if root is None else construct(root)
 
 
-def compose(text: str, *, what: str = "YAML") -> Any:
+def compose(text: str, *, label: str = "YAML") -> Any:
     """Return the node of a document, for :func:`construct`; None if it is empty.
 
     Raises:
         BadYamlError: the text is no YAML, or exceeds a bound.
         MissingExtraError: PyYAML is not installed.
     """
-    yaml = yaml_module(what)
+    yaml = yaml_module(label)
     if len(text) > MAX_YAML_TEXT_CHARACTERS:
         raise BadYamlError(f"{len(text)} characters, expected {MAX_YAML_TEXT_CHARACTERS} at most")
     try:
@@ -85,9 +85,9 @@ def construct(root: Any) -> Any:
         loader.dispose()
 
 
-def yaml_module(what: str) -> Any:
+def yaml_module(label: str) -> Any:
     """Return PyYAML; raise MissingExtraError if it is not installed."""
-    return _extras.load("yaml", f"{what} needs")
+    return _extras.load("yaml", f"{label} needs")
 
 
 def _as_bad_yaml(exc: Exception) -> BadYamlError:
@@ -113,7 +113,7 @@ def _count(node: Any, known: dict[int, int]) -> int:
     if count is None:
         known[id(node)] = 0  # nodes that are being counted
         children = (
-            node.value if node.id == "sequence" else [one for row in node.value for one in row]
+            node.value if node.id == "sequence" else [child for row in node.value for child in row]
         )
         count = 1
         for child in children:

@@ -71,7 +71,11 @@ def _broker(text: str) -> str:
 
 
 def _prefix(text: str) -> str:
-    if any(one in text for one in "+#\0") or text.startswith(("/", "$")) or text.endswith("/"):
+    if (
+        any(character in text for character in "+#\0")
+        or text.startswith(("/", "$"))
+        or text.endswith("/")
+    ):
         raise ValueError("expected a topic without + and #, such as plant1/smartcam")
     return text
 
@@ -233,7 +237,7 @@ class MqttOutlet(Outlet[MqttSettings]):
             was_published(of, data, number, reason, properties)
 
         def on_connect(of: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
-            largest = getattr(properties, "MaximumPacketSize", None)  # of all of the packet
+            largest = getattr(properties, "MaximumPacketSize", None)  # size of the whole packet
             if largest is not None:
                 self._largest = min(self._largest, largest - MAX_HEADER_BYTES)
             was_connected(of, data, flags, reason, properties)
@@ -247,7 +251,7 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; return when the broker has acknowledged all."""
         messages = [_message(entry) for entry in entries]
-        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
+        topics = [self._topic(entry.kind, entry.camera or "all") for entry in entries]
         sizes = [
             len(topic.encode()) + len(message)
             for topic, message in zip(topics, messages, strict=True)
@@ -268,17 +272,17 @@ class MqttOutlet(Outlet[MqttSettings]):
 
     async def _while_here(self, calls: list[Any]) -> None:
         """Publish messages concurrently, in order, while the broker is connected."""
-        hearing = self._hearing
-        if hearing is None:
+        hearing_task = self._hearing
+        if hearing_task is None:
             for call in calls:
                 call.close()
             raise OutletError("not connected to the broker")
         publishing: asyncio.Future[Any] = asyncio.gather(*calls)
         try:
-            ends: set[asyncio.Future[Any]] = {publishing, hearing}
+            ends: set[asyncio.Future[Any]] = {publishing, hearing_task}
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-            if hearing.done():
-                hearing.result()
+            if hearing_task.done():
+                hearing_task.result()
             await publishing
         finally:
             publishing.cancel()
@@ -320,20 +324,20 @@ class MqttOutlet(Outlet[MqttSettings]):
     async def _hear(self, client: Any) -> None:
         """Publish states and receive commands until the broker's connection is lost."""
         loop = asyncio.get_running_loop()
-        telling = loop.create_task(self._tell_states(client))
-        hearing = loop.create_task(self._take_commands(client))
+        telling = loop.create_task(self._send_states(client))
+        listening_task = loop.create_task(self._take_commands(client))
         try:
-            await asyncio.wait({telling, hearing}, return_when=asyncio.FIRST_COMPLETED)
-            for task in (telling, hearing):
+            await asyncio.wait({telling, listening_task}, return_when=asyncio.FIRST_COMPLETED)
+            for task in (telling, listening_task):
                 if task.done():
                     task.result()
             raise OutletError("the broker is gone")
         finally:
-            for task in (telling, hearing):
+            for task in (telling, listening_task):
                 task.cancel()
-            await asyncio.wait({telling, hearing})
+            await asyncio.wait({telling, listening_task})
 
-    async def _tell_states(self, client: Any) -> None:
+    async def _send_states(self, client: Any) -> None:
         while True:
             await self._changed.wait()
             self._changed.clear()

@@ -55,7 +55,7 @@ class Outlets(Server):
 
     Args:
         section: settings by the outlet's name.
-        folder: folder to which relative paths refer, those of spools, secrets and stores.
+        folder: folder to which relative paths refer, such as paths of spools, secrets and stores.
         columns: function that returns names, types and units of an application's values, by its
             layout.
         command: function that carries out a command from an outlet.
@@ -154,7 +154,7 @@ class Outlets(Server):
         """
         check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
         answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
-        return {name: found for name, found in answers.items() if found is not None}
+        return {name: rows for name, rows in answers.items() if rows is not None}
 
     # ------------------------------------------------------------------ what cameras bring
 
@@ -194,12 +194,12 @@ class Outlets(Server):
             pump.outlet.state_changed(camera, state)
 
     def _of(self, camera: str) -> list[Pump]:
-        found = self._chosen.get(camera)
-        if found is None:
+        chosen = self._chosen.get(camera)
+        if chosen is None:
             pumps = self._pumps.values()
-            found = [one for one in pumps if one.outlet.settings.chooses(camera)]
-            self._chosen[camera] = found
-        return found
+            chosen = [pump for pump in pumps if pump.outlet.settings.chooses(camera)]
+            self._chosen[camera] = chosen
+        return chosen
 
 
 def _result(
@@ -217,8 +217,8 @@ def _result(
         raise
     except BaseException as exc:  # noqa: BLE001 - an interpreter is a plug-in
         text = str(exc) if isinstance(exc, SmartCamError) else text_of(exc)
-        kept = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
-        return "error", application, object_text({**result._asdict(), "value": None, **kept})
+        stored = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
+        return "error", application, object_text({**result._asdict(), "value": None, **stored})
 
 
 def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
@@ -228,13 +228,13 @@ def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
 
 def stored_accounts(section: Section, folder: Path) -> dict[str, OutletAccount | None]:
     """Return the accounts of a section's spools, by the outlet's name; None without a spool."""
-    found: dict[str, OutletAccount | None] = {}
+    accounts: dict[str, OutletAccount | None] = {}
     for name, given in section.items():
         settings = outlet_class(name, given).settings_class.model_validate(given)
-        found[name] = None
+        accounts[name] = None
         with contextlib.suppress(FileNotFoundError):
-            found[name] = read_account(spool_path(folder, settings, name))
-    return found
+            accounts[name] = read_account(spool_path(folder, settings, name))
+    return accounts
 
 
 LOCALIZATION: Sequence[Column] = (
@@ -262,6 +262,10 @@ def columns_of(interpreter: Interpreter | None) -> Sequence[Column]:
     if layout is None:
         return ()
     return [
-        (one.name, "real64" if one.unit else one.type, _SI.get(one.unit, "m") if one.unit else "")
-        for one in (*layout.head, *layout.fields)
+        (
+            part.name,
+            "real64" if part.unit else part.type,
+            _SI.get(part.unit, "m") if part.unit else "",
+        )
+        for part in (*layout.head, *layout.fields)
     ]

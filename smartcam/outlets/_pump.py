@@ -1,4 +1,4 @@
-"""Write entries to a spool, and deliver them from the spool to the far end."""
+"""Write entries to a spool on disk, and deliver them from there to an outlet's server."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ MAX_WRITTEN_TOGETHER = 500
 """Largest number of entries of one write to the spool."""
 
 GATHER_SECONDS = 0.002
-"""Seconds in which entries gather in memory before they are written together: so a write does not
-delay the trigger of its result, and many results need one write."""
+"""Seconds for which entries are collected in memory before they are written together: so a write
+does not delay the trigger, and many results need a single write."""
 
 DISK_RETRY_SECONDS = 1.0
 """Seconds until a disk that was full or unavailable is tried again."""
@@ -46,20 +46,20 @@ STOP_TIMEOUT = 10.0
 """Seconds for writing the waiting entries at the end."""
 
 LINGER = 1.0
-"""Seconds for delivering spooled entries at the end, if the far end accepts them."""
+"""Seconds for delivering spooled entries at the end, if the server accepts them."""
 
 CLOSE_TIMEOUT = 5.0
 """Seconds for an outlet's ``close``."""
 
 
 class Arrival(NamedTuple):
-    """A result or an error that is not yet made into an entry.
+    """A result or an error before an entry is made of it.
 
     Attributes:
         camera: name of the camera.
         number: number of the entry.
         at: time of arrival, seconds since 1970, UTC.
-        size: bytes that it takes in memory.
+        size: size in memory, bytes.
         make: function that returns kind, application and body of the entry; called in the spool's
             thread.
     """
@@ -77,7 +77,7 @@ class Pump:
     Args:
         outlet: the outlet.
         spool: spool of the outlet.
-        tell: function that is called with the reason why the far end or the disk fails, and with
+        report: function that is called with the reason why the server or the disk fails, and with
             "" when it works again.
 
     Attributes:
@@ -89,15 +89,17 @@ class Pump:
         self,
         outlet: Outlet[Any],
         spool: Spool,
-        tell: Callable[[str, str], None] = lambda _name, _why: None,
+        report: Callable[[str, str], None] = lambda _name, _why: None,
     ) -> None:
-        self.outlet, self.spool, self._tell = outlet, spool, tell
+        self.outlet, self.spool, self._report = outlet, spool, report
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
-        self._lost: dict[str, tuple[Arrival, int]] = {}  # dropped entries without a gap yet
+        self._lost: dict[
+            str, tuple[Arrival, int]
+        ] = {}  # dropped entries that no gap stands for yet
         self._numbers: dict[str, int] = {}
-        self._came, self._spooled = asyncio.Event(), asyncio.Event()
+        self._arrived, self._spooled = asyncio.Event(), asyncio.Event()
         self._account = OutletAccount()
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
@@ -124,7 +126,7 @@ class Pump:
             self._tasks.append(loop.create_task(work, name=f"smartcam.outlets.{self.outlet.name}"))
 
     async def stop(self) -> None:
-        """Stop, after writing the waiting entries to the spool, where they stay for the next start.
+        """Write the waiting entries to the spool, and stop; the next start delivers them.
 
         Cancellation: the spool's thread still finishes its work.
         """
@@ -137,7 +139,7 @@ class Pump:
                 with contextlib.suppress(Exception):  # the next start adds a gap for the rest
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._lost:
-                            await self._keep_some()
+                            await self._store_waiting()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(LINGER):
                         while (  # noqa: ASYNC110 - for a second at most
@@ -171,15 +173,15 @@ class Pump:
     ) -> None:
         """Accept a result or an error; never wait."""
         number = self._numbers[camera] = self._numbers.get(camera, 0) + 1
-        came = Arrival(camera, number, at, size, make)
+        arrival = Arrival(camera, number, at, size, make)
         if (
             len(self._waiting) >= MAX_WAITING
             or self._waiting_bytes + size > MAX_WAITING_BYTES
-            or self._lost  # entries after a gap stay after it
+            or self._lost  # later entries must not overtake the gap
         ):
-            self._lost[camera] = came, self._lost.get(camera, (came, 0))[1] + 1
+            self._lost[camera] = arrival, self._lost.get(camera, (arrival, 0))[1] + 1
         else:
-            self._waiting.append(came)
+            self._waiting.append(arrival)
             self._waiting_bytes += size
         if self._gathering is None:
             loop = asyncio.get_running_loop()
@@ -187,71 +189,77 @@ class Pump:
 
     def _gathered(self) -> None:
         self._gathering = None
-        self._came.set()
+        self._arrived.set()
 
     @property
     def account(self) -> OutletAccount:
-        """The account of all entries, with those that wait in memory."""
-        kept, waiting = self._account, len(self._waiting)
+        """The account of all entries, including the ones in memory."""
+        counts, waiting = self._account, len(self._waiting)
         lost = sum(count for _, count in self._lost.values())
-        dropped = dict(kept.dropped)
+        dropped = dict(counts.dropped)
         if lost:
             dropped["memory"] = dropped.get("memory", 0) + lost
         return OutletAccount(
-            kept.results + waiting + lost, kept.delivered, kept.spooled + waiting, dropped
+            counts.results + waiting + lost, counts.delivered, counts.spooled + waiting, dropped
         )
 
     # ------------------------------------------------------------------ into the spool
 
     async def _write(self) -> None:
         while True:
-            await self._came.wait()
-            self._came.clear()
+            await self._arrived.wait()
+            self._arrived.clear()
             while self._waiting or self._lost:
                 try:
-                    await self._keep_some()
+                    await self._store_waiting()
                 except Exception as exc:  # noqa: BLE001 - after any error entries are kept
-                    self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
+                    self._report_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                     self._account = self.spool.account
                     await asyncio.sleep(DISK_RETRY_SECONDS)
                 else:
-                    self._say_disk("")
+                    self._report_disk("")
 
-    async def _keep_some(self) -> None:
-        """Write the first waiting entries, or the gap after all of them."""
-        batch = [one for one, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)]
+    async def _store_waiting(self) -> None:
+        """Write the first waiting entries; if none wait, the gaps of dropped ones."""
+        batch = [
+            arrival for arrival, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)
+        ]
         lost = {} if batch else dict(self._lost)
-        await self._kept(batch, lost)
+        await self._store_arrivals(batch, lost)
 
-    async def _kept(self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]) -> None:
+    async def _store_arrivals(
+        self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]
+    ) -> None:
         epoch = self.spool.epoch
 
         def work() -> OutletAccount:
             entries = list[OutletEntry]()
-            for one in batch:
-                kind, application, body = one.make()
-                entry = OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
+            for arrival in batch:
+                kind, application, body = arrival.make()
+                entry = OutletEntry(
+                    arrival.camera, epoch, arrival.number, kind, application, arrival.at, body
+                )
                 entries.append(entry)
             gaps = [
                 (
-                    OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),
+                    OutletEntry(arrival.camera, epoch, arrival.number, "gap", None, arrival.at, ""),
                     count,
                     _MEMORY,
                 )
-                for one, count in lost.values()
+                for arrival, count in lost.values()
             ]
             self.spool.add(entries, gaps)
             return self.spool.account
 
-        await self._run(work, lambda account: self._drop_kept(batch, lost, account))
+        await self._run(work, lambda account: self._remove_stored(batch, lost, account))
         self._spooled.set()
 
-    def _drop_kept(
+    def _remove_stored(
         self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]], account: OutletAccount
     ) -> None:
-        for one in batch:
+        for arrival in batch:
             self._waiting.popleft()
-            self._waiting_bytes -= one.size
+            self._waiting_bytes -= arrival.size
         for camera, (_, count) in lost.items():
             last, now = self._lost.pop(camera)
             if now > count:
@@ -273,21 +281,21 @@ class Pump:
 
         running = asyncio.wrap_future(self._thread.submit(guarded))
         try:
-            found = await asyncio.shield(running)
+            outcome = await asyncio.shield(running)
         except asyncio.CancelledError:
             await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang forever
             if running.done() and running.exception() is None:
                 then(running.result())
             raise
-        then(found)
-        return found
+        then(outcome)
+        return outcome
 
-    def _say_disk(self, why: str) -> None:
+    def _report_disk(self, why: str) -> None:
         if why != self.disk_trouble:
             self.disk_trouble = why
             log = logger.error if why else logger.info
             log("outlet %s: %s", self.outlet.name, why or "the spool is written again")
-            self._tell(self.outlet.name, why)
+            self._report(self.outlet.name, why)
 
     # ------------------------------------------------------------------ to the far end
 
@@ -306,11 +314,11 @@ class Pump:
             except asyncio.CancelledError:
                 if _cancelled():
                     raise
-                self._say_far("it cancelled its own work")
+                self._report_delivery("the outlet cancelled its own work")
             except ENDS_PROGRAM:
                 raise
-            except BaseException as exc:  # noqa: BLE001 - a plug-in raises what it likes
-                self._say_far(text_of(exc))
+            except BaseException as exc:  # noqa: BLE001 - a plug-in may raise anything
+                self._report_delivery(text_of(exc))
             await asyncio.sleep(next(delays))
 
     async def _close_outlet(self) -> None:
@@ -321,14 +329,14 @@ class Pump:
             raise
         except ENDS_PROGRAM:
             raise
-        except BaseException as exc:  # noqa: BLE001 - a plug-in raises what it likes
+        except BaseException as exc:  # noqa: BLE001 - a plug-in may raise anything
             logger.debug("outlet %s: closing: %s", self.outlet.name, text_of(exc))
 
     async def _deliver_some(self) -> bool:
         """Deliver a batch, or wait for one; return True if one was delivered.
 
-        After a failed batch, entries are delivered one by one at first: if the far end fails at one
-        of them, earlier ones are not delivered again and again.
+        After a failed batch, entries are delivered singly at first: if the server fails at one,
+        earlier entries are not delivered again.
         """
         self._spooled.clear()
         together, self._together = self._together, 1
@@ -336,7 +344,7 @@ class Pump:
         if not waiting.places:
             self._together = together
             if self.trouble:
-                self._say_far("")
+                self._report_delivery("")
             await self._idle()
             return False
         try:
@@ -354,7 +362,7 @@ class Pump:
         else:
             await self._forget(waiting, None, "")
         self._together = min(2 * together, self.outlet.max_batch)
-        self._say_far("")
+        self._report_delivery("")
         return True
 
     async def _forget(self, waiting: SpoolHead, count: int | None, refused: str) -> None:
@@ -368,7 +376,7 @@ class Pump:
             try:
                 await self._run(work, self._set_account)
             except sqlite3.Error as exc:
-                self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
+                self._report_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                 await asyncio.sleep(DISK_RETRY_SECONDS)
             else:
                 return
@@ -380,26 +388,26 @@ class Pump:
         """Wait until something is spooled.
 
         Raises:
-            Exception: the far end is lost.
+            Exception: the server is lost.
         """
         loop = asyncio.get_running_loop()
-        came = loop.create_task(self._spooled.wait())
+        arrival = loop.create_task(self._spooled.wait())
         watching = loop.create_task(self.outlet.watch())
         try:
-            await asyncio.wait({came, watching}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({arrival, watching}, return_when=asyncio.FIRST_COMPLETED)
             if watching.done():
                 watching.result()
         finally:
-            for task in (came, watching):
+            for task in (arrival, watching):
                 task.cancel()
-            await asyncio.wait({came, watching})
+            await asyncio.wait({arrival, watching})
 
-    def _say_far(self, why: str) -> None:
+    def _report_delivery(self, why: str) -> None:
         if why != self.trouble:
             self.trouble = why
             log = logger.warning if why else logger.info
             log("outlet %s: %s", self.outlet.name, why or "delivers again")
-            self._tell(self.outlet.name, why)
+            self._report(self.outlet.name, why)
 
 
 _MEMORY = "the spool's disk was full, away or too slow"

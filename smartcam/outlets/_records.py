@@ -29,13 +29,13 @@ def records_of(value: Any) -> list[dict[str, Any]] | None:
     """Return the records of a value, a mapping of plain values each; None if it has none."""
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
-        lists = [name for name, one in fields.items() if isinstance(one, list)]
-        if len(lists) == 1 and all(isinstance(one, dict) for one in fields[lists[0]]):
-            head = {name: one for name, one in fields.items() if name != lists[0]}
-            return [_flat({**head, **one}) for one in fields[lists[0]]] or [_flat(head)]
+        lists = [name for name, field in fields.items() if isinstance(field, list)]
+        if len(lists) == 1 and all(isinstance(item, dict) for item in fields[lists[0]]):
+            head = {name: field for name, field in fields.items() if name != lists[0]}
+            return [_flat({**head, **item}) for item in fields[lists[0]]] or [_flat(head)]
         return [_flat(fields)]
-    if isinstance(value, list) and all(isinstance(one, dict) for one in value):
-        return [_flat(one) for one in cast("list[dict[str, Any]]", value)]
+    if isinstance(value, list) and all(isinstance(item, dict) for item in value):
+        return [_flat(item) for item in cast("list[dict[str, Any]]", value)]
     return None
 
 
@@ -46,7 +46,7 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
         return record
     parts = cast("dict[str, dict[str, Any]]", pose)
     turned = {f"q{axis}": value for axis, value in parts["orientation"].items()}
-    rest = {name: one for name, one in record.items() if name != "pose"}
+    others = {name: value for name, value in record.items() if name != "pose"}
     errors = (parts.get("sigma") or {}).items()
-    off = {name if "_" in name else f"sigma_{name}": one for name, one in errors}
-    return {**rest, **parts["position"], **turned, **off}
+    sigmas = {name if "_" in name else f"sigma_{name}": value for name, value in errors}
+    return {**others, **parts["position"], **turned, **sigmas}

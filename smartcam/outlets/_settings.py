@@ -61,10 +61,10 @@ class Secret(_OutletFields):
             ConfigurationError: the secret does not exist; the text names its place.
         """
         if self.variable is not None:
-            found = os.environ.get(self.variable)
-            if found is None:
+            value = os.environ.get(self.variable)
+            if value is None:
                 raise ConfigurationError(f"the environment variable {self.variable} is not set")
-            return found
+            return value
         path = folder / Path(self.file or "").expanduser()
         try:
             with path.open("rb") as stream:
@@ -137,10 +137,10 @@ def outlet_class(name: str, given: Mapping[str, Any]) -> type[Outlet[Any]]:
         PluginError: its kind is unknown or cannot be loaded.
     """
     kind = given.get("kind") or name
-    found = OUTLETS.load(str(kind))
-    if not (isinstance(found, type) and issubclass(found, Outlet)):
+    class_ = OUTLETS.load(str(kind))
+    if not (isinstance(class_, type) and issubclass(class_, Outlet)):
         raise PluginError(f"smartcam.outlets: {kind} is no class of Outlet", name=str(kind))
-    return found
+    return class_
 
 
 def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:

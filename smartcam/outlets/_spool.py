@@ -146,9 +146,9 @@ class Spool:
             _check_versions(self.path)
             database.execute("BEGIN IMMEDIATE")
             database.execute("COMMIT")
-            ((found,),) = database.execute("PRAGMA quick_check(1)").fetchall()
-            if found != "ok":
-                raise sqlite3.DatabaseError(found)
+            ((answer,),) = database.execute("PRAGMA quick_check(1)").fetchall()
+            if answer != "ok":
+                raise sqlite3.DatabaseError(answer)
             database.executescript(_SCHEMA)
             self._load(database)
         except BaseException:
@@ -167,7 +167,7 @@ class Spool:
         before, last = counts.get("epoch", 0), self._last_epoch()
         self.epoch = max(before + 1, last + 1, time.time_ns() // 1000)
         with _transaction(database):
-            if counts.get("running"):  # nobody ended it: what waited in memory is gone
+            if counts.get("running"):  # no end was written: results that waited in memory are lost
                 why = "the process ended at once; what came behind the last entry may be missing"
                 for camera, epoch, number in _last_numbers(database):
                     _add_gap(database, _gap(camera, epoch, number + 1), 0, why, 0)
@@ -175,7 +175,7 @@ class Spool:
             database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
             if last > before:
                 why = "the spool is gone, or older than its last start; what it had is missing"
-                self._tell_all(database, 0, why)
+                self._add_common_gap(database, 0, why)
             _set(database, {"epoch": self.epoch, "running": 1})
         self._counts = {**counts, "epoch": self.epoch, "running": 1}
 
@@ -192,7 +192,7 @@ class Spool:
             os.lseek(self._lock, 0, os.SEEK_SET)
             os.write(self._lock, b"%20d" % epoch)
 
-    def _tell_all(self, database: sqlite3.Connection, lost: int, why: str) -> None:
+    def _add_common_gap(self, database: sqlite3.Connection, lost: int, why: str) -> None:
         """Add a gap of all cameras."""
         ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
         gap = _gap("", epoch, number + 1)
@@ -227,14 +227,16 @@ class Spool:
     def _forget_damaged(self) -> None:
         pattern = f"{self.path.name}.damaged-*"
         names = sorted(
-            one for one in self.path.parent.glob(pattern) if one.name[-4:] not in ("-wal", "-shm")
+            path
+            for path in self.path.parent.glob(pattern)
+            if path.name[-4:] not in ("-wal", "-shm")
         )
-        for one in names[:-MAX_DAMAGED_FILES]:
+        for name in names[:-MAX_DAMAGED_FILES]:
             for suffix in ("", "-wal", "-shm"):
-                one.with_name(one.name + suffix).unlink(missing_ok=True)
+                name.with_name(name.name + suffix).unlink(missing_ok=True)
 
     @property
-    def _there(self) -> sqlite3.Connection:
+    def _open_database(self) -> sqlite3.Connection:
         if self._database is None:
             raise sqlite3.OperationalError("the spool is closed")
         return self._database
@@ -253,18 +255,21 @@ class Spool:
         Raises:
             sqlite3.Error: the disk is full or unavailable; no entry was written or counted.
         """
-        database = self._there
+        database = self._open_database
         new = dict(self._counts)
         with _transaction(database):
             for last, count, why in lost:
                 _add_gap(database, last, count, why, self._in_flight)
                 new["results"] = new.get("results", 0) + count
                 new["dropped.memory"] = new.get("dropped.memory", 0) + count
-            came = sum(entry.kind != "gap" for entry in entries)
-            new["results"] = new.get("results", 0) + came
+            results = sum(entry.kind != "gap" for entry in entries)
+            new["results"] = new.get("results", 0) + results
             taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
-            kept, refused = entries[:taken], [one for one in entries[taken:] if one.kind != "gap"]
-            size = self._write(database, kept)
+            accepted, refused = (
+                entries[:taken],
+                [entry for entry in entries[taken:] if entry.kind != "gap"],
+            )
+            size = self._write(database, accepted)
             for last, count in _by_camera(refused):
                 _add_gap(database, last, count, "the spool was full", self._in_flight)
             if refused:
@@ -274,7 +279,7 @@ class Spool:
             _set(database, new)
         self._counts = new
         self._bytes += size - freed
-        self._spooled += sum(entry.kind != "gap" for entry in kept) - gone
+        self._spooled += sum(entry.kind != "gap" for entry in accepted) - gone
 
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
         rows = [_row(entry, place) for place, entry in enumerate(entries, _next_place(database))]
@@ -307,7 +312,7 @@ class Spool:
             places.append(place)
             dropped.append(OutletEntry(*fields))
             freed += size_of
-        database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+        database.executemany("DELETE FROM entries WHERE place = ?", [(place,) for place in places])
         last_places = {entry.camera: place for entry, place in zip(dropped, places, strict=True)}
         for last, count in _by_camera(dropped):
             place = last_places[last.camera]
@@ -321,7 +326,7 @@ class Spool:
         """Return the oldest entries, ``most`` at most, which stay in flight until :meth:`done`."""
         while True:
             places, entries, bad = list[int](), list[OutletEntry](), list[int]()
-            for place, checksum, *fields in self._there.execute(
+            for place, checksum, *fields in self._open_database.execute(
                 f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
                 (most,),
             ):
@@ -338,11 +343,13 @@ class Spool:
 
     def _discard(self, places: Sequence[int]) -> None:
         """Drop damaged entries, and add a gap for them."""
-        database, counts = self._there, dict(self._counts)
+        database, counts = self._open_database, dict(self._counts)
         with _transaction(database):
-            database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+            database.executemany(
+                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+            )
             lost = _settle(database, counts)
-            self._tell_all(database, lost, "entries of the spool were damaged")
+            self._add_common_gap(database, lost, "entries of the spool were damaged")
             _set(database, counts)
         self._counts = counts
         self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
@@ -355,7 +362,7 @@ class Spool:
             count: number of accepted entries.
             refused: reason why the far end refused the next one; "" if it did not.
         """
-        database = self._there
+        database = self._open_database
         if waiting.epoch != self.epoch:
             return  # the spool was renewed meanwhile: they come again, with the same ids
         taken = len(waiting.places) if count is None else count
@@ -370,10 +377,12 @@ class Spool:
                 if entry.kind != "gap":
                     counts["dropped.refused"] = self._counts.get("dropped.refused", 0) + 1
                     gone += 1
-            database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+            database.executemany(
+                "DELETE FROM entries WHERE place = ?", [(place,) for place in places]
+            )
             _set(database, counts)
         self._counts |= counts
-        freed = sum(len(one.body) + ROW_BYTES for one in entries if one.kind != "gap")
+        freed = sum(len(entry.body) + ROW_BYTES for entry in entries if entry.kind != "gap")
         self._bytes -= freed
         self._spooled -= gone
         self._in_flight = 0
@@ -436,7 +445,7 @@ def _check_versions(path: Path) -> None:
     """
     with path.open("rb") as file:
         versions = file.read(20)[18:]
-    if any(one not in {1, 2} for one in versions):
+    if any(version not in {1, 2} for version in versions):
         raise sqlite3.DatabaseError(f"expected the versions 1 or 2, got {versions.hex(' ')}")
 
 
@@ -451,7 +460,7 @@ def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
         sqlite3.DatabaseError: the entries are damaged.
     """
     counts = dict(database.execute("SELECT name, value FROM counts"))
-    if not all(isinstance(one, int) and one >= 0 for one in counts.values()):
+    if not all(isinstance(count, int) and count >= 0 for count in counts.values()):
         raise sqlite3.DatabaseError("a count is none")
     return counts
 
@@ -513,8 +522,8 @@ def _next_place(database: sqlite3.Connection) -> int:
     Raises:
         sqlite3.DatabaseError: the file's record of the last place is damaged.
     """
-    found = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
-    last = 0 if found is None else found[0]
+    row = database.execute("SELECT seq FROM sqlite_sequence WHERE name = 'entries'").fetchone()
+    last = 0 if row is None else row[0]
     if not isinstance(last, int) or not 0 <= last < MAX_PLACE - MAX_PLACES_AT_ONCE:
         raise sqlite3.DatabaseError(f"expected the last place of an entry, got {last!r:.40}")
     return last + 1
@@ -533,10 +542,10 @@ def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
 
 def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
     """Return the last entry of each camera, and the number of the camera's entries."""
-    found: dict[str, tuple[OutletEntry, int]] = {}
+    gaps: dict[str, tuple[OutletEntry, int]] = {}
     for entry in entries:
-        found[entry.camera] = entry, found.get(entry.camera, (entry, 0))[1] + 1
-    return [*found.values()]
+        gaps[entry.camera] = entry, gaps.get(entry.camera, (entry, 0))[1] + 1
+    return [*gaps.values()]
 
 
 def _add_gap(
@@ -561,21 +570,21 @@ def _add_gap(
         unknown: whether more may be missing than the count.
     """
     unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
-    for there, checksum, *fields in database.execute(
+    for gap_place, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
         (last.camera, in_flight, MAX_PLACE if place is None else place),
     ):
         entry = OutletEntry(*fields)
-        if entry.kind != "gap" or _checksum(entry, there) != checksum:
+        if entry.kind != "gap" or _checksum(entry, gap_place) != checksum:
             break
         older = json.loads(entry.body)
         count += older["lost"]
         unknown = unknown or older["at_least"]
         reasons.append(older["error"])
-        gone.append((there,))
+        gone.append((gap_place,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
-    each = dict.fromkeys(one for text in reversed(reasons) for one in text.split("; "))
+    each = dict.fromkeys(reason for text in reversed(reasons) for reason in text.split("; "))
     error = "; ".join(each)[:MAX_REASON_CHARACTERS]
     body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)

@@ -60,7 +60,7 @@ _TYPES = {
     "string": "TEXT",
     "real32": "REAL",
     "real64": "REAL",
-    "uint64": "BLOB",  # as they come; an INTEGER's column makes a REAL of digits that are too many
+    "uint64": "BLOB",  # keeps values as they are; INTEGER makes a REAL of too many digits
 }
 _OWN = frozenset({"id", "record", "rowid"})
 
@@ -111,7 +111,7 @@ class ResultStore(Outlet[StoreSettings]):
         await _done(self._file.submit(self._file.open))
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
-        """Write entries, all or none; before an unfit entry, write those that precede it."""
+        """Write entries, all or none; before an unfit entry, write the preceding ones."""
         file = self._file
         if file is None:
             raise sqlite3.OperationalError("the store is closed")
@@ -159,7 +159,7 @@ class _StoreFile:
         self._database: sqlite3.Connection | None = None
         self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns of one batch
         self._expired = 0.0
-        self._identity: object = None  # of the file that is open
+        self._identity: object = None  # identity of the open file
 
     def submit(self, work: Callable[[], None], *, last: bool = False) -> Future[None]:
         """Run work in the thread; with ``last`` the thread ends afterwards."""
@@ -203,10 +203,10 @@ class _StoreFile:
     def _identity_there(self) -> object:
         """Return the device and the number of the file at the path; None without one."""
         try:
-            there = self.path.stat()
+            status = self.path.stat()
         except FileNotFoundError:
             return None
-        return there.st_dev, there.st_ino
+        return status.st_dev, status.st_ino
 
     def close(self) -> None:
         """Close the file."""
@@ -316,18 +316,18 @@ class _StoreFile:
         known: dict[str, str],
         wanted: Column,
     ) -> None:
-        """Add the column of a value to those that are known, created if needed."""
+        """Add the column of a value to the known columns, created if needed."""
         name, kind, unit = wanted
-        there = database.execute(
+        rows = database.execute(
             "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)
         ).fetchall()
-        for of, column, its_kind, its_unit in there:
+        for of, column, its_kind, its_unit in rows:
             if (of, _affinity(its_kind), its_unit) == (name, _affinity(kind), unit):
                 known[name] = column
                 return
-        if len(there) >= MAX_COLUMNS:
+        if len(rows) >= MAX_COLUMNS:
             return
-        taken = {column.lower() for _, column, _, _ in there} | _OWN
+        taken = {column.lower() for _, column, _, _ in rows} | _OWN
         column = base = re.sub(r"\W", "_", name)[:MAX_COLUMN_CHARACTERS] or "value"
         if column.lower() in taken:
             column = base = f"{base}_{unit or kind}"
@@ -345,8 +345,8 @@ class _StoreFile:
         pattern, folder = self.settings.pictures, self.path.parent
         if pattern is None or entry.kind == "gap":
             return None
-        found = picture_of(pattern, folder, fields)
-        return None if found is None else str(found.relative_to(folder))
+        picture = picture_of(pattern, folder, fields)
+        return None if picture is None else str(picture.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:
         """Delete results beyond the bounds of age and size, a part at a time."""
@@ -382,7 +382,7 @@ def _readable(value: Any) -> Any:
         return value if value.isascii() else value.encode(errors="replace").decode()
     if isinstance(value, dict):
         fields = cast("dict[str, Any]", value)
-        return {_readable(name): _readable(one) for name, one in fields.items()}
+        return {_readable(name): _readable(field) for name, field in fields.items()}
     return [*map(_readable, value)] if isinstance(value, list) else value
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 READ_TIMEOUT = 20.0
 """Seconds of the timeout of a query."""
 
-STEPS_BETWEEN_LOOKS = 10_000
+STEPS_BETWEEN_CHECKS = 10_000
 """Steps of SQLite's machine between two checks of the time."""
 
 COLUMNS = (
@@ -87,7 +87,7 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
     end = time.monotonic() + READ_TIMEOUT
     try:
         with contextlib.closing(open_for_reading(path, timeout=5.0)) as database:
-            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_LOOKS)
+            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_CHECKS)
             return _read(database, question)
     except sqlite3.Error as exc:
         raise ConfigurationError(f"results {path}: expected a store of results: {exc}") from exc
@@ -118,8 +118,8 @@ def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResult
         f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {of}",
         values,
     ).fetchone()
-    found = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
-    return StoredResults(found, total, failed, errors, gaps, lost, bool(at_least))
+    records = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
+    return StoredResults(records, total, failed, errors, gaps, lost, bool(at_least))
 
 
 def _failure_condition(database: sqlite3.Connection) -> str:
@@ -132,9 +132,9 @@ def _failure_condition(database: sqlite3.Connection) -> str:
         if good is not None:
             quoted = column.replace('"', '""')
             conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
-    found = [
+    conditions_sql = [
         f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
         for application, each in conditions.items()
     ]
-    either = " OR ".join(["kind != 'result'", *found])
+    either = " OR ".join(["kind != 'result'", *conditions_sql])
     return f"({either})"

@@ -1,6 +1,6 @@
 """The parts of a protocol: dialects, roles with their policies, the entry point.
 
-A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
+A :class:`Dialect` is one wire variant as the client uses it, in any form of frames;
 ``_framed/dialect.py`` has the dialect of binary frames. A :class:`Policy`, chosen by role and
 transport, decides how broken input is handled.
 """

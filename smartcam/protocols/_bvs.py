@@ -344,7 +344,7 @@ BID = FramedDialect(
             0x0100: Status.OVERTRIGGERED,  # Trigger Error; from the example on p. 227, derived
         },
         without={0x0020: Status.BUSY},  # Ready; from the example on p. 227, derived
-        always=Status.RUNNING,  # it has neither start nor stop
+        always=Status.RUNNING,  # the dialect has neither start nor stop
         others=32,
     ),
     codes=CODES,

@@ -57,14 +57,14 @@ class HeldResults:
         self._unanswered: set[int] = set()  # numbers of questions without an answer
         self._named: int | None = None  # the application that the camera named last
         self._before_trigger = 0  # number of the question before the last trigger
-        self._seen: set[int] | None = None  # applications named since that question
+        self._numbers_seen: set[int] | None = None  # applications named since that question
 
     def ask(self, *, trigger: bool = False) -> int:
         """Return the number of a new question, which may stand before a trigger."""
         self._last += 1
         self._unanswered.add(self._last)
         if trigger:
-            self._before_trigger, self._seen = self._last, set()
+            self._before_trigger, self._numbers_seen = self._last, set()
         return self._last
 
     def add(self, messages: tuple[Event, ...], *, answers_trigger: bool) -> bool:
@@ -73,12 +73,12 @@ class HeldResults:
         Raises:
             FrameError: too many events wait for an answer.
         """
-        results = [one for one in messages if isinstance(one, m.ResultContainer)]
+        results = [message for message in messages if isinstance(message, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
-        if answers_trigger and self._seen is not None:
-            seen, self._seen = self._seen, None
+        if answers_trigger and self._numbers_seen is not None:
+            seen, self._numbers_seen = self._numbers_seen, None
         if results:
-            size = sum(len(one.data) for one in results)
+            size = sum(len(result.data) for result in results)
             self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
             self._size += size
         elif self._waiting:
@@ -108,8 +108,8 @@ class HeldResults:
         """
         self._named = application
         self._unanswered.discard(question)
-        held = [one for one in self._waiting if isinstance(one, _Held)]
-        for seen in (self._seen, *(one.seen for one in held)):
+        held = [item for item in self._waiting if isinstance(item, _Held)]
+        for seen in (self._numbers_seen, *(item.seen for item in held)):
             if seen is not None:
                 seen.add(application)
         self._release()
@@ -150,8 +150,8 @@ def _with_application(held: _Held, named: int | None, *, unknown: bool) -> tuple
         fault = f"the application changed while the result was made: it may be of any of {which}"
     application = m.UNNAMED_APPLICATION if named is None else named
     return tuple(
-        replace(one, application=application, fault=one.fault or fault)
-        if isinstance(one, m.ResultContainer)
-        else one
-        for one in held.messages
+        replace(message, application=application, fault=message.fault or fault)
+        if isinstance(message, m.ResultContainer)
+        else message
+        for message in held.messages
     )

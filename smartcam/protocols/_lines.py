@@ -131,7 +131,7 @@ class LineDialect(Dialect):
     """A dialect of lines.
 
     Args:
-        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
+        name, about, source, quirks: as for :class:`~smartcam.protocols.Dialect`.
         rows: requests and answers; ``Connect`` and ``Query`` are needed.
         ids: the ids that applications may have.
         line_end: end of each line, one or two bytes.
@@ -222,7 +222,7 @@ class LineDialect(Dialect):
         row = self.row(type(message))
         if row is None:
             raise self.unsupported(type(message))
-        values = {one.name: getattr(message, one.name) for one in fields(message)}
+        values = {attribute.name: getattr(message, attribute.name) for attribute in fields(message)}
         texts = {
             key: value.decode(self.encoding, "replace") if isinstance(value, bytes) else value
             for key, value in values.items()
@@ -295,8 +295,8 @@ class LineDialect(Dialect):
     def _twin(self, message: LineCommand) -> LineRow | None:
         """Return the row of a request of the client that sends the same command."""
         word = _command_word(message.line)
-        own = (row for row in self.rows if row.request not in {None, LineCommand})
-        return next((row for row in own if _command_word(row.line) == word), None)
+        own_rows = (row for row in self.rows if row.request not in {None, LineCommand})
+        return next((row for row in own_rows if _command_word(row.line) == word), None)
 
     def row_of(self, message: m.Message) -> LineRow | None:
         """Return the row of a message; a user's line is answered like the client's same command."""
@@ -496,7 +496,9 @@ class LineMachine:
 
     def _known_by(self, word: str) -> _OpenRequest | None:
         """Return the request whose answer is matched by a word."""
-        return next((one for one in self._open if one.sent and one.word == word), None)
+        return next(
+            (request for request in self._open if request.sent and request.word == word), None
+        )
 
     def _report_unasked(self, word: str, text: str, *, by_word: bool = False) -> bool:
         """Report a line that the camera sent by itself; return False if no row has such a line.
@@ -513,7 +515,7 @@ class LineMachine:
                 reported = row.read(text)
             except (ValueError, LookupError):
                 continue
-            self._add(reported, asked=False)
+            self._add(reported, is_answer=False)
             return True
         return False
 
@@ -557,31 +559,33 @@ class LineMachine:
         if request.question:
             self._name(reported, request.question)
         else:
-            self._add(reported, asked=row.request is m.Trigger)
+            self._add(reported, is_answer=row.request is m.Trigger)
         if self._open and not self._open[0].sent and self.state is State.CONNECTED:
             self._send_line(self._open[0])
 
-    def _add(self, reported: Reported, *, asked: bool) -> None:
+    def _add(self, reported: Reported, *, is_answer: bool) -> None:
         """Report messages; mark containers as answers to a Trigger or not, if that is known."""
         messages = reported if isinstance(reported, tuple) else (reported,)
         if self._marks:
             messages = tuple(
-                replace(one, asked=asked) if isinstance(one, m.ResultContainer) else one
-                for one in messages
+                replace(message, asked=is_answer)
+                if isinstance(message, m.ResultContainer)
+                else message
+                for message in messages
             )
         if self._query is None:
             self._held.pass_on(messages)
             return
-        if self._held.add(messages, answers_trigger=asked):
+        if self._held.add(messages, answers_trigger=is_answer):
             self._ask_application()
         self._name(messages)
 
     def _name(self, reported: Reported, question: int = 0) -> None:
         """Note which application is active; ask again if results came after the question."""
-        for one in reported if isinstance(reported, tuple) else (reported,):
-            if not isinstance(one, m.QueryAnswer | m.SwitchAnswer):
+        for message in reported if isinstance(reported, tuple) else (reported,):
+            if not isinstance(message, m.QueryAnswer | m.SwitchAnswer):
                 continue
-            if self._held.name(one.application, question):
+            if self._held.name(message.application, question):
                 self._ask_application()
 
     def _ask_application(self, *, trigger: bool = False) -> None:
@@ -627,9 +631,13 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        same = [one for one in self._open if one.row.request is row.request and not one.question]
+        same = [
+            request
+            for request in self._open
+            if request.row.request is row.request and not request.question
+        ]
         if kind is m.GetStatus:
-            if not all(one.sent for one in same):
+            if not all(request.sent for request in same):
                 return
         elif same:
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
@@ -665,7 +673,7 @@ class LineMachine:
 
     def _next_ticket(self) -> str:
         """Return a ticket that no waiting request has."""
-        used = {one.word for one in self._open}
+        used = {request.word for request in self._open}
         return next(ticket for ticket in self._tickets if ticket not in used)
 
     def data_to_send(self) -> list[bytes]:

@@ -32,7 +32,7 @@ class State(enum.Enum):
     CONNECTING = "connecting"
     """Connect was sent, its answer has not come."""
     CONNECTED = "connected"
-    """In a session."""
+    """A session is open."""
     DISCONNECTED = "disconnected"
     """Disconnect was sent; messages that were under way may still come."""
     CLOSED = "closed"
@@ -66,15 +66,15 @@ class ResultBurst:
     size: int
 
     def __iter__(self) -> Iterator[m.ResultContainer]:
-        return (m.ResultContainer(application=self.application, data=one) for one in self.data)
+        return (m.ResultContainer(application=self.application, data=data) for data in self.data)
 
     def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
         """Return the first ``count`` containers and the others."""
-        data, rest = self.data[:count], self.data[count:]
+        data, remaining = self.data[:count], self.data[count:]
         size = sum(map(len, data))
         return (
             ResultBurst(application=self.application, data=data, size=size),
-            ResultBurst(application=self.application, data=rest, size=self.size - size),
+            ResultBurst(application=self.application, data=remaining, size=self.size - size),
         )
 
 

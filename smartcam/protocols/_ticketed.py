@@ -90,12 +90,12 @@ class TicketedDialect(LineDialect):
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
         """Return a frame in readable form."""
-        asked = sender.value == "client"  # the client's frames are traced with their header
-        headed = asked and self.asks_with_length
+        from_client = sender.value == "client"  # the client's frames are traced with their header
+        headed = from_client and self.asks_with_length
         body = frame.payload.partition(b"\r\n")[2] if headed else frame.payload
         ticket, content = body[: self.width].decode(ENCODING), body[self.width :]
         data = frame.payload + self.line_end
-        if not asked:
+        if not from_client:
             data = self.frame(content, ticket, length=self.digits > 0)
         return Spelled(None, "frame", {"ticket": ticket, "text": content.decode(ENCODING)}, data)
 

@@ -51,14 +51,14 @@ class FileName(NamedTuple):
     @classmethod
     def parse(cls, name: str) -> FileName | None:
         """Return the parts of a name; None if it is not a recorder's."""
-        found = _NAME.fullmatch(name)
-        if found is None:
+        match = _NAME.fullmatch(name)
+        if match is None:
             return None
         try:
-            at = datetime.strptime(found["at"], _AT).replace(tzinfo=UTC)
+            at = datetime.strptime(match["at"], _AT).replace(tzinfo=UTC)
         except ValueError:
             return None
-        return cls(found["camera"].replace(".", "/"), at)
+        return cls(match["camera"].replace(".", "/"), at)
 
     def __str__(self) -> str:
         at = self.at.strftime("%Y%m%dT%H%M%S.") + f"{self.at.microsecond // 1000:03d}"
@@ -101,8 +101,8 @@ def files_of(folder: Path) -> Iterator[tuple[FileName, os.DirEntry[str]]]:
     Raises:
         OSError: the folder cannot be read.
     """
-    with os.scandir(folder) as found:
-        for entry in found:
+    with os.scandir(folder) as entries:
+        for entry in entries:
             name = FileName.parse(entry.name)
             if name is not None and entry.is_file(follow_symlinks=False):
                 yield name, entry
@@ -164,7 +164,7 @@ class RecordingFolder:
         Raises:
             OSError: the folder cannot be read.
         """
-        found: dict[str, KnownFile] = {}
+        known_files: dict[str, KnownFile] = {}
         ours: dict[str, bool] = {}
         for name, entry in files_of(self.path):
             known = self._ours.get(entry.name)
@@ -172,9 +172,9 @@ class RecordingFolder:
             if known:
                 with contextlib.suppress(FileNotFoundError):
                     size = entry.stat(follow_symlinks=False).st_size
-                    found[entry.name] = KnownFile(name.at, entry.name, size)
+                    known_files[entry.name] = KnownFile(name.at, entry.name, size)
             self._note(name)
-        self.files, self._ours = found, ours
+        self.files, self._ours = known_files, ours
 
     def _note(self, name: FileName) -> None:
         self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
@@ -186,11 +186,11 @@ class RecordingFolder:
             camera: name of the camera.
             at: time of the first record of the file.
         """
-        whole = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
+        rounded = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
         last = self._last.get(camera)
         if last is not None:
-            whole = max(whole, last + timedelta(milliseconds=1))
-        name = FileName(camera, whole)
+            rounded = max(rounded, last + timedelta(milliseconds=1))
+        name = FileName(camera, rounded)
         self._note(name)
         return self.path / str(name)
 
@@ -209,7 +209,7 @@ class RecordingFolder:
     @property
     def bytes(self) -> int:
         """Bytes of the recorder's files together."""
-        return sum(one.size for one in self.files.values())
+        return sum(file.size for file in self.files.values())
 
     def delete(self, name: str) -> None:
         """Delete a file of the recorder; keep one that another program has replaced.

@@ -23,7 +23,7 @@ MAX_PICTURE_BYTES: Final = 1 << 28
 kept in any case."""
 
 MAX_RESULTS: Final = 1000
-"""Largest number of results of a camera that wait for a picture that comes later."""
+"""Largest number of results of a camera that wait for their pictures."""
 
 
 class JudgedResult(NamedTuple):
@@ -32,9 +32,9 @@ class JudgedResult(NamedTuple):
     Attributes:
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
-        linked: True if the picture was recorded for this result, as after ``read_image()``; False
-            if it was found by its time. Without a trigger of this client it cannot be found by
-            time: the picture is None.
+        linked: True if the picture was recorded with the result's number, as after
+            ``read_image()``; False if it was found by its time. That needs a trigger of this
+            client: without one, the picture is None.
     """
 
     result: Result[Any]
@@ -43,7 +43,7 @@ class JudgedResult(NamedTuple):
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
-    """Yield each result with its picture, as soon as no later picture can be the result's."""
+    """Yield each result with its picture once no later picture can belong to the result."""
     matchers: dict[str, PictureMatcher] = {}
     for item in items:
         if isinstance(item, (RecordedPicture, Result)):
@@ -75,7 +75,7 @@ class PictureMatcher:
         self._max_bytes = max_bytes
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
-        self._dropped = -math.inf  # start of the exposure of the last picture no longer kept
+        self._dropped = -math.inf  # exposure start of the last dropped picture
         self._latest = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
@@ -92,15 +92,15 @@ class PictureMatcher:
             too_many = False
 
     def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
-        """Yield the results whose picture is known, or cannot come any more."""
+        """Yield the results whose picture is known, or can no longer arrive."""
         while self.results:
             result = self.results[0]
-            found = self._reported_picture(result)
-            reported = found is not None
+            recorded = self._reported_picture(result)
+            reported = recorded is not None
             if not (reported or over or self._is_late(result)):
                 return
             self.results.popleft()
-            picture = self._by_time(result) if found is None else found.frame
+            picture = self._by_time(result) if recorded is None else recorded.frame
             yield JudgedResult(result, picture, reported)
 
     def settled_by_time(self) -> Iterator[JudgedResult]:
@@ -122,20 +122,28 @@ class PictureMatcher:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
         return next(
-            (one for one in pictures if (one.result_number, one.result_received_at) == key), None
+            (
+                picture
+                for picture in pictures
+                if (picture.result_number, picture.result_received_at) == key
+            ),
+            None,
         )
 
     def _by_time(self, result: Result[Any]) -> Frame | None:
         if result.triggered_at is None:  # the duration of the inspection is unknown
             return None
-        triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
+        triggered, received = result.triggered_at.timestamp(), result.received_at.timestamp()
         if self._dropped >= triggered:
             return None
-        for one in self._pictures:
-            began = one.frame.utc - one.frame.duration
-            if one.result_number is None and triggered <= began <= one.frame.utc <= came:
-                missing = one.left_out or one.frame.lost  # a missing picture may be the result's
-                return None if missing else one.frame
+        for picture in self._pictures:
+            began = picture.frame.utc - picture.frame.duration
+            if (
+                picture.result_number is None
+                and triggered <= began <= picture.frame.utc <= received
+            ):
+                missing = picture.left_out or picture.frame.lost  # perhaps the result's picture
+                return None if missing else picture.frame
         return None
 
 

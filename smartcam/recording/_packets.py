@@ -53,8 +53,8 @@ def file_header() -> bytes:
 
 def file_record(time: int, packet: bytes) -> bytes:
     """Return a packet's record; ``time`` in nanoseconds since 1970, cut to microseconds."""
-    seconds, rest = divmod(time, 10**9)
-    return _RECORD.pack(seconds, rest // 1000, len(packet), len(packet)) + packet
+    seconds, nanoseconds = divmod(time, 10**9)
+    return _RECORD.pack(seconds, nanoseconds // 1000, len(packet), len(packet)) + packet
 
 
 def tcp_packet(

@@ -172,14 +172,14 @@ class _Capture:
         if outward and entry.message == "Connect" and self._tcp:
             yield from self._end(by_client=True)
         yield from self._held()
-        yield from self._say(entry)
+        yield from self._packets_of_entry(entry)
 
     def _held(self) -> Iterator[_Packet]:
         held, self._before = self._before, None
         if held is not None:
-            yield from self._say(held)
+            yield from self._packets_of_entry(held)
 
-    def _say(self, entry: TraceEntry) -> Iterator[_Packet]:
+    def _packets_of_entry(self, entry: TraceEntry) -> Iterator[_Packet]:
         data = bytes.fromhex(entry.hex)
         if not data:
             return  # passwords are not recorded

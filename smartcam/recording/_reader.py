@@ -1,4 +1,4 @@
-"""Read a recording, whole or cut off."""
+"""Read a recording, complete or cut off."""
 
 from __future__ import annotations
 
@@ -59,8 +59,7 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
-"""Number of values that the messages of every file may have: ten seconds of
-work."""
+"""Number of values that the messages of any file may have: ten seconds of work."""
 
 VALUES_PER_BYTE = 100
 """Number of values for each byte that a larger file may have. Real recordings have less than one,
@@ -99,7 +98,7 @@ class Recording:
     """An MCAP file of :class:`~smartcam.recording.Recorder`; made by :func:`load_recording`.
 
     Or a folder of :class:`~smartcam.recording.FleetRecorder`. Its items are read from the file each
-    time, in the order in which they were recorded; those of a folder camera by camera.
+    time, in the order of recording; for a folder, camera by camera.
 
     Attributes:
         path: the file, or the folder.
@@ -156,11 +155,11 @@ class Recording:
 
     def items(self, camera: str | None = None) -> Iterator[Item]:
         """Yield all items, of all cameras or of one."""
-        for found in self.all_items(camera):
-            if not isinstance(found, RecordedState) and (
-                self.since is None or _when(found) >= self.since
+        for item in self.all_items(camera):
+            if not isinstance(item, RecordedState) and (
+                self.since is None or _when(item) >= self.since
             ):
-                yield found
+                yield item
 
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
         """Yield the items for a replay, with those before ``since`` and the states of cameras.
@@ -172,13 +171,13 @@ class Recording:
         for path in self._files_of(camera):
             scan, last = _Scan(path), None
             try:
-                for found in scan.items(states=True):
-                    at = _when(found)
+                for item in scan.items(states=True):
+                    at = _when(item)
                     if self.until is not None and at > self.until:
                         continue
-                    if camera is None or found.camera == camera:
-                        last = found.camera, at
-                        yield found
+                    if camera is None or item.camera == camera:
+                        last = item.camera, at
+                        yield item
             except SmartCamError as exc:
                 if path == self.path:
                     raise
@@ -220,8 +219,8 @@ class Recording:
         """Yield each result with its picture, if the picture is known.
 
         The picture was recorded for its result, or is found by its time: the first picture of the
-        camera that was certainly exposed after the trigger, and before the result came. A result
-        without a trigger of its client has a picture only if it was recorded for it.
+        camera that was certainly exposed after the trigger and before the result. A result without
+        a trigger of the recording client has a picture only if it was recorded for the result.
         """
         return judged(self.items(camera))
 
@@ -235,9 +234,9 @@ def frame_of(picture: RecordedPicture) -> Frame:
     return replace(frame, lost=frame.lost + picture.left_out) if picture.left_out else frame
 
 
-def check_recording(value: Recording, who: str) -> Recording:
+def check_recording(value: Recording, caller: str) -> Recording:
     """Return a recording; raise ConfigurationError for another type."""
-    return check_kind(value, Recording, "recording", "what load_recording() returns", who)
+    return check_kind(value, Recording, "recording", "what load_recording() returns", caller)
 
 
 def load_recording(
@@ -279,7 +278,7 @@ def load_recording(
 
 
 def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
-    """Yield each readable item of a file or of a folder, without scanning it before.
+    """Yield each readable item of a file or of a folder, without a scan.
 
     Args:
         path: the file or folder.
@@ -302,7 +301,7 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
         named = sorted((name, entry.path) for name, entry in files_of(folder))
     except OSError as exc:
         raise ConfigurationError(f"recording {folder}: {exc.strerror or exc}") from exc
-    found: list[Path] = []
+    paths: list[Path] = []
     begins: list[FileName | None] = [name for name, _ in named]
     for (name, path), follows in zip(named, [*begins[1:], None], strict=False):
         if follows is not None and follows.camera == name.camera and since is not None:
@@ -310,13 +309,13 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
         else:
             over = False
         if not over and (until is None or name.at <= until):
-            found.append(Path(path))
-    if not found:
+            paths.append(Path(path))
+    if not paths:
         raise ConfigurationError(
             f"recording {folder}: no recordings of a fleet are in this folder"
             f"{' at that time' if named else ''}; expected CAMERA_TIME{ENDING}"
         )
-    return found
+    return paths
 
 
 @dataclass(slots=True)
@@ -422,7 +421,7 @@ class _Scan:
     """One pass through a file."""
 
     path: Path
-    # facts about the file; filled during the pass, as the next two
+    # facts about the file; filled during the pass, like the next two
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
     # facts about cameras, by their names
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
@@ -495,7 +494,7 @@ class _Scan:
                 schemas[number] = name
             case Channel(number, schema):
                 name = schemas.get(schema, "")
-                kind = next((one for one in KINDS.values() if one.schema == name), None)
+                kind = next((kind for kind in KINDS.values() if kind.schema == name), None)
                 if kind is not None:
                     kinds[number] = kind
                 elif name in (ANNOTATIONS_SCHEMA, *PICTURE_SCHEMAS):
@@ -558,14 +557,14 @@ class _Scan:
 
     def _check_magic(self, begin: bytes) -> None:
         if not begin.startswith(b"\x89MCAP"):
-            came = f"it begins with {begin.hex(' ')}" if begin else "it is empty"
-            raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {came}")
+            actual = f"it begins with {begin.hex(' ')}" if begin else "it is empty"
+            raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {actual}")
 
     def _check_format(self) -> None:
-        came, version = self.file_facts.get("format"), self.file_facts.get("version")
-        if came not in FORMATS:
+        actual, version = self.file_facts.get("format"), self.file_facts.get("version")
+        if actual not in FORMATS:
             raise ConfigurationError(
-                f"recording {self.path}: its form is {came}, this version of smartcam reads "
+                f"recording {self.path}: its form is {actual}, this version of smartcam reads "
                 f"{' and '.join(FORMATS)}; it was written by smartcam {version}"
             )
 

@@ -22,7 +22,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 import smartcam
 from smartcam._arguments import check_flag, check_kind, check_path, check_text
 from smartcam._extras import from_part, load
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer, RawFrame, TraceEntry
@@ -174,7 +174,7 @@ class Recorder(Observer):
         self._file: _Written | None = None
         self._thread: threading.Thread | None = None
         self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     # ------------------------------------------------------------------ life
 
@@ -305,7 +305,7 @@ class Recorder(Observer):
 
     def on_results(self, results: Sequence[Result]) -> None:
         """Keep results that came together."""
-        self._put_all(results, 4 * sum([len(one.raw) for one in results]), "results")
+        self._put_all(results, 4 * sum([len(result.raw) for result in results]), "results")
 
     def on_picture(self, result: Result, frame: Frame) -> None:
         """Keep the picture of a result, unless ``pictures`` is False."""
@@ -430,7 +430,7 @@ class Recorder(Observer):
             on_start: function that is called when the first picture was added.
 
         Returns:
-            Counts of delivered and lost pictures; ``skipped`` counts those that were left out.
+            Counts of delivered and lost pictures; ``skipped`` counts pictures that were left out.
 
         Raises:
             ConfigurationError: an argument is wrong.
@@ -595,8 +595,8 @@ class RecordingFile:
         Raises:
             OSError: the file was deleted, or moved away with its folder.
         """
-        own = os.fstat(self._stream.fileno())
-        if not os.path.samestat(own, self.path.stat()):
+        status = os.fstat(self._stream.fileno())
+        if not os.path.samestat(status, self.path.stat()):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.path))
 
     def cut(self, size: int) -> None:
@@ -718,7 +718,7 @@ class RecordingFile:
 
 def address_facts(url: str) -> dict[str, str]:
     """Return the facts about a camera that follow from its address."""
-    if is_fleet(url):  # only the agent knows the dialect
+    if is_fleet(url):  # only the agent has the dialect
         return {"url": url, "protocol": "fleet"}
     try:
         address = parse_address(url)

@@ -63,17 +63,17 @@ class RecordedState(NamedTuple):
         The time is that of the next record, not of writing: records wait for the disk, and a replay
         of a span would begin too early.
         """
-        found = {
+        facts = {
             "camera": self.camera,
             "at": at.isoformat(),
             "connected": "yes" if self.connected else "no",
             "endian": str(endian),
         }
         if self.application is not None:
-            found["application"] = str(self.application)
+            facts["application"] = str(self.application)
         if self.status is not None:
-            found["status"] = str(int(self.status))
-        return found
+            facts["status"] = str(int(self.status))
+        return facts
 
     @classmethod
     def of(cls, facts: Mapping[str, str]) -> RecordedState:

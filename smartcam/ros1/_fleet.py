@@ -48,7 +48,9 @@ class RosbridgeFleet(RosFleet):
     @property
     def bridged(self) -> list[RosbridgeNode]:
         """The nodes, in the order of their names."""
-        return sorted((one.node for one in self.nodes.values()), key=lambda one: one.full_name)
+        return sorted(
+            (node.node for node in self.nodes.values()), key=lambda service: service.full_name
+        )
 
     async def wait_first_attempts(self) -> None:
         """Wait, for a bounded time, until every node is connected or has failed to connect."""

@@ -1,6 +1,6 @@
 """Messages for a rosbridge: JSON with the fields of each type in ROS 1.
 
-The types are those of ROS 2. The tables of this module have ROS 1's other names; bytes are base64.
+The types are ROS 2's. The tables of this module have ROS 1's other names; bytes are base64.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Raw:
 
 def ros1_name(name: str) -> str | None:
     """Return a type's name in ROS 1 (``std_msgs/String``); None if ROS 1 has no such type."""
-    package, _, rest = name.partition("/")
-    return None if package in ONLY_ROS2 else f"{package}/{rest.rpartition('/')[2]}"
+    package, _, short_name = name.partition("/")
+    return None if package in ONLY_ROS2 else f"{package}/{short_name.rpartition('/')[2]}"
 
 
 def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
@@ -96,13 +96,13 @@ def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
 def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
     if field.nested:
         inner = kind.nested[field.type]
-        return [_fields(inner, one) for one in value] if field.shape else _fields(inner, value)
+        return [_fields(inner, item) for item in value] if field.shape else _fields(inner, value)
     if not field.shape:
         return _signed(value) if field.type == "byte" else value
     if field.type in _BYTES:
         return Raw(value)
     items = value.tolist() if hasattr(value, "tolist") else list(value)
-    return [_signed(one) for one in items] if field.type == "byte" else items
+    return [_signed(item) for item in items] if field.type == "byte" else items
 
 
 def _signed(value: int) -> int:
@@ -126,7 +126,7 @@ def from_json(kind: MessageType, data: Any) -> Any:
                 f"{kind.name}: expected up to {len(kind.fields)} values, got {len(data)}"
             )
         names = RENAMED.get(kind.name, {})
-        ordered = [names.get(one.name, one.name) for one in kind.fields]
+        ordered = [names.get(field.name, field.name) for field in kind.fields]
         data = dict(zip(ordered, data, strict=False))
     message = kind.new(**_checked_fields(kind, data, "", _MAX_LEVELS))
     return kind.decode(kind.encode(message))  # makes numpy arrays and bytes, as in ROS 2
@@ -142,7 +142,7 @@ def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dic
         raise RosMessageError(f"{kind.name}: {where}: nested too deep")
     names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
     fields = {names.get(field.name, field.name): field for field in kind.fields}
-    found = dict[str, Any]()
+    checked = dict[str, Any]()
     for name, value in data.items():
         if name in only:
             continue
@@ -150,11 +150,13 @@ def _checked_fields(kind: MessageType, data: Any, where: str, depth: int) -> dic
         if field is None:
             expected = ", ".join((*fields, *only)) or "none"
             raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
-        found[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
-    return found
+        checked[field.attribute] = _checked_value(kind, field, value, f"{where}{name}", depth)
+    return checked
 
 
-def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth: int) -> Any:
+def _checked_value(
+    kind: MessageType, field: MessageField, value: Any, where: str, depth: int
+) -> Any:
     if field.shape and field.type in _BYTES and isinstance(value, str):
         try:
             return base64.b64decode(value, validate=True)
@@ -167,16 +169,18 @@ def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth
     if not field.nested:
         allowed = _ALLOWED.get(field.type, (int,))
         values: list[Any] = value if field.shape else [value]
-        for one in values:
-            if type(one) not in allowed:
-                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {one!r:.80}")
+        for item in values:
+            if type(item) not in allowed:
+                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {item!r:.80}")
         if field.type == "byte":
-            values = [one + 256 if -128 <= one < 0 else one for one in values]
+            values = [value + 256 if -128 <= value < 0 else value for value in values]
         return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:
         return _checked_fields(inner, value, f"{where}.", depth - 1)
-    return [_checked_fields(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
+    return [
+        _checked_fields(inner, item, f"{where}[{n}].", depth - 1) for n, item in enumerate(value)
+    ]
 
 
 def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:

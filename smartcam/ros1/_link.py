@@ -36,7 +36,7 @@ SEND_BUFFER = 1 << 17
 """Number of bytes of the system's send buffer: small, since waiting data become old."""
 HEARTBEAT_INTERVAL = 10.0
 """Seconds of silence after which the bridge gets a ping; half of them are the timeout."""
-MIN_LIFETIME = 5.0
+MIN_LINK_SECONDS = 5.0
 """Seconds that a link must have lasted for the next attempt to be immediate."""
 MAX_MESSAGE_BYTES = 8 << 20
 """Largest number of bytes of a message from a bridge; a longer one ends the link."""
@@ -168,7 +168,7 @@ class BridgeLink:
                 began = clock()
                 reason = await self._try()
                 if await self._tell_lost(reason):
-                    short_lived = 0 if clock() - began > MIN_LIFETIME else short_lived + 1
+                    short_lived = 0 if clock() - began > MIN_LINK_SECONDS else short_lived + 1
                     await asyncio.sleep(delay)
                     break
                 await asyncio.sleep(delay)

@@ -46,7 +46,7 @@ class RosbridgePublisher:
         return self.lane.dropped
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the bridge is connected and the topic may have subscribers.
 
         For a topic with long messages, rosapi is asked for subscribers every two seconds, if it

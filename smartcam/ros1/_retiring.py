@@ -69,13 +69,13 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
     Raises:
         ConnectionError: the bridge closed the link.
     """
-    asked = question(PROBED_SERVICE, {})
-    await web.send_json(asked)
+    request = question(PROBED_SERVICE, {})
+    await web.send_json(request)
     async for message in web:
         try:
             operation = json.loads(message.data)
         except (ValueError, TypeError, RecursionError):
             continue
-        if isinstance(operation, dict) and operation.get("id") == asked["id"]:
+        if isinstance(operation, dict) and operation.get("id") == request["id"]:
             return
     raise ConnectionError("the bridge closed the link")

@@ -53,9 +53,10 @@ class RosbridgeNode(NamedNode):
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         bridge: the bridge's URL, ``ws://host:9090``.
-        types: the known messages and services; None for those of Jazzy. Topics and services of
+        types: the known messages and services; None for Jazzy's. Topics and services of
             types that ROS 1 does not have are left out, and logged.
-        backoff: delays between attempts to connect; None: those of :class:`smartcam.Backoff`.
+        backoff: delays between attempts to connect; None: the defaults of
+            :class:`smartcam.Backoff`.
         on_change: function called in the event loop when the bridge was connected or lost.
 
     Raises:
@@ -88,7 +89,7 @@ class RosbridgeNode(NamedNode):
         self._new: list[RosbridgeService] = []  # services to be advertised
         self._leaving: list[RosbridgeService] = []  # services to be withdrawn
         self._changing: asyncio.Task[None] | None = None
-        self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
+        self._pending_answers: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "publish": self._published,
@@ -197,11 +198,11 @@ class RosbridgeNode(NamedNode):
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
-        heard = RosbridgeSubscription(self, name, kind, qos)
-        if self._log_if_absent(heard.exists, name, kind.name):
-            self._subscriptions.append(heard)
-            heard.ask()
-        return heard
+        subscription = RosbridgeSubscription(self, name, kind, qos)
+        if self._log_if_absent(subscription.exists, name, kind.name):
+            self._subscriptions.append(subscription)
+            subscription.ask()
+        return subscription
 
     def serve(
         self,
@@ -215,7 +216,7 @@ class RosbridgeNode(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields. The text of an error becomes the response's field ``error``,
@@ -236,10 +237,10 @@ class RosbridgeNode(NamedNode):
             self._change()
         return served
 
-    def _new_name(self, name: str, what: str, there: dict[str, Any]) -> str:
-        full = self._resolved(name, what)
-        if full in there:
-            raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
+    def _new_name(self, name: str, kind_text: str, existing: dict[str, Any]) -> str:
+        full = self._resolved(name, kind_text)
+        if full in existing:
+            raise ConfigurationError(f"{self.full_name}: the {kind_text} {full} is there already")
         return full
 
     def _log_if_absent(self, exists: bool, name: str, kind: str) -> bool:
@@ -269,11 +270,11 @@ class RosbridgeNode(NamedNode):
             self._leaving.append(end)
             self._change()
 
-    def forget_subscription(self, heard: RosbridgeSubscription) -> None:
+    def forget_subscription(self, subscription: RosbridgeSubscription) -> None:
         """Remove a closed subscription."""
-        if heard in self._subscriptions:
-            self._subscriptions.remove(heard)
-            heard.leave()
+        if subscription in self._subscriptions:
+            self._subscriptions.remove(subscription)
+            subscription.leave()
 
     def renew(self, service: RosbridgeService) -> None:
         """Withdraw a service and advertise it again, so that its calls fail at their callers."""
@@ -302,7 +303,7 @@ class RosbridgeNode(NamedNode):
 
     def on_connected(self) -> None:
         """Advertise everything to a new bridge."""
-        self._tell_change()
+        self._report_change()
         for publisher in self._publishers.values():
             if publisher.exists:
                 self.send(encoded(publisher.advertisement()))
@@ -311,10 +312,10 @@ class RosbridgeNode(NamedNode):
             subscription.ask()
         self.begin(self._repeat_shared())
         self.begin(listen_for_subscribers(self, self._publishers))
-        self._new = [one for one in self._services.values() if one.exists]
+        self._new = [service for service in self._services.values() if service.exists]
         self._change()
 
-    def _tell_change(self) -> None:
+    def _report_change(self) -> None:
         try:
             self._on_change(self)
         except ENDS_PROGRAM:
@@ -346,8 +347,10 @@ class RosbridgeNode(NamedNode):
         await asyncio.sleep(0)
         new, leaving = self._new, [*self._leaving]
         self._new = []
-        await asyncio.gather(*(one.still() for one in leaving))
-        await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
+        await asyncio.gather(*(service.still() for service in leaving))
+        await retire(
+            self._link.url, list(dict.fromkeys(service.name for service in (*leaving, *new)))
+        )
         if leaving:  # first handle calls that the bridge has aborted
             await self.ask(PROBED_SERVICE, {})
         self._leaving = self._leaving[len(leaving) :]
@@ -359,21 +362,21 @@ class RosbridgeNode(NamedNode):
 
         Earlier operations of the bridge have been handled by then.
         """
-        asked = question(service, arguments)
+        request = question(service, arguments)
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
-        self._asked[asked["id"]] = answer
+        self._pending_answers[request["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
-                self.send(encoded(asked))
+                self.send(encoded(request))
                 return await answer
         except TimeoutError:
             logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
             return None
         finally:
-            del self._asked[asked["id"]]
+            del self._pending_answers[request["id"]]
 
     def _answered(self, operation: dict[str, Any]) -> None:
-        answer = self._asked.get(str(operation.get("id")))
+        answer = self._pending_answers.get(str(operation.get("id")))
         if answer is not None and not answer.done():
             answer.set_result(operation)
 
@@ -388,7 +391,7 @@ class RosbridgeNode(NamedNode):
     async def on_lost(self, was: bool) -> None:
         """End calls and tasks for a lost bridge."""
         if self._running is not None and was:
-            self._tell_change()
+            self._report_change()
         for service in self._services.values():
             service.end_turn()
         self._new, self._changing = [], None
@@ -404,7 +407,7 @@ class RosbridgeNode(NamedNode):
             logger.warning("%s: no call: %.200r", self.full_name, operation)
             return
         service = self._services.get(name)
-        if any(one.name == name for one in self._leaving):
+        if any(service.name == name for service in self._leaving):
             return  # the call fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)

@@ -172,5 +172,5 @@ class RosbridgeService:
 
 def error_field(kind: MessageType) -> str:
     """Return the field of a response for an error's text, "" if it has none."""
-    texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
-    return next((one for one in ERROR_FIELDS if one in texts), "")
+    texts = {field.name for field in kind.fields if field.type == "string" and not field.shape}
+    return next((field for field in ERROR_FIELDS if field in texts), "")

@@ -28,13 +28,15 @@ async def listen_for_subscribers(
     for publisher in publishers.values():
         publisher.subscribed = True
     while True:
-        for publisher in [one for one in publishers.values() if one.type.name in LARGE_TYPES]:
+        for publisher in [
+            publisher for publisher in publishers.values() if publisher.type.name in LARGE_TYPES
+        ]:
             answer = await node.ask(SERVICE, {"topic": publisher.name})
             values = answer.get("values") if answer else None
-            found = values.get("subscribers") if isinstance(values, dict) else None
-            if not isinstance(found, list):
-                for one in publishers.values():
-                    one.subscribed = True
+            names = values.get("subscribers") if isinstance(values, dict) else None
+            if not isinstance(names, list):
+                for known in publishers.values():
+                    known.subscribed = True
                 return
-            publisher.subscribed = bool(found)
+            publisher.subscribed = bool(names)
         await asyncio.sleep(PERIOD)

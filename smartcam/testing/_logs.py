@@ -6,8 +6,8 @@
     emulated_camera.log.expect_nothing_while_busy()
     emulated_camera.log.expect_disconnect_before_close()
 
-Expected messages may still be on their way, so each method looks again and again until its time is
-over. A failure is an ``AssertionError`` that shows the log.
+Expected messages may still arrive, so each method repeats its check until its timeout. A failure is
+an ``AssertionError`` that shows the log.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ camera's time (inferred)."""
 MAX_SHOWN_ENTRIES = 40
 """Largest number of entries of the log that a failure shows: the last ones."""
 
-LOOK_INTERVAL = 0.005
-"""Seconds between two looks."""
+CHECK_INTERVAL = 0.005
+"""Seconds between two checks of the log."""
 
 
 class CameraLog(Sequence["LogEntry"]):
-    """The log of an emulated camera's traffic, oldest first; read anew for each use.
+    """The log of an emulated camera's traffic, oldest first, which is read again for each use.
 
     Args:
         read: function that returns the entries.
@@ -110,22 +110,22 @@ class CameraLog(Sequence["LogEntry"]):
     # ------------------------------------------------------------------ expectations
 
     def expect(self, *expected: Expected, only: bool = False, timeout: float = 5.0) -> None:
-        """Check that these messages went over the wire, in this order.
+        """Check that messages were transferred in a given order.
 
         Args:
-            expected: messages of the client and of the camera; others may stand between them.
-            only: the client sent no other message. The camera's messages are ignored unless
-                expected.
+            expected: messages of the client and of the camera; others may be between them.
+            only: whether the client sent no other message. The camera's messages are ignored
+                unless expected.
             timeout: seconds to wait for them.
 
         Raises:
-            AssertionError: the messages did not come.
+            AssertionError: the messages did not arrive in time.
             ConfigurationError: there is no message of this name.
         """
         __tracebackhide__ = True
         only = check_flag(only, "only", "expect")
         timeout = check_seconds(timeout, "timeout", "expect")
-        wanted = [_known(one) for one in expected]
+        wanted = [_checked_expectation(message) for message in expected]
         self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
 
     def expect_nothing_while_busy(
@@ -147,9 +147,9 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         grace = check_seconds(grace, "grace", "expect_nothing_while_busy")
         timeout = check_seconds(timeout, "timeout", "expect_nothing_while_busy")
-        for one in also:
-            if not (isinstance(one, type) and issubclass(one, m.Message)):
-                raise wrong_argument("also", "types of messages", one)
+        for message in also:
+            if not (isinstance(message, type) and issubclass(message, m.Message)):
+                raise wrong_argument("also", "types of messages", message)
         allowed = (*ALLOWED_WHILE_BUSY, *also)
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
@@ -201,15 +201,15 @@ class CameraLog(Sequence["LogEntry"]):
         end = time.monotonic() + timeout
         while True:
             entries = self._read()
-            found = finding(entries)
+            found_text = finding(entries)
             gone = self._pushed_out()
             missing = f"{gone} older entries were pushed out of the full log" if gone else None
-            if found is None and not (missing and whole):
+            if found_text is None and not (missing and whole):
                 return
-            if time.monotonic() >= end or found is None:
-                reasons = [one for one in (found, missing) if one]
+            if time.monotonic() >= end or found_text is None:
+                reasons = [text for text in (found_text, missing) if text]
                 raise AssertionError("\n".join([*reasons, _shown(entries)]))
-            time.sleep(LOOK_INTERVAL)
+            time.sleep(CHECK_INTERVAL)
 
 
 def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
@@ -220,7 +220,7 @@ def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
     ]
 
 
-def _known(expected: Expected) -> Expected:
+def _checked_expectation(expected: Expected) -> Expected:
     if isinstance(expected, type) and issubclass(expected, m.Message):
         return expected
     if isinstance(expected, m.Message):
@@ -257,7 +257,7 @@ def _in_order(entries: list[LogEntry], wanted: list[Expected], *, only: bool) ->
 
 
 def _place_text(wanted: list[Expected], place: int) -> str:
-    done = ", ".join(_name(one) for one in wanted[:place])
+    done = ", ".join(_name(message) for message in wanted[:place])
     return f"after {done}" if done else "at first"
 
 
@@ -313,9 +313,9 @@ def _shown(entries: list[LogEntry]) -> str:
     begin = entries[0].time if entries else 0.0
     for entry in entries[-MAX_SHOWN_ENTRIES:]:
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
-        what = entry.error or _text(entry)
+        text = entry.error or _text(entry)
         fault = f"  ({entry.fault})" if entry.fault else ""
-        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {what}{fault}")
+        lines.append(f"  {entry.time - begin:9.4f} s {mark} {entry.peer}  {text}{fault}")
     return "\n".join(
         ["what went over the wire (< from a client, > to it):", *(lines or ["  nothing"])]
     )

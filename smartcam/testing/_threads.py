@@ -235,7 +235,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.inject, *faults)
 
     def clear_faults(self) -> None:
-        """Remove the faults that wait, and end those that go on."""
+        """Remove waiting faults, and end lasting ones."""
         self._thread.run(self._emulator.clear_faults)
 
     def command(self, name: str) -> None:
@@ -298,11 +298,11 @@ class ThreadedCamera(_InLoop):
         else:
             await asyncio.wrap_future(future)
 
-    def _bvs(self, what: str) -> EmulatedCamera:
+    def _bvs(self, label: str) -> EmulatedCamera:
         """Return the emulator; UnsupportedError: it is of another make."""
         if isinstance(self._emulator, EmulatedCamera):
             return self._emulator
-        raise UnsupportedError(f"{self._emulator!r} has no {what}; an EmulatedCamera has")
+        raise UnsupportedError(f"{self._emulator!r} has no {label}; an EmulatedCamera has")
 
     def _look(self, function: Callable[[], T]) -> T:
         """Call a function in the thread; in the caller's if the thread has ended."""

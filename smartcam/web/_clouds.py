@@ -111,8 +111,8 @@ class CloudSite(ThreadedSite):
 
     async def stop(self) -> None:
         """Close the port, and end the viewers."""
-        for one in self.viewers:
-            one.end()
+        for viewer in self.viewers:
+            viewer.end()
         try:
             await super().stop()
         finally:
@@ -130,8 +130,8 @@ class CloudSite(ThreadedSite):
             made = loop.run_in_executor(self._threads, packed, self._cloud)
             made.add_done_callback(_mark_handled)
             self._packing = (self._number, made)
-        found, job = self._packing
-        return found, await asyncio.shield(job)
+        cloud_packed, job = self._packing
+        return cloud_packed, await asyncio.shield(job)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the cloud and the number of viewers, as values for JSON."""

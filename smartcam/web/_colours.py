@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_LOOKS: Final = 16
 """Largest number of pictures that are asked for at a time: two for each of eight viewers."""
 
-MAX_KEPT: Final = 8
+MAX_VIEWERS_KEPT: Final = 8
 """Largest number of viewers whose pictures are kept."""
 
 PICTURES_PER_VIEWER: Final = 2
@@ -105,14 +105,14 @@ class ColourSite(ThreadedSite):
         self.colours: ColourRange = ColourRange() if colours is None else colours
         self._quality = quality
         self._looks = 0
-        self._kept: OrderedDict[str, deque[Frame]] = OrderedDict()
+        self._pictures: OrderedDict[str, deque[Frame]] = OrderedDict()
 
     async def stop(self) -> None:
         """Close the port, and drop all pictures."""
         try:
             await super().stop()
         finally:
-            self._kept.clear()
+            self._pictures.clear()
 
     async def next_frame(self, viewer: str) -> Frame:
         """Return the next frame of the source, and keep it for a viewer.
@@ -131,11 +131,11 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a source that gives frames") from exc
         except StopAsyncIteration:
             raise RefusedError(410, f"{name} has ended", "one that goes on") from None
-        kept = self._kept.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
-        kept.append(frame)
-        self._kept.move_to_end(viewer)
-        while len(self._kept) > MAX_KEPT:
-            self._kept.popitem(last=False)
+        queue = self._pictures.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
+        queue.append(frame)
+        self._pictures.move_to_end(viewer)
+        while len(self._pictures) > MAX_VIEWERS_KEPT:
+            self._pictures.popitem(last=False)
         return frame
 
     def kept_frame(self, viewer: str, sequence: int | None = None) -> Frame:
@@ -144,7 +144,7 @@ class ColourSite(ThreadedSite):
         Raises:
             RefusedError: the frame is no longer kept.
         """
-        for frame in reversed(self._kept.get(viewer, ())):
+        for frame in reversed(self._pictures.get(viewer, ())):
             if sequence in {None, frame.sequence}:
                 return frame
         which = "a picture" if sequence is None else f"picture {sequence}"
@@ -187,15 +187,15 @@ class ColourSite(ThreadedSite):
             "part": float(mask.mean()),
             "regions": [
                 {
-                    "area": one.area,
-                    "sides": one.sides,
-                    "ratio": one.ratio,
-                    "fullness": one.fullness,
-                    "orientation": one.orientation,
-                    "centre": one.centre,
-                    "corners": one.corners.tolist(),
+                    "area": region.area,
+                    "sides": region.sides,
+                    "ratio": region.ratio,
+                    "fullness": region.fullness,
+                    "orientation": region.orientation,
+                    "centre": region.centre,
+                    "corners": region.corners.tolist(),
                 }
-                for one in regions
+                for region in regions
             ],
             "jpeg": len(picture),
         }

@@ -28,7 +28,7 @@ HEAD_TIMEOUT = 10.0
 """Seconds within which a request's head must be complete, from its first byte; for the first head
 of a connection, from the connection's beginning."""
 
-KEEP_ALIVE = 60.0
+KEEP_ALIVE_TIMEOUT = 60.0
 """Seconds that a connection stays open without a request, or with an unread answer."""
 
 MAX_HEAD_BYTES = 1 << 15
@@ -53,7 +53,7 @@ class Visitors:
         self.make: Callable[[], asyncio.Protocol] = make
         self.closed: bool = False
         self.places: Places[Visitor] = Places(
-            MAX_CONNECTIONS, within=HEAD_TIMEOUT, what="no request", own="a request"
+            MAX_CONNECTIONS, within=HEAD_TIMEOUT, label="no request", own="a request"
         )
         self.acceptor: Acceptor[Visitor] = Acceptor(
             lambda: Visitor(self), self.places, _log, name="smartcam.web"
@@ -72,7 +72,8 @@ class Visitor(asyncio.Protocol):
         self._inner: asyncio.Protocol | None = None  # protocol for the bytes; None: none
         self._head: bytearray | None = None  # received part of an unfinished head
         self._idle = False  # between requests, when the next may take long
-        self._rest: StreamReader | None = None  # body of a request that was refused before its end
+        # body of a request that was refused before its end
+        self._stream: StreamReader | None = None
         self._peer = "?"
 
     # ------------------------------------------------------------------ from the transport
@@ -121,8 +122,8 @@ class Visitor(asyncio.Protocol):
         self._acceptor.leave(self)
         if self._inner is not None:
             self._inner.connection_lost(exc)
-        if self._rest is not None:  # aiohttp would still wait for its end
-            self._rest.feed_eof()
+        if self._stream is not None:  # aiohttp would still wait for its end
+            self._stream.feed_eof()
 
     # ------------------------------------------------------------------ from the site
 
@@ -136,9 +137,9 @@ class Visitor(asyncio.Protocol):
         finally:
             if request.content.is_eof():
                 self._head, self._idle = bytearray(), True
-                self._acceptor.expect(self, KEEP_ALIVE, "no request")
+                self._acceptor.expect(self, KEEP_ALIVE_TIMEOUT, "no request")
             else:  # the connection ends with the request
-                self._rest = request.content
+                self._stream = request.content
                 self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager

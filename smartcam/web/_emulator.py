@@ -35,7 +35,7 @@ MAX_WAITING_CHANGES = 16
 """Largest number of calls that may wait for a log entry at a time: together with the event streams,
 half of the places."""
 
-LOOK_AGAIN = 0.02
+LOG_POLL_INTERVAL = 0.02
 """Seconds between two looks for a log entry."""
 
 MAX_PARTS = 100
@@ -99,7 +99,7 @@ class EmulatorSite(Site):
             loop = asyncio.get_running_loop()
             deadline = loop.time() + seconds
             while loop.time() < deadline and is_open(request) and not condition():
-                if await self.streams.pause(LOOK_AGAIN):
+                if await self.streams.pause(LOG_POLL_INTERVAL):
                     break
         finally:
             self._waiting -= 1
@@ -186,13 +186,13 @@ def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
     return site.cameras[_name(site, call)]
 
 
-def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
+def _operator(site: EmulatorSite, call: CallRequest, label: str) -> Any:
     """Return a method of the camera's operator; RefusedError: the camera does not have it."""
     emulator = _emulator(site, call)
-    if not hasattr(emulator.device, what):
+    if not hasattr(emulator.device, label):
         able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
-        raise RefusedError(409, f"{what} of a camera that speaks {emulator.dialect}", able)
-    return getattr(emulator.device, what)
+        raise RefusedError(409, f"{label} of a camera that speaks {emulator.dialect}", able)
+    return getattr(emulator.device, label)
 
 
 def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
@@ -212,7 +212,9 @@ def _calls(_site: EmulatorSite, _ask: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/cameras")
 def _cameras(site: EmulatorSite, _ask: CallRequest) -> object:
     """All cameras, in short."""
-    return {"cameras": [serialize.camera_row(name, one) for name, one in site.cameras.items()]}
+    return {
+        "cameras": [serialize.camera_row(name, camera) for name, camera in site.cameras.items()]
+    }
 
 
 @CALLS.add("GET", _CAMERA)
@@ -256,7 +258,7 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
     switch, emulator = _operator(site, call, "switch_application"), _emulator(site, call)
     wanted: _ApplicationBody = call.body
     if wanted.id not in emulator.application_ids:
-        known = ", ".join(str(one) for one in emulator.application_ids)
+        known = ", ".join(str(ident) for ident in emulator.application_ids)
         field = {"field": "id", "came": str(wanted.id), "expected": f"one of {known}"}
         raise RefusedError(422, f"application {wanted.id}", f"one of {known}", (field,))
     if not switch(wanted.id, running=wanted.running):
@@ -301,7 +303,7 @@ def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", f"{_CAMERA}/faults")
 def _faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Faults that wait, and the last ones that have happened."""
+    """Waiting faults, and the last past ones."""
     return serialize.faults_state(_emulator(site, call))
 
 
@@ -316,7 +318,7 @@ def _inject(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("DELETE", f"{_CAMERA}/faults")
 def _clear_faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Forget the faults that wait, end those that last."""
+    """Forget waiting faults, and end lasting ones."""
     _emulator(site, call).clear_faults()
     return _faults(site, call)
 
@@ -402,8 +404,8 @@ def _log_entry(site: EmulatorSite, call: CallRequest) -> object:
     entries, count = emulator.log.since(serial, 1)
     first = count - len(emulator.log)
     if not entries or serial < first:
-        there = f"{first} to {count - 1}" if len(emulator.log) else "none"
-        raise RefusedError(404, f"log entry {text!r}", f"one that is there: {there}")
+        entries_text = f"{first} to {count - 1}" if len(emulator.log) else "none"
+        raise RefusedError(404, f"log entry {text!r}", f"one that is there: {entries_text}")
     return serialize.camera_entry(serial, entries[0], emulator, whole=True)
 
 

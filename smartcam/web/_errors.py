@@ -61,6 +61,8 @@ def refused_fields(error: ValidationError) -> RefusedError:
         }
         for item in error.errors(include_url=False)
     )
-    came = "; ".join(f"{one['field'] or 'the body'}: {one['came']}" for one in fields)
-    expected = "; ".join(one["expected"] for one in fields)
-    return RefusedError(422, came, expected, fields)
+    received = "; ".join(
+        f"{refused['field'] or 'the body'}: {refused['came']}" for refused in fields
+    )
+    expected = "; ".join(refused["expected"] for refused in fields)
+    return RefusedError(422, received, expected, fields)

@@ -32,7 +32,7 @@ class Watcher:
         self._name = name
         self._emulator = emulator
         self._serial = serialize.log_count(emulator) if since is None else since
-        self._known: dict[str, Any] = {}
+        self._last_values: dict[str, Any] = {}
         self._looks = 0
 
     def look(self) -> Iterator[News]:
@@ -51,14 +51,14 @@ class Watcher:
         self._looks += 1
 
     def _changed(self, kind: str, value: Any) -> Iterator[News]:
-        if self._known.get(kind) != value:
-            self._known[kind] = value
+        if self._last_values.get(kind) != value:
+            self._last_values[kind] = value
             yield News(kind, value)
 
     def _changed_faults(self) -> bool:
         fired = self._emulator.fired
         now = (self._emulator.faults, len(fired), fired[-1] if fired else None)
-        before, self._known["faults"] = self._known.get("faults"), now
+        before, self._last_values["faults"] = self._last_values.get("faults"), now
         return now != before
 
     def _log(self) -> News | None:

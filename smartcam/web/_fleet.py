@@ -38,7 +38,7 @@ MAX_CAMERAS: Final = 16
 LINGER: Final = 30.0
 """Seconds that a camera is followed after its own page has no viewer any more."""
 
-KEEP_PERIOD: Final = 1.0
+VIEWER_CHECK_PERIOD: Final = 1.0
 """Seconds between two checks for viewers."""
 
 
@@ -166,8 +166,8 @@ class FleetSite(Site):
         except ConfigurationError as exc:
             raise RefusedError(404, str(exc)[:300], "a camera of the fleet") from exc
         if len(self._live) >= MAX_CAMERAS:
-            what = f"camera {MAX_CAMERAS + 1} on a page of its own"
-            raise RefusedError(503, what, f"{MAX_CAMERAS} at one time")
+            label = f"camera {MAX_CAMERAS + 1} on a page of its own"
+            raise RefusedError(503, label, f"{MAX_CAMERAS} at one time")
         row = self.view.rows.get(name)
         live = WatchedCamera(camera, control=self.control, units=self.units, row=row)
         self._live[name] = live
@@ -180,7 +180,7 @@ class FleetSite(Site):
         """Leave cameras without viewers, and follow new objects of the others."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(KEEP_PERIOD)
+            await asyncio.sleep(VIEWER_CHECK_PERIOD)
             for name, live in list(self._live.items()):
                 if not live.watched and loop.time() - live.used_at > LINGER:
                     del self._live[name]
@@ -220,13 +220,13 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
 async def _cameras(site: FleetSite, call: CallRequest) -> object:
     sight: RowsInSight = call.query
     names = (await site.view.ordered(sight.query)).names
-    found: list[dict[str, Any]] = []
+    cameras: list[dict[str, Any]] = []
     for name in names[sight.first : sight.first + sight.count]:
         row = site.view.rows.get(name)
-        if row is not None:  # it was not forgotten meanwhile
-            found.append(row.fields())
+        if row is not None:  # the camera was not forgotten meanwhile
+            cameras.append(row.fields())
             await asyncio.sleep(0)
-    return {"found": len(names), "cameras": found}
+    return {"found": len(names), "cameras": cameras}
 
 
 @CALLS.add(
@@ -248,7 +248,7 @@ async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
 @CALLS.add("GET", f"{API}/outlets")
 async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     """The accounts of all agents' outlets: results = delivered + spooled + dropped."""
-    return {"outlets": [one._asdict() for one in await site.outlets.accounts()]}
+    return {"outlets": [account._asdict() for account in await site.outlets.accounts()]}
 
 
 @CALLS.add(
@@ -259,7 +259,7 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     "(errors, gaps, failures), `camera` (a pattern), `most`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
-    return {"stores": [one._asdict() for one in await site.outlets.stored(call.query)]}
+    return {"stores": [result._asdict() for result in await site.outlets.stored(call.query)]}
 
 
 def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
@@ -276,8 +276,8 @@ def _add_live_calls() -> None:
     for row in LIVE_CALLS:
         if row.path == API:
             continue
-        rest = row.path.removeprefix(API).removeprefix("/camera")
-        CALLS.adopt(row, f"{API}/cameras/{{camera}}{rest}", _of_camera(row.handler))
+        tail = row.path.removeprefix(API).removeprefix("/camera")
+        CALLS.adopt(row, f"{API}/cameras/{{camera}}{tail}", _of_camera(row.handler))
 
 
 _add_live_calls()

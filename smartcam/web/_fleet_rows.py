@@ -137,7 +137,7 @@ class FleetRow:
     # ------------------------------------------------------------------ following a camera
 
     def follow(self, camera: FleetCamera[Any]) -> None:
-        """Follow a camera object, which may replace one that was given up."""
+        """Follow a camera object, which may replace a camera that was given up."""
         if self.camera is camera:
             return
         self.leave()
@@ -247,7 +247,7 @@ class FleetRow:
         self.mode = self._word(state)
         self.flags = _flags(self.mode, state, bad=self.error_at is not None)
         words = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
-        self.text = "\n".join(str(one) for one in words if one is not None).lower()
+        self.text = "\n".join(str(word) for word in words if word is not None).lower()
 
     def _word(self, state: RowState) -> str:
         if not state.agents or self.camera is None:
@@ -329,9 +329,9 @@ class FleetRow:
         value = shown_value(result.value, self._layout)
         if "parts" in value:
             parts = [
-                [one["name"][:40], *(round(one[key], 5) for key in ("x", "y", "theta"))]
-                for one in value["parts"][:MAX_DRAWN]
-                if None not in (one["x"], one["y"], one["theta"])
+                [part["name"][:40], *(round(part[key], 5) for key in ("x", "y", "theta"))]
+                for part in value["parts"][:MAX_DRAWN]
+                if None not in (part["x"], part["y"], part["theta"])
             ]
             return {**fields, "parts": parts, "parts_count": value["count"]}
         if "cut" in value:
@@ -380,16 +380,16 @@ def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
 
     Args:
         value: value in its JSON form.
-        units: SI unit of the value, or those of its fields by their names.
+        units: SI unit of the value, or the units of its fields by name.
         shown: units in which the line shows numbers.
     """
     if isinstance(value, dict):
         fields = list(value.items())[:20]
         return ", ".join(
-            f"{name} {line_of(one, units.get(name, {}), shown)}" for name, one in fields
+            f"{name} {line_of(value, units.get(name, {}), shown)}" for name, value in fields
         )
     if isinstance(value, list):
-        return f"{len(value)}: " + " | ".join(line_of(one, units, shown) for one in value[:3])
+        return f"{len(value)}: " + " | ".join(line_of(item, units, shown) for item in value[:3])
     if isinstance(value, float):
         if isinstance(units, str):
             return f"{shown.shown(value, units):.5g} {shown.of(units).name}"

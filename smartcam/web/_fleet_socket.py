@@ -24,7 +24,7 @@ PROTOCOL: Final = "smartcam.fleet"
 """Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
-"""Largest number of rows that may be in sight: three times those of a tall screen."""
+"""Largest number of rows that may be in sight: three times the rows of a tall screen."""
 
 MAX_SEARCH_CHARACTERS: Final = 100
 """Largest number of characters of a search text."""
@@ -38,7 +38,7 @@ ALIVE_INTERVAL: Final = 5.0
 QUICK_INTERVAL: Final = 0.05
 """Seconds that must pass between two messages to a page that scrolls or searches."""
 
-AT_ONCE: Final = 10
+ROWS_PER_TURN: Final = 10
 """Rows that are converted to JSON before other tasks of the loop have a turn."""
 
 TOTALS_INTERVAL: Final = 1.0
@@ -81,7 +81,7 @@ class FleetSocket(PageSocket):
         self._sight = RowsInSight()
         self._moved = asyncio.Event()  # set when other rows are in sight
         self._looked = -1  # version of the view at the last look
-        self._seen: dict[str, int] = {}  # versions of the rows that the page has
+        self._counts_sent: dict[str, int] = {}  # versions of the rows that the page has
         self._window: tuple[Any, ...] = ()  # window that the page has: found cameras and names
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
@@ -142,30 +142,30 @@ class FleetSocket(PageSocket):
     async def _changed_rows(self) -> list[str]:
         view, sight, parts = self._view, self._sight, list[str]()
         ordered = await view.ordered(sight.query)
-        found = len(ordered.names)
-        first = max(0, min(sight.first, found - sight.count))
-        names = [one for one in ordered.names[first : first + sight.count] if one in view.rows]
-        window = (found, first, names)
+        count = len(ordered.names)
+        first = max(0, min(sight.first, count - sight.count))
+        names = [name for name in ordered.names[first : first + sight.count] if name in view.rows]
+        window = (count, first, names)
         if window != self._window:
             self._window = window
-            parts.append(f'"found":{found},"first":{first},"names":{json.dumps(names)}')
-        seen, self._seen = self._seen, {}
+            parts.append(f'"found":{count},"first":{first},"names":{json.dumps(names)}')
+        seen, self._counts_sent = self._counts_sent, {}
         changed: list[str] = []
         for name in names:
             row = view.rows.get(name)
             if row is None:
                 continue  # the row was forgotten
-            self._seen[name] = row.version
+            self._counts_sent[name] = row.version
             if seen.get(name) != row.version:
                 changed.append(row.as_json())
-                if len(changed) % AT_ONCE == 0:
+                if len(changed) % ROWS_PER_TURN == 0:
                     await asyncio.sleep(0)
         if changed:
             parts.append(f'"rows":[{",".join(changed)}]')
         return parts
 
     def _new_bars(self) -> Iterator[str]:
-        bars = [one for one in self._view.series if one[0] > self._bars]
+        bars = [bar for bar in self._view.series if bar[0] > self._bars]
         if bars:
             self._bars = bars[-1][0]
             yield f'"bars":{json.dumps(bars)}'

@@ -31,20 +31,20 @@ MAX_EVENTS: Final = 50_000
 """Largest number of events of cameras between two looks; after more, the whole fleet is read
 again."""
 
-MAX_GONE: Final = 10_000
+MAX_REMOVED: Final = 10_000
 """Largest number of cameras shown although no agent shares them any more; the oldest are
 forgotten."""
 
-AT_ONCE: Final = 50
+ITEMS_PER_TURN: Final = 50
 """Rows or results that are handled before other tasks of the loop have a turn."""
 
 MAX_SIFTED_ROWS: Final = 1000
 """Largest number of rows that are searched before other tasks of the loop have a turn."""
 
-BUCKET: Final = 5
+BAR_DURATION: Final = 5
 """Seconds of one bar of the outcomes."""
 
-SERIES: Final = 600
+SERIES_DURATION: Final = 600
 """Seconds over which outcomes are kept."""
 
 ORDER_LASTING_TIME: Final = 1.0
@@ -103,14 +103,16 @@ class FleetView:
         self._units = units
         self.rows: dict[str, FleetRow] = {}
         self.version: int = 0
-        self.series: collections.deque[tuple[int, ...]] = collections.deque(maxlen=SERIES // BUCKET)
+        self.series: collections.deque[tuple[int, ...]] = collections.deque(
+            maxlen=SERIES_DURATION // BAR_DURATION
+        )
         self.failing: dict[FleetRow, None] = {}
         self.ended: bool = True
         self.agents: set[str] = set()
         self._names: list[str] = []  # sorted; empty until it is made again
         self._rang: dict[FleetRow, None] = {}
         self._aging: set[FleetRow] = set()  # rows whose rate or error mark changes by itself
-        self._gone: dict[str, None] = {}  # the longest gone first
+        self._removed: dict[str, None] = {}  # the longest gone first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
@@ -192,7 +194,7 @@ class FleetView:
     async def _take(self, stream: Subscription[FleetEvent], count: int) -> None:
         for number in range(count):
             self._on_event(await anext(stream))
-            if number % AT_ONCE == AT_ONCE - 1:
+            if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
                 await asyncio.sleep(0)
 
     def _on_event(self, event: FleetEvent) -> None:
@@ -239,25 +241,25 @@ class FleetView:
             outcomes = await row.take(now)
             if row.may_have_changed:
                 row.account(outcomes, now)
-            came = self._count_in(row, outcomes, row.count - before)
+            arrived = self._count_in(row, outcomes, row.count - before)
             if row.may_have_changed or outcomes["errors"]:
                 self._refresh(row, now)
             if row.history.wants_picture:
                 self.failing[row] = None
-            done += 1 + came
-            if done >= AT_ONCE:
+            done += 1 + arrived
+            if done >= ITEMS_PER_TURN:
                 done = 0
                 await asyncio.sleep(0)
 
-    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], came: int) -> int:
+    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], arrived: int) -> int:
         """Count a camera's outcomes; return their number."""
-        if came:
+        if arrived:
             self._bar.update(outcomes)
-            self._count += came
+            self._count += arrived
             self._errors += outcomes["errors"]
             self._aging.add(row)
             self._change(row)
-        return came
+        return arrived
 
     def _change(self, row: FleetRow) -> None:
         self.version += 1
@@ -275,13 +277,13 @@ class FleetView:
             self._flags.subtract(flags)
             self._flags.update(row.flags)
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
-            self._aging.add(row)  # its reason may change without an event
+            self._aging.add(row)  # the reason of a loss may change without an event
         if row.agents:
-            self._gone.pop(row.name, None)
-        elif row.name not in self._gone:
-            self._gone[row.name] = None
-            if len(self._gone) > MAX_GONE:
-                self._forget(next(iter(self._gone)))
+            self._removed.pop(row.name, None)
+        elif row.name not in self._removed:
+            self._removed[row.name] = None
+            if len(self._removed) > MAX_REMOVED:
+                self._forget(next(iter(self._removed)))
 
     def _forget(self, name: str) -> None:
         row = self.rows.pop(name)
@@ -289,7 +291,7 @@ class FleetView:
         self.failing.pop(row, None)
         self._flags.subtract(row.flags)
         self._aging.discard(row)
-        self._gone.pop(name, None)
+        self._removed.pop(name, None)
         self._names = []
         self.version += 1
 
@@ -309,10 +311,10 @@ class FleetView:
             if row.rate != rate:
                 self._change(row)
             self._refresh(row, now)
-            if number % AT_ONCE == AT_ONCE - 1:
+            if number % ITEMS_PER_TURN == ITEMS_PER_TURN - 1:
                 await asyncio.sleep(0)
         self._totals.append(self._count)
-        bar = int(wall) // BUCKET * BUCKET
+        bar = int(wall) // BAR_DURATION * BAR_DURATION
         if bar != self._bar_at:
             if self._bar.total() and self._bar_at:
                 self.series.append((self._bar_at, *(self._bar[name] for name in OUTCOMES)))
@@ -363,18 +365,20 @@ class FleetView:
         return known is None or known.version != self.version
 
     async def _sorted(self, query: RowQuery) -> list[str]:
-        words, found = query.search.lower().split(), list[FleetRow]()
+        words, rows_found = query.search.lower().split(), list[FleetRow]()
         names = self._names
         for start in range(0, len(names), MAX_SIFTED_ROWS):
             rows = map(self.rows.get, names[start : start + MAX_SIFTED_ROWS])
-            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
+            rows_found += [
+                row for row in rows if row is not None and _fits(row, query.filter, words)
+            ]
             await asyncio.sleep(0)
         if query.sort in SORTS:
-            found.sort(key=SORTS[query.sort], reverse=query.down)
+            rows_found.sort(key=SORTS[query.sort], reverse=query.down)
         elif query.down:
-            found.reverse()
-        return [row.name for row in found]
+            rows_found.reverse()
+        return [row.name for row in rows_found]
 
 
 def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:
-    return wanted in row.flags and all(one in row.text for one in words)
+    return wanted in row.flags and all(word in row.text for word in words)

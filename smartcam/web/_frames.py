@@ -168,11 +168,13 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
     """The features of a source's device, with value and range; and whether they may be set here."""
     place = _place(site, call)
     with _refused(site, place):
-        found = await site.sources[place].features.describe()
-    features = [{**dataclasses.asdict(one), "range": one.range} for one in found.values()]
-    for one in features:
-        if isinstance(one["value"], float) and not math.isfinite(one["value"]):
-            one["value"] = None
+        described = await site.sources[place].features.describe()
+    features = [
+        {**dataclasses.asdict(feature), "range": feature.range} for feature in described.values()
+    ]
+    for feature in features:
+        if isinstance(feature["value"], float) and not math.isfinite(feature["value"]):
+            feature["value"] = None
     return {"settable": site.changes, "features": features}
 
 

@@ -73,12 +73,12 @@ class Guard:
         if self.token is None:
             return
         wanted = f"Bearer {self.token}".encode()
-        came = (given or "").encode("utf-8", "surrogateescape")
-        if not hmac.compare_digest(came, wanted):
-            what = "no Authorization" if given is None else "an Authorization with another token"
+        token = (given or "").encode("utf-8", "surrogateescape")
+        if not hmac.compare_digest(token, wanted):
+            problem = "no Authorization" if given is None else "an Authorization with another token"
             raise RefusedError(
                 401,
-                what,
+                problem,
                 "Authorization: Bearer TOKEN, with the token that stands in the page's address",
                 headers={"WWW-Authenticate": 'Bearer realm="smartcam"'},
             )
@@ -88,7 +88,7 @@ def _authorization(request: web.Request) -> str | None:
     given = request.headers.get("Authorization")
     if given is None and request.headers.get("Upgrade", "").lower() == "websocket":
         offered = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
-        tokens = [one.strip() for one in offered if one.strip().startswith(BEARER)]
+        tokens = [offer.strip() for offer in offered if offer.strip().startswith(BEARER)]
         return f"Bearer {tokens[0].removeprefix(BEARER)}" if tokens else None
     return given
 

@@ -1,4 +1,4 @@
-"""Keep the outcomes of a camera's results over a shift: a trend, and the last failures."""
+"""Keep the outcomes of a camera's results over a shift, as a trend and the last failures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_BARS: Final = SHIFT_SECONDS // BAR_SECONDS
 """Largest number of bars that are kept."""
 
 SLOT_SECONDS: Final = 1800
-"""Seconds of results in a place of the short trend."""
+"""Seconds of results in a slot of the short trend."""
 
 MAX_FAILURES: Final = 50
 """Largest number of failures that are kept; equal ones in a row are one."""
@@ -69,7 +69,7 @@ class ShiftHistory:
         version: number of changes.
         failed_since: time of the first failure after the last pass, seconds since 1970; None if
             the last result with a verdict has passed.
-        in_a_row: number of failed results since then.
+        in_a_row: number of failed results since the last pass.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
 
@@ -105,7 +105,7 @@ class ShiftHistory:
         self._fail(at, None, f"not readable: {text}")
 
     def add_missed(self, count: int, text: str) -> None:
-        """Count results that did not come, with a text."""
+        """Count missing results, with a text."""
         at = time.time()
         self._count_up("errors", at, count)
         self._newest = 0
@@ -127,30 +127,30 @@ class ShiftHistory:
         self._bars[-1][1 + KINDS.index(outcome)] += count
         self.totals[KINDS.index(outcome)] += count
 
-    def _fail(self, at: float, number: int | None, what: str) -> None:
+    def _fail(self, at: float, number: int | None, text: str) -> None:
         self._failed += 1
         self.in_a_row += 1
         if self.failed_since is None:
             self.failed_since = at
-        self._note(at, number, what)
+        self._note(at, number, text)
         self._newest = self._serial
 
-    def _note(self, at: float, number: int | None, what: str) -> None:
+    def _note(self, at: float, number: int | None, text: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
-        if last is not None and last.what == what[:MAX_TEXT_CHARACTERS] and not self._passed:
+        if last is not None and last.what == text[:MAX_TEXT_CHARACTERS] and not self._passed:
             last.count += 1
             last.until = at
             return
         self._passed = False
         self._serial += 1
-        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT_CHARACTERS]))
+        self._failures.append(Failure(self._serial, at, at, number, text[:MAX_TEXT_CHARACTERS]))
 
     # ------------------------------------------------------------------ pictures
 
     @property
     def wants_picture(self) -> bool:
-        """True if the newest result is a failure that has no picture yet."""
+        """True if the newest result is a failure without a picture."""
         return self._newest > 0 and self._newest not in self._pictures
 
     def attach(self, serial: int, picture: bytes) -> None:
@@ -172,7 +172,7 @@ class ShiftHistory:
 
     @property
     def last_failure(self) -> int:
-        """Serial of the failure that is the newest result; 0 if that is no failure."""
+        """Serial of the newest result if it is a failure, else 0."""
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
@@ -184,7 +184,8 @@ class ShiftHistory:
     def as_json(self) -> dict[str, Any]:
         """Return the history for the page: bars, and the failures, the oldest first."""
         failures = [
-            {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
+            {**asdict(failure), "picture": failure.serial in self._pictures}
+            for failure in self._failures
         ]
         return {
             "bars": [*self._bars],
@@ -197,7 +198,7 @@ class ShiftHistory:
     def trend(self) -> dict[str, Any]:
         """Return the short trend, for a row of a table.
 
-        ``end`` is the end of its last place, seconds since 1970. Each place covers
+        ``end`` is the end of the last slot, seconds since 1970. Each slot covers
         :data:`SLOT_SECONDS` and is one character: the number of bad results in ten with a verdict,
         rounded up (X: all bad); ``-`` if none had a verdict, a space without results.
         """
@@ -210,13 +211,13 @@ class ShiftHistory:
             place = at // SLOT_SECONDS - last + count - 1
             if place >= 0:
                 slots[place] = [
-                    one + more for one, more in zip(slots[place], outcomes, strict=True)
+                    count + more for count, more in zip(slots[place], outcomes, strict=True)
                 ]
         return {"end": (last + 1) * SLOT_SECONDS, "places": "".join(map(_place, slots)).lstrip(" ")}
 
 
 def _place(outcomes: list[int]) -> str:
-    """Return the character of a place of the short trend."""
+    """Return the character of a slot of the short trend."""
     passed, failed, other, errors = outcomes
     bad, judged = failed + errors, passed + failed + errors
     if judged:

@@ -23,7 +23,7 @@ HEAD: Final = 4096
 """Number of first bytes that are searched for the tables, which precede the picture."""
 
 READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
-"""Formats that become a JPEG without a conversion; those of Y, U and V do, too."""
+"""Formats that become a JPEG without a conversion; formats of Y, U and V do, too."""
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:

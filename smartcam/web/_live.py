@@ -102,7 +102,7 @@ class LiveReader:
         self._view = site.view
         oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
         self._serial = oldest if since is None else since
-        self._known: dict[str, Any] = {}
+        self._last_values: dict[str, Any] = {}
         self._looks = 0
         self._history = -1  # version of the history that was sent
 
@@ -124,20 +124,20 @@ class LiveReader:
 
     def _results(self) -> Iterator[News]:
         view = self._view
-        if self._serial > view.serial:  # from an earlier process
+        if self._serial > view.serial:  # number from an earlier process
             self._serial = 0
-        new = [one for one in view.entries if one.serial >= self._serial]
+        new = [entry for entry in view.entries if entry.serial >= self._serial]
         missed = (new[0].serial if new else view.serial) - self._serial
         shown = new[-MAX_NEWS:]
         missed += len(new) - len(shown)
         if shown or missed:
             self._serial = view.serial
-            entries = [one.as_json() for one in shown]
+            entries = [result.as_json() for result in shown]
             yield News("results", {"results": entries, "missed": missed}, self._serial)
 
     def _changed(self, kind: str, value: Any) -> Iterator[News]:
-        if self._known.get(kind) != value:
-            self._known[kind] = value
+        if self._last_values.get(kind) != value:
+            self._last_values[kind] = value
             yield News(kind, value)
 
 
@@ -186,7 +186,7 @@ def _camera(site: ShowsCamera, _call: CallRequest) -> object:
 @CALLS.add("GET", f"{API}/results")
 def _results(site: ShowsCamera, _call: CallRequest) -> object:
     """The last results, the oldest first."""
-    return {"results": [one.as_json() for one in site.view.entries]}
+    return {"results": [entry.as_json() for entry in site.view.entries]}
 
 
 @CALLS.add("GET", f"{API}/history")

@@ -18,7 +18,7 @@ _log = logging.getLogger("smartcam.web")
 JPEG_QUALITY: Final = 80
 """Quality, 1 to 100, of the JPEGs that the agent makes; low, to save traffic on the bus."""
 
-LOOK_INTERVAL: Final = 0.1
+CHECK_INTERVAL: Final = 0.1
 """Seconds between two checks of which camera the page shows, and whether it has frames."""
 
 
@@ -69,7 +69,7 @@ class LiveFrames:
             camera: object = self._camera()
             if isinstance(camera, HasFrames) and camera.has_frames:
                 await self._show(camera)
-            await asyncio.sleep(LOOK_INTERVAL)
+            await asyncio.sleep(CHECK_INTERVAL)
 
     async def _show(self, camera: HasFrames) -> None:
         """Keep the camera's frames until the page shows another camera."""
@@ -81,7 +81,7 @@ class LiveFrames:
             while (  # noqa: ASYNC110 - nothing tells of it
                 self._camera() is camera and camera.has_frames and not keeping.done()
             ):
-                await asyncio.sleep(LOOK_INTERVAL)
+                await asyncio.sleep(CHECK_INTERVAL)
         finally:
             self.pictures = None
             keeping.cancel()

@@ -34,7 +34,7 @@ MAX_PARTS = 500
 MAX_SHOWN_RAW_BYTES = 64
 """Largest number of bytes of a container that the page shows."""
 
-SERIES = 300
+SERIES_DURATION = 300
 """Seconds of rate and latency that the page draws."""
 
 IMAGE_PERIOD = 1.0
@@ -105,7 +105,7 @@ class LiveView:
         self._writes = history is None
         self.camera: Camera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
-        self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
+        self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES_DURATION)
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time of the last connection or loss
@@ -115,7 +115,7 @@ class LiveView:
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
-        self._asked = 0  # number of the failure whose picture was asked for
+        self._questions = 0  # number of the failure whose picture was asked for
         self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -225,7 +225,7 @@ class LiveView:
             self._serial += max(0, len(batch) - MAX_RESULTS)
             for result in batch[-MAX_RESULTS:]:
                 self._add(result)
-            self._latencies += [one.latency for one in batch if one.latency is not None]
+            self._latencies += [result.latency for result in batch if result.latency is not None]
             self._picture_wanted = True
 
     def _add(self, result: Result[Any] | None, error: str = "") -> None:
@@ -266,9 +266,9 @@ class LiveView:
         while True:
             wanted = self._picture_wanted and self._is_watched()
             failure = self.history.last_failure
-            missing = self._writes and self.history.wants_picture and failure != self._asked
+            missing = self._writes and self.history.wants_picture and failure != self._questions
             if (wanted or missing) and self.camera.connected:
-                self._asked = failure
+                self._questions = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()
@@ -303,14 +303,14 @@ def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
 def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
     """Return a value for the page: parts to draw, or JSON, which is cut if it is long.
 
-    ``units`` are those of its fields, and of the fields of its lists. ``layout``: that of a table.
+    ``units``: units of its fields, and of the fields of its lists. ``layout``: layout of a table.
     """
-    if isinstance(value, list) and all(isinstance(one, Localization) for one in value):
-        found: list[Localization] = value
-        frame = found[0].pose.header.frame_id if found else ""
+    if isinstance(value, list) and all(isinstance(part, Localization) for part in value):
+        localizations: list[Localization] = value
+        frame = localizations[0].pose.header.frame_id if localizations else ""
         return {
-            "parts": [_part(one) for one in found[:MAX_PARTS]],
-            "count": len(found),
+            "parts": [_part(localization) for localization in localizations[:MAX_PARTS]],
+            "count": len(localizations),
             "frame": frame,
         }
     units = {**units_of(value, layout), **_units_of_lists(value)}
@@ -327,7 +327,7 @@ def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
 def _units_of_lists(value: Any) -> dict[str, Mapping[str, str]]:
     """Return the units of the fields of a record's lists, by the lists' names."""
     fields = value._asdict() if hasattr(value, "_asdict") else {}
-    lists = {name: units_of(one) for name, one in fields.items() if isinstance(one, list)}
+    lists = {name: units_of(field) for name, field in fields.items() if isinstance(field, list)}
     return {name: units for name, units in lists.items() if units}
 
 
@@ -342,9 +342,16 @@ def _as_text(value: Any) -> Any:
     return text if text and text.replace("\n", " ").isprintable() else value
 
 
-def _part(one: Localization) -> dict[str, Any]:
+def _part(localization: Localization) -> dict[str, Any]:
     """Return a part's place on the plane: metres, and radians about z."""
-    (x, y, z), (i, j, k, w) = one.pose.position, one.pose.orientation
+    (x, y, z), (i, j, k, w) = localization.pose.position, localization.pose.orientation
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
-    part = {"name": one.feature_id, "quality": one.quality, "x": x, "y": y, "z": z, "theta": theta}
+    part = {
+        "name": localization.feature_id,
+        "quality": localization.quality,
+        "x": x,
+        "y": y,
+        "z": z,
+        "theta": theta,
+    }
     return {name: jsonable(item) for name, item in part.items()}

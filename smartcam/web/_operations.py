@@ -65,7 +65,7 @@ class OperationsSite(Server):
         if section.place is None:
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
         self._host, self._port = section.place
-        self._names = {socket.gethostname().lower(), *(one.lower() for one in section.names)}
+        self._names = {socket.gethostname().lower(), *(name.lower() for name in section.names)}
         self._each = section.latency == "camera"
         self._tried = False
         self._open: OpenPort | None = None
@@ -176,7 +176,7 @@ def _guarded(names: Collection[str] | None) -> Any:
     """Return the middleware of all handlers: the connection's place, the guard, refusals as text.
 
     Args:
-        names: names of this machine that requests may use; None: only those of loopback.
+        names: names of this machine that requests may use; None: only loopback names.
     """
 
     @web.middleware

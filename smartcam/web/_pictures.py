@@ -1,7 +1,7 @@
 """The newest frames of some sources, for viewers: the common part of pages with pictures.
 
-Each viewer of a source has a reader of it and a WebSocket, with one picture on the way at a
-time: when the page reports that it has shown the last picture, the newest one is sent. So a slow
+Each viewer of a source has its own reader and WebSocket, with at most one picture in transfer: when
+the page reports that it has shown the last picture, the newest one is sent. So a slow
 viewer skips pictures, and delays neither the device nor other viewers. Without viewers there is no
 reader, and the device does not stream.
 """
@@ -95,9 +95,9 @@ class SitePictures:
             self._presses = [Press(self._threads, self._quality) for _ in self.sources]
 
     def end_viewers(self) -> None:
-        """Tell all viewers that the site ends."""
-        for one in self.viewers:
-            one.end()
+        """Notify all viewers of the site's end."""
+        for viewer in self.viewers:
+            viewer.end()
 
     async def stop(self) -> None:
         """End the threads, once all viewers have left.
@@ -105,8 +105,8 @@ class SitePictures:
         Cancellation: takes effect at once; the threads end by themselves.
         """
         self.end_viewers()
-        for one in tuple(self.viewers):
-            await one.gone.wait()
+        for viewer in tuple(self.viewers):
+            await viewer.gone.wait()
         threads, self._threads = self._threads, None
         if threads is not None:
             await asyncio.to_thread(threads.shutdown)
@@ -191,7 +191,7 @@ class Press:
             loop = asyncio.get_running_loop()
             self._frame = frame
             self._made = loop.run_in_executor(self._threads, _pressed, frame, self._quality)
-            self._made.add_done_callback(_seen)
+            self._made.add_done_callback(_retrieved)
         return await asyncio.shield(self._made)
 
     def forget(self) -> None:
@@ -211,7 +211,7 @@ def _pressed(frame: Frame, quality: int) -> bytes:
     return data
 
 
-def _seen(made: asyncio.Future[bytes]) -> None:
+def _retrieved(made: asyncio.Future[bytes]) -> None:
     if not made.cancelled():
         made.exception()  # marks the error as handled if all callers are gone
 
@@ -235,20 +235,20 @@ class Viewer(PageSocket):
         self._sent = 0
 
     async def serve(self) -> web.WebSocketResponse:
-        """Show frames until the page goes."""
+        """Show frames until the page is closed."""
         self._pictures.viewers.add(self)
         try:
             return await super().serve()
         finally:
             self._pictures.viewers.discard(self)
             self.gone.set()
-            if not any(one.place == self.place for one in self._pictures.viewers):
+            if not any(viewer.place == self.place for viewer in self._pictures.viewers):
                 self._pictures.press(self.place).forget()
 
     async def _show(self) -> None:
         """Show frames, and read the source again after it ended.
 
-        A lost source stays lost for the page until a picture of it comes.
+        The page shows a lost source as lost until its next picture.
         """
         delays, lost = REOPEN_BACKOFF.delays(), False
         while True:
@@ -268,7 +268,8 @@ class Viewer(PageSocket):
                 lost = True
             else:
                 await self._send({"state": "ended", "text": f"{self._source.name} has ended."})
-                await asyncio.Event().wait()  # a second message would make the page play it again
+                # after a second message the page would play the recording again
+                await asyncio.Event().wait()
             if self._sent > before:
                 delays = REOPEN_BACKOFF.delays()
             await asyncio.sleep(next(delays))

@@ -61,9 +61,9 @@ OPERATOR = (
 
 def abilities(emulator: WireCamera) -> list[str]:
     """Return the names of an operator's actions, with ``scene`` and ``clock`` if present."""
-    able = [one for one in OPERATOR if hasattr(emulator.device, one)]
+    able = [name for name in OPERATOR if hasattr(emulator.device, name)]
     has = {"scene": emulator.table, "clock": emulator.clock_time}
-    return able + [name for name, one in has.items() if one is not None]
+    return able + [name for name, ability in has.items() if ability is not None]
 
 
 def camera_row(name: str, emulator: WireCamera) -> dict[str, Any]:
@@ -225,13 +225,13 @@ def _byte_order(device: Device) -> ByteOrder:
 
 
 def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
-    """Return the faults that wait and the last ones that have happened."""
+    """Return the waiting faults and the last past ones."""
     waiting, fired = emulator.faults, list(emulator.fired)
-    last = (one.fault for one in reversed(fired))
+    last = (fault.fault for fault in reversed(fired))
     return {
-        "waiting": [_fault(one) for one in waiting[: _shown_count(waiting, limit)]],
+        "waiting": [_fault(fault) for fault in waiting[: _shown_count(waiting, limit)]],
         "waiting_count": len(waiting),
-        "fired": [_fired(one) for one in fired[len(fired) - _shown_count(last, limit) :]],
+        "fired": [_fired(fault) for fault in fired[len(fired) - _shown_count(last, limit) :]],
     }
 
 
@@ -251,9 +251,9 @@ def _fault(fault: BaseFault) -> dict[str, Any]:
     return {"kind": getattr(fault, "kind", None), **given}
 
 
-def _fired(one: FiredFault) -> dict[str, Any]:
-    message = None if one.message is None else type(one.message).__name__
-    return {"time": one.time, "fault": _fault(one.fault), "message": message}
+def _fired(fault: FiredFault) -> dict[str, Any]:
+    message = None if fault.message is None else type(fault.message).__name__
+    return {"time": fault.time, "fault": _fault(fault.fault), "message": message}
 
 
 def kinds() -> list[dict[str, Any]]:
@@ -290,7 +290,7 @@ def scene_state(emulator: WireCamera, scene: TableScene) -> dict[str, Any]:
         "seed": scene.seed,
         "y_down": scene.y_down,
         "parts": [_part(scene, name, pose) for name, pose in scene.pieces.items()],
-        "lookers": [one.id for one in applications if _looks(one)],
+        "lookers": [application.id for application in applications if _looks(application)],
         "reported": _reported(emulator, scene),
     }
 
@@ -325,10 +325,11 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
     if last is None or application is None or layout is None or not _looks(application):
         return None
     records = layout.parse_records(last.result.data, last.byte_order)
-    found = [
-        _pose(one, scene, pixels=TABLE_GENERATORS[str(application.generator)]) for one in records
+    poses = [
+        _pose(record, scene, pixels=TABLE_GENERATORS[str(application.generator)])
+        for record in records
     ]
-    parts = [one for one in found if one is not None]
+    parts = [pose for pose in poses if pose is not None]
     return {"application": application.id, "time": round(last.time, 6), "parts": parts}
 
 

@@ -12,7 +12,7 @@ from smartcam._accepting import is_loopback, listening
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._connections import KEEP_ALIVE, Visitors
+from smartcam.web._connections import KEEP_ALIVE_TIMEOUT, Visitors
 from smartcam.web._guard import HEADERS, Guard, checked_token, new_token
 from smartcam.web._pages import page_html, read_file
 from smartcam.web._routes import MAX_BODY_BYTES, middleware, routes
@@ -209,7 +209,7 @@ async def open_port(
         application,
         access_log=None,
         shutdown_timeout=FINISH_TIMEOUT,
-        keepalive_timeout=KEEP_ALIVE,
+        keepalive_timeout=KEEP_ALIVE_TIMEOUT,
         logger=calm(_log),
     )
     listener = await listening(host, port, local=local)

@@ -29,10 +29,12 @@ def check_websocket(request: web.Request, protocol: str, viewers: int, most: int
         RefusedError: 400, it asks for another; 503, there are ``most`` viewers already.
     """
     headers = request.headers
-    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", protocol).split(",")]
+    offered = [
+        offer.strip() for offer in headers.get("Sec-WebSocket-Protocol", protocol).split(",")
+    ]
     if headers.get("Upgrade", "").lower() != "websocket" or protocol not in offered:
-        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-        raise RefusedError(400, what, f"a WebSocket of {protocol}")
+        offered_text = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, offered_text, f"a WebSocket of {protocol}")
     if viewers >= most:
         raise RefusedError(503, f"viewer {most + 1}", f"{most} at one time")
 
@@ -43,7 +45,7 @@ class PageSocket(ABC):
     Args:
         request: request that asks for the WebSocket.
         protocol: subprotocol of the WebSocket.
-        what: word for the shown messages, for the log.
+        label: word for the shown messages, for the log.
         heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
         longest: largest number of bytes of a message from the page.
     """
@@ -52,13 +54,13 @@ class PageSocket(ABC):
         self,
         request: web.Request,
         protocol: str,
-        what: str,
+        label: str,
         *,
         heartbeat: float | None = None,
         longest: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
-        self._what = what
+        self._subject = label
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
             max_msg_size=longest,
@@ -85,7 +87,9 @@ class PageSocket(ABC):
                 await self._socket.close(code=WSCloseCode.GOING_AWAY)
         except TimeoutError:
             _log.info(
-                "= %s: a page that takes no %s was disconnected", self._request.remote, self._what
+                "= %s: a page that takes no %s was disconnected",
+                self._request.remote,
+                self._subject,
             )
             if self._request.transport is not None:
                 self._request.transport.abort()

@@ -94,11 +94,13 @@ class TeachSite(ThreadedSite):
         super().__init__(CALLS, "teach", host=host, port=port, token=token)
         self.teaching: Teaching = teaching
         self.source: FrameSource | None = source
-        paths = [Path(one) for one in files]
+        paths = [Path(file) for file in files]
         if len(paths) > MAX_PICTURES:
             raise ConfigurationError(f"teach: expected {MAX_PICTURES} pictures at most")
         folder = teaching.path.parent
-        made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
+        made = [
+            NamedPicture(path.name, Picture.read(path), _beside(path, folder)) for path in paths
+        ]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
         # results of the last tools that were tried, by picture
@@ -142,10 +144,10 @@ class TeachSite(ThreadedSite):
         Raises:
             RefusedError: there is no such picture.
         """
-        found = self.pictures.get(int(number)) if number.isdecimal() else None
-        if found is None:
+        picture_file = self.pictures.get(int(number)) if number.isdecimal() else None
+        if picture_file is None:
             raise RefusedError(404, f"picture {number:.20}", "one of those that are listed")
-        return found
+        return picture_file
 
     def try_tools(self, given: dict[str, dict[str, str]]) -> dict[str, Any]:
         """Return the verdicts and values of every picture; call it in a thread.
@@ -156,15 +158,15 @@ class TeachSite(ThreadedSite):
             ConfigurationError: a tool or setting is wrong.
         """
         program = self.teaching.program(read_settings(given))
-        found: list[dict[str, Any]] = []
+        results: list[dict[str, Any]] = []
         tried: dict[int, Inspection] = {}
-        for number, one in list(self.pictures.items()):
+        for number, picture_file in list(self.pictures.items()):
             try:
-                seen = tried[number] = program.inspect(one.picture)
+                seen = tried[number] = program.inspect(picture_file.picture)
             except SmartCamError as exc:
-                found.append({"picture": number, "ok": False, "reason": str(exc), "marks": []})
+                results.append({"picture": number, "ok": False, "reason": str(exc), "marks": []})
                 continue
-            found.append(
+            results.append(
                 {
                     "picture": number,
                     "ok": seen.ok,
@@ -176,7 +178,7 @@ class TeachSite(ThreadedSite):
             )
         self._tried = tried
         remarks = [text for step in program.steps for text in step.tool.remarks]
-        return {"found": found, "remarks": remarks}
+        return {"found": results, "remarks": remarks}
 
     def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
         """Return settings, as texts, for which the good pictures pass, and their reasons.
@@ -207,8 +209,13 @@ class TeachSite(ThreadedSite):
             "kinds": tool_settings(),
             "live": self.source is not None,
             "pictures": [
-                {"number": number, "name": one.name, "size": one.picture.size, "file": one.file}
-                for number, one in self.pictures.items()
+                {
+                    "number": number,
+                    "name": picture.name,
+                    "size": picture.picture.size,
+                    "file": picture.file,
+                }
+                for number, picture in self.pictures.items()
             ],
         }
 
@@ -229,13 +236,18 @@ def texts_of(tools: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
 
 def _marks(seen: Inspection) -> list[dict[str, Any]]:
     """Return the marks of the tools, as values for JSON."""
-    drawn = [one for finding in seen.findings.values() for one in finding.drawings]
-    return [_mark(one) for one in drawn[:MAX_MARKS]]
+    drawn = [drawing for finding in seen.findings.values() for drawing in finding.drawings]
+    return [_mark(drawing) for drawing in drawn[:MAX_MARKS]]
 
 
-def _mark(one: Drawing) -> dict[str, Any]:
-    points = [[round(x, 2), round(y, 2)] for x, y in one.points[:MAX_POINTS]]
-    return {"kind": one.kind, "role": one.role, "text": one.text, "points": jsonable(points)}
+def _mark(drawing: Drawing) -> dict[str, Any]:
+    points = [[round(x, 2), round(y, 2)] for x, y in drawing.points[:MAX_POINTS]]
+    return {
+        "kind": drawing.kind,
+        "role": drawing.role,
+        "text": drawing.text,
+        "points": jsonable(points),
+    }
 
 
 def _png(picture: Picture) -> bytes:
@@ -274,7 +286,7 @@ def _calls(_site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/state")
 def _state(site: TeachSite, _call: CallRequest) -> object:
-    """The application as the file has it, the kinds of tools, and the pictures."""
+    """The application's entry in the file, the kinds of tools, and the pictures."""
     return site.state()
 
 

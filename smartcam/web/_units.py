@@ -37,5 +37,5 @@ class PageUnits:
         units = {symbol: self.shown.of(symbol) for symbol in SI_SYMBOLS.values()}
         return {
             "first": self.first,
-            "instead": {key: [*one] for key, one in units.items() if one.name != key},
+            "instead": {key: [*unit] for key, unit in units.items() if unit.name != key},
         }

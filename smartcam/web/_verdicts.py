@@ -21,15 +21,15 @@ def verdicts(value: Any) -> list[dict[str, Any]]:
     For a list of records, the number of true ones, and of all.
     """
     rows: list[Any] = value if isinstance(value, list) else [value]
-    if not (rows and all(isinstance(one, dict) for one in rows)):
+    if not (rows and all(isinstance(row, dict) for row in rows)):
         return []
-    names = [str(name) for name, one in rows[0].items() if isinstance(one, bool)]
-    return [_verdict(name, [one.get(name) is True for one in rows]) for name in names]
+    names = [str(name) for name, value in rows[0].items() if isinstance(value, bool)]
+    return [_verdict(name, [row.get(name) is True for row in rows]) for name in names]
 
 
 def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
     good = meaning(name)
-    verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
+    verdict = None if good is None else "pass" if all(value is good for value in values) else "fail"
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
 
 
@@ -43,10 +43,10 @@ def judged(value: Any) -> Outcome:
     for row in rows[:MAX_JUDGED]:
         if isinstance(row, Localization) or not hasattr(row, "_asdict"):
             return "other"
-        for name, one in row._asdict().items():
-            if one is True or one is False:
+        for name, field_value in row._asdict().items():
+            if field_value is True or field_value is False:
                 good = _meaning(name)
-                if good is not None and one is not good:
+                if good is not None and field_value is not good:
                     return "failed"
                 if good is not None:
                     verdict = "passed"
@@ -55,11 +55,15 @@ def judged(value: Any) -> Outcome:
 
 def failing(value: Any) -> str:
     """Return the truth values that are wrong, in words; "" without any."""
-    bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
+    bad = [verdict for verdict in verdicts(jsonable(value)) if verdict["verdict"] == "fail"]
     texts = []
-    for one in bad:
-        wanted = "true" if meaning(one["name"]) else "false"
-        of = "" if one["of"] == 1 else f" in {one['true']} of {one['of']} records"
-        got = {"true": "false", "false": "true"}[wanted] if one["of"] == 1 else "true"
-        texts.append(f"{one['name']} is {got}{of}, expected {wanted}")
+    for bad_verdict in bad:
+        wanted = "true" if meaning(bad_verdict["name"]) else "false"
+        of = (
+            ""
+            if bad_verdict["of"] == 1
+            else f" in {bad_verdict['true']} of {bad_verdict['of']} records"
+        )
+        actual = {"true": "false", "false": "true"}[wanted] if bad_verdict["of"] == 1 else "true"
+        texts.append(f"{bad_verdict['name']} is {actual}{of}, expected {wanted}")
     return "; ".join(texts)

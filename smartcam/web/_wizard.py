@@ -112,10 +112,12 @@ _STATUS = {
 
 
 def _refused(error: CalibrationError) -> RefusedError:
-    came, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
+    cause, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
     status = next((code for kind, code in _STATUS.items() if kind == error.code), 422)
     field = {"field": "code", "came": error.code, "expected": ""}
-    return RefusedError(status, came, expected or "what the folder and its wizard can do", (field,))
+    return RefusedError(
+        status, cause, expected or "what the folder and its wizard can do", (field,)
+    )
 
 
 CALLS: Calls[WizardSite] = Calls()

@@ -112,7 +112,7 @@ def test_any_thread_logs_whole_lines(tmp_path: Path) -> None:
 def test_a_pipe_that_nobody_reads_holds_nobody_up_and_what_was_dropped_is_told(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_lines, "FAREWELL", 0.01)
+    monkeypatch.setattr(log_lines, "FAREWELL_TIMEOUT", 0.01)
     reading, writing = pipe
     with json_log(logging.INFO, str, set, descriptor=writing, most=50) as handler:
         for number in range(3000):  # more than a pipe and the queue hold

@@ -10,7 +10,7 @@ from smartcam.emulator._insight.commands import InSightCommands
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._insight.job import BUILTIN_JOBS, Control, make_job, shown
 from smartcam.emulator._links import TcpListener, _TcpLink
-from smartcam.emulator._scenario.timeline import MAX_AT_ONCE, MAX_PENDING, Timeline
+from smartcam.emulator._scenario.timeline import MAX_CUES_AT_ONCE, MAX_PENDING, Timeline
 from smartcam.emulator.faults import _matching
 from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue

@@ -425,8 +425,8 @@ async def test_second_client_goes_when_the_emulator_stops(emulator: EmulatedCame
 def test_second_client_is_told_nothing_that_makes_no_frame() -> None:
     told: list[Frame] = []
     session = SecondClientSession(HANDBOOK, told.append)
-    session.say(m.QueryAnswer(application=1 << 40))
-    session.say(m.QueryAnswer(application=1))
+    session.send(m.QueryAnswer(application=1 << 40))
+    session.send(m.QueryAnswer(application=1))
     assert [HANDBOOK.encode_frame(frame) for frame in told] == [wire.ACTIVE_1]
 
 

@@ -44,8 +44,10 @@ def provide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         (tmp_path / "maker_of_weights.py").write_text(WEIGHTS, encoding="utf-8")
 
     monkeypatch.syspath_prepend(tmp_path)
-    for registry_part in ("_found", "_loaded"):
-        monkeypatch.setattr(GENERATORS, registry_part, None if registry_part == "_found" else {})
+    for registry_part in ("_points_found", "_loaded"):
+        monkeypatch.setattr(
+            GENERATORS, registry_part, None if registry_part == "_points_found" else {}
+        )
     monkeypatch.setattr("smartcam.emulator._generators._FOUND", dict(_FOUND))
     return add
 

@@ -231,7 +231,7 @@ class Owner:
     def received(self, link: ClientLink, message: m.Message) -> None:
         self.messages.append(message)
         if isinstance(message, m.Connect):
-            link.say(m.ConnectAnswer(version=1))
+            link.send(m.ConnectAnswer(version=1))
 
     def serves(self, link: ClientLink) -> bool:
         return True

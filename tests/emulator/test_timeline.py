@@ -22,7 +22,7 @@ from smartcam.models import Status
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
-from tests.emulator.inside import MAX_AT_ONCE, MAX_PENDING, Timeline
+from tests.emulator.inside import MAX_CUES_AT_ONCE, MAX_PENDING, Timeline
 
 STOP = {"kind": "stop"}
 
@@ -135,7 +135,7 @@ def test_cues_that_wait_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
         bench.timeline.entered(DeviceState.BUSY)
     assert caplog.text.count("cues wait, one is dropped") == 5
     bench.clock.advance(10)
-    assert len(bench.happened) == MAX_AT_ONCE
+    assert len(bench.happened) == MAX_CUES_AT_ONCE
 
 
 @given(
@@ -269,7 +269,7 @@ async def test_every_state_can_be_entered() -> None:
         device.stop()
         device.handle(m.Disconnect())
         device.reboot(1)
-        device.tell_entered()
+        device.report_entered()
     done = dict(zip(DeviceState, emulator.cues_done, strict=True))
     assert [state for state, count in done.items() if not count] == [DeviceState.INPUT_CONTAINER]
 
@@ -328,7 +328,7 @@ async def test_cues_that_bring_each_other_about_end(caplog: pytest.LogCaptureFix
     )
     async with emulator:
         emulator.device.stop()
-        assert sum(emulator.cues_done) == MAX_AT_ONCE
+        assert sum(emulator.cues_done) == MAX_CUES_AT_ONCE
     assert "one is dropped" in caplog.text
 
 

@@ -141,7 +141,7 @@ class OverZenoh(Client):
     async def topic(self, pattern: str) -> Heard:
         heard = await super().topic(pattern)
         # of a subscription the engine tells in another thread than of what is asked
-        await until(lambda: all(one.heard for one in self._publishers(pattern)))
+        await until(lambda: all(one.has_subscribers for one in self._publishers(pattern)))
         return heard
 
     def _publishers(self, pattern: str) -> list[Publisher]:

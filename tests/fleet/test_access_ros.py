@@ -32,7 +32,7 @@ def topics(context: RosContext) -> set[str]:
 
 
 async def test_roles_and_renewal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_renewal, "LOOK_EVERY", 0.02)
+    monkeypatch.setattr(_renewal, "CHECK_INTERVAL", 0.02)
     folder = await certified(tmp_path)
     file = plant_file(folder, ros2={"domain": DOMAIN})
     async with smartcam.fleet.serve(file) as server:

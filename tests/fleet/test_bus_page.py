@@ -118,10 +118,14 @@ class NotingEnd(MemoryEnd):
         return super().subscribe_parts(pattern, hear)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
         self._note("would say", key)
-        return super().publisher(key, on_heard, urgent=urgent)
+        return super().publisher(key, on_subscribers, urgent=urgent)
 
     def answer(
         self,

@@ -202,9 +202,9 @@ class Ros2Face(Face):
             now = time.time()
             if self.robot.moving:
                 moves.publish(transforms=self.robot.transforms(now))
-            if images.heard:
+            if images.has_subscribers:
                 images.publish(image_of(self.robot.view, now))
-            if lenses.heard:
+            if lenses.has_subscribers:
                 lenses.publish(lens_of(now))
             await asyncio.sleep(PERIOD)
 

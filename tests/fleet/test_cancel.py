@@ -145,7 +145,7 @@ async def check_camera(
     await until(lambda: not camera._caller._insisting)
     assert camera._program._pending == {}
     assert camera._watching == set()
-    assert camera._receiver.own == {}
+    assert camera._receiver.own_calls == {}
     assert host.outcomes == {}
 
 

@@ -349,6 +349,6 @@ async def test_many_that_knock_are_looked_at_together(monkeypatch: pytest.Monkey
         now[0] += 0.0001
     await asyncio.sleep(0)
     assert looks == 1
-    now[0] += _door.REST * 0.02
+    now[0] += _door.CHECK_PAUSE_FACTOR * 0.02
     await until(lambda: looks == 2)
     door._expect_look(None)

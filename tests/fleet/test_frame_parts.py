@@ -186,10 +186,10 @@ async def test_frame_comes_whole_or_not_at_all(size: int, each: int, fates: list
     for part, said in came:
         if said or not data:
             one.take(part, said)
-    assert await one.whole(size) in [None, data]
+    assert await one.complete_data(size) in [None, data]
     if not fates or set(fates) == {"come"}:
-        assert await one.whole(size) == data
-    assert await one.whole(size + 1) is None
+        assert await one.complete_data(size) == data
+    assert await one.complete_data(size + 1) is None
 
 
 async def test_rest_that_does_not_come_is_given_up_and_told() -> None:
@@ -197,7 +197,7 @@ async def test_rest_that_does_not_come_is_given_up_and_told() -> None:
     one, told = incoming()
     one.take(*parts(data, PART_BYTES)[0])
     begun = asyncio.get_running_loop().time()
-    assert await one.whole(len(data)) is None
+    assert await one.complete_data(len(data)) is None
     waited = asyncio.get_running_loop().time() - begun
     assert waited == pytest.approx(_frame_collector.PART_TIMEOUT, abs=0.1)
     one.forget()

@@ -303,7 +303,7 @@ async def test_silent_agent_ends_a_stream() -> None:
         camera.frames(timeout=PATIENCE) as frames,
     ):
         await anext(frames)
-        end_of(camera).heard.clear()  # nothing comes to this program any more
+        end_of(camera).subscriptions.clear()  # nothing comes to this program any more
         with pytest.raises(FrameSourceError, match="did not answer"):
             async for _ in frames:
                 pass

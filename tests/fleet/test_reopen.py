@@ -34,7 +34,7 @@ async def test_all_is_there_again() -> None:
         connects.watch("here/*", lambda key, present: known.append((key, present)))
         connects.be_present("there/stays")
         goes = connects.be_present("there/goes")
-        await until(lambda: len(seen) == 2 and len(known) == 2 and publisher.heard)
+        await until(lambda: len(seen) == 2 and len(known) == 2 and publisher.has_subscribers)
         closed.close()
         await until(lambda: len(known) == 3)
         seen.clear()
@@ -51,7 +51,13 @@ async def test_all_is_there_again() -> None:
         goes.close()
         await reopening
 
-        await until(lambda: ("there/stays", True) in seen and publisher.heard and early.heard)
+        await until(
+            lambda: (
+                ("there/stays", True) in seen
+                and publisher.has_subscribers
+                and early.has_subscribers
+            )
+        )
         # both are gone with the session; who has gone while there was none does not come back
         assert sorted(seen[:2]) == [("there/goes", False), ("there/stays", False)]
         assert [one for one in seen[2:] if one[1]] == [("there/stays", True)]
@@ -75,12 +81,12 @@ async def test_publisher_that_nobody_hears_any_more_is_told() -> None:
         told: list[bool] = []
         publisher = listens.publisher("topic/a", told.append)
         hears = connects.subscribe("topic/a", lambda *_: None)
-        await until(lambda: publisher.heard)
+        await until(lambda: publisher.has_subscribers)
         reopening = asyncio.ensure_future(listens.reopen(PATIENCE))
         await asyncio.sleep(0)
         hears.close()
         await reopening
-        await until(lambda: not publisher.heard)
+        await until(lambda: not publisher.has_subscribers)
         assert told[-1] is False
 
 

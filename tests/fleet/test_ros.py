@@ -67,7 +67,7 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
         others = viewer.subscribe("/line_1/cam1/localizations", POSES, qos=QoS(depth=5))
         publishers = {one.node.full_name: one for one in server._ros.nodes.values()}  # type: ignore[union-attr]
         heard = [one.results._publishers["localizations"] for one in publishers.values()]
-        await until(lambda: all(one.heard for one in heard))
+        await until(lambda: all(one.has_subscribers for one in heard))
         direct: Any = smartcam.connect(server.urls["line-1/cam2"])
         async with direct as camera:
             result = await camera.trigger()

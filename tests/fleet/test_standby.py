@@ -370,14 +370,14 @@ async def test_session_that_begins_while_another_agent_is_asked_is_seen(
         await until(lambda: pair.having() == ["south"])
         async with pair.program() as camera:
             pair.box.inject(faults.Delay(on="ConnectAnswer", seconds=1.0))
-            say_hello = camera._caller._say_hello
+            say_hello = camera._caller._greet_agent
 
             async def slowly(agent: str) -> Any:
                 heard = await say_hello(agent)
                 await asyncio.sleep(2.0)  # another one is asked, and says nothing
                 return heard
 
-            monkeypatch.setattr(camera._caller, "_say_hello", slowly)
+            monkeypatch.setattr(camera._caller, "_greet_agent", slowly)
             await pair.agents["south"].drop(NAME, "it is told to")
             await until(lambda: pair.having() == ["north"])
             await camera.wait_connected(timeout=PATIENCE)

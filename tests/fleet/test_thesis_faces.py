@@ -162,7 +162,9 @@ class JsonFace(Face):
             key = f"{PREFIX}/thesis/topic/outputs"
             self._heard = self._session.declare_subscriber(key, take)
         topics = self._server.hosts[NAME].topics
-        await until(lambda: topics.results_out is not None and topics.results_out.publisher.heard)
+        await until(
+            lambda: topics.results_out is not None and topics.results_out.publisher.has_subscribers
+        )
 
     async def ask(self, service: str, fields: dict[str, Any]) -> dict[str, Any]:
         return await ask_thesis(self._session, service, fields)
@@ -183,7 +185,9 @@ class Ros2Face(Face):
             self._task = asyncio.create_task(self._take(heard))
         assert self._server._ros is not None
         (node,) = self._server._ros.nodes.values()
-        await until(lambda: node.results._outlet is not None and node.results._outlet.heard)
+        await until(
+            lambda: node.results._outlet is not None and node.results._outlet.has_subscribers
+        )
 
     async def _take(self, heard: Any) -> None:
         async for message in heard:

@@ -173,7 +173,7 @@ async def test_cancelling_under_the_name_of_another() -> None:
 async def refused(url: str, timeout: float = PATIENCE) -> str:
     """Return why nobody comes in."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_zenoh, "LOOK_TIMEOUT", PATIENCE)
+        patch.setattr(_zenoh, "DIAGNOSIS_TIMEOUT", PATIENCE)
         with pytest.raises(ConnectFailedError) as caught:
             async with smartcam.connect(url, connect_timeout=timeout):
                 pass
@@ -244,7 +244,7 @@ async def test_any_certificate(folder: Path) -> None:
 
 
 async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_renewal, "LOOK_EVERY", 0.02)
+    monkeypatch.setattr(_renewal, "CHECK_INTERVAL", 0.02)
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
         await server.wait_first_attempts()
@@ -282,7 +282,7 @@ async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
 async def test_command_under_way_is_not_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_renewal, "LOOK_EVERY", 0.02)
+    monkeypatch.setattr(_renewal, "CHECK_INTERVAL", 0.02)
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
         await server.wait_first_attempts()

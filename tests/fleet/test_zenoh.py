@@ -91,7 +91,7 @@ async def heard_by(listens: ZenohEnd, connects: ZenohEnd) -> Heard:
     connects.subscribe("test/**", heard)
     publisher = listens.publisher("test/first")
     async with asyncio.timeout(PATIENCE):
-        while not publisher.heard:  # noqa: ASYNC110 - the engine tells
+        while not publisher.has_subscribers:  # noqa: ASYNC110 - the engine tells
             await asyncio.sleep(0.005)
     return heard
 
@@ -419,7 +419,7 @@ async def test_what_is_said_while_a_link_stands_still_arrives_in_order(urgent: b
             for says, hears in ((listens, connects), (connects, listens)):
                 heard = await heard_by(says, hears)
                 results = says.publisher("test/results", urgent=urgent)
-                await until(lambda results=results: results.heard)
+                await until(lambda results=results: results.has_subscribers)
                 relay.flows.clear()
                 payloads = [b"%d" % number + bytes(200) for number in range(60)]
                 for _ in range(300):  # much more than sockets take

@@ -726,7 +726,7 @@ PARSERS: tuple[Parser, ...] = (
     ),
     Parser(
         "GenICam: formulas",
-        lambda text: _expressions.evaluate(text, {}, whole=True),
+        lambda text: _expressions.evaluate(text, {}, integral=True),
         _FORMULAS,
         _expressions.MAX_FORMULA_CHARACTERS,
         "frames._gige.expressions.MAX_FORMULA_CHARACTERS",

@@ -14,7 +14,7 @@ from smartcam.frames._gige.discovery import (
     MAX_ANSWERS_OF_ONE_ADDRESS,
     AnsweringCamera,
     Network,
-    _Asking,
+    _NetworkSearch,
     find,
     networks,
 )

@@ -18,8 +18,8 @@ from tests.frames.inside import (
     NEW_HOST_DELAY,
     Network,
     RtpPacket,
-    _Asking,
     _ControlPort,
+    _NetworkSearch,
 )
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
 from tests.frames.rtp.ways import HOST, two_ports
@@ -151,12 +151,12 @@ async def test_events_of_a_gige_camera_are_those_of_its_address_alone() -> None:
 
 async def test_one_address_does_not_replace_all_gige_cameras() -> None:
     async with gige_camera() as there:
-        asking = _Asking(Network("127.0.0.1", ()))
+        asking = _NetworkSearch(Network("127.0.0.1", ()))
         answer = await discovery_of(there.port)
         for number in range(300):
             asking.datagram_received(answer, ("10.0.0.9", number))
         asking.datagram_received(answer, ("10.0.0.1", 3956))
-    assert [one.address for one in asking.found] == ["10.0.0.9"] * MAX_ANSWERS_OF_ONE_ADDRESS + [
+    assert [one.address for one in asking.cameras] == ["10.0.0.9"] * MAX_ANSWERS_OF_ONE_ADDRESS + [
         "10.0.0.1"
     ]
 

@@ -122,15 +122,15 @@ async def test_a_disk_that_is_full_for_a_while_loses_nothing_that_memory_holds(
     async with Outlets({"list": {}}, tmp_path) as outlets:
         spool = outlets._pumps["list"].spool
         far.there = False
-        pages = spool._there.execute("PRAGMA page_count").fetchone()[0]
-        spool._there.execute(f"PRAGMA max_page_count = {pages}")
+        pages = spool._open_database.execute("PRAGMA page_count").fetchone()[0]
+        spool._open_database.execute(f"PRAGMA max_page_count = {pages}")
         for n in range(300):
             outlets.offer_result(result(n, value={"n": n, "text": "x" * 500}))
         await until(lambda: "full" in outlets.states["list"].trouble)
         assert account(outlets).spooled == 300
         await asyncio.wrap_future(
             outlets._pumps["list"]._thread.submit(
-                lambda: spool._there.execute("PRAGMA max_page_count = 100000") and None
+                lambda: spool._open_database.execute("PRAGMA max_page_count = 100000") and None
             )
         )
         far.there = True
@@ -164,8 +164,8 @@ async def test_what_a_full_disk_keeps_out_until_the_end_is_told_by_the_next_star
     far.there = False
     async with Outlets({"list": {}}, tmp_path) as outlets:
         spool = outlets._pumps["list"].spool
-        pages = spool._there.execute("PRAGMA page_count").fetchone()[0]
-        spool._there.execute(f"PRAGMA max_page_count = {pages}")
+        pages = spool._open_database.execute("PRAGMA page_count").fetchone()[0]
+        spool._open_database.execute(f"PRAGMA max_page_count = {pages}")
         outlets.offer_result(result(1, value={"n": 1, "text": "x" * 100_000}))
         await until(lambda: "full" in outlets.states["list"].trouble)
         epoch = spool.epoch
@@ -187,7 +187,7 @@ async def test_a_spool_that_is_damaged_while_it_is_used_is_begun_anew(
         spool = outlets._pumps["list"].spool
 
         def damage() -> None:
-            spool._there.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            spool._open_database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             spool.path.write_bytes(b"\xff" * spool.path.stat().st_size)
 
         await asyncio.wrap_future(outlets._pumps["list"]._thread.submit(damage))

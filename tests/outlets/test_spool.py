@@ -98,7 +98,7 @@ def test_the_gap_of_a_crash_has_another_id_than_that_of_a_refused_entry(tmp_path
 def test_an_entry_that_is_not_what_was_written_is_dropped_and_told(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.add([entry(n, spool, body=f'{{"n": {n}}}') for n in range(1, 6)])
-    spool._there.execute("UPDATE entries SET body = '{\"n\": 7}' WHERE number = 3")
+    spool._open_database.execute("UPDATE entries SET body = '{\"n\": 7}' WHERE number = 3")
     head = spool.head(10).entries
     assert [one.number for one in head if one.kind == "result"] == [1, 2, 4, 5]
     (gap,) = [one for one in head if one.kind == "gap"]
@@ -131,7 +131,7 @@ def test_a_spool_that_is_deleted_or_older_than_its_last_start_is_told(
 def test_counts_that_do_not_balance_are_damage(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.add([entry(n, spool) for n in range(1, 6)])
-    spool._there.execute("UPDATE counts SET value = 3 WHERE name = 'results'")
+    spool._open_database.execute("UPDATE counts SET value = 3 WHERE name = 'results'")
     spool.close()
     again = opened(tmp_path)
     assert again.account == OutletAccount(5, 0, 5, {})
@@ -204,7 +204,7 @@ def test_the_account_balances_whatever_is_done(tmp_path: Path, seed: int) -> Non
             spool, waiting = opened(tmp_path, 4000, policy), None
         assert spool.account.balanced, spool.account
         assert spool.account == read_account(tmp_path / "a.spool")
-        there = spool._there.execute("SELECT SUM(bytes) FROM entries").fetchone()[0] or 0
+        there = spool._open_database.execute("SELECT SUM(bytes) FROM entries").fetchone()[0] or 0
         assert spool.bytes == there
     assert spool.account.results == number
     told = sum(lost for _, _, lost in gaps(spool))
@@ -217,12 +217,12 @@ def test_a_full_disk_keeps_nothing_of_a_write_and_counts_nothing(tmp_path: Path)
 
     spool = opened(tmp_path)
     spool.add([entry(1, spool)])
-    pages = spool._there.execute("PRAGMA page_count").fetchone()[0]
-    spool._there.execute(f"PRAGMA max_page_count = {pages}")
+    pages = spool._open_database.execute("PRAGMA page_count").fetchone()[0]
+    spool._open_database.execute(f"PRAGMA max_page_count = {pages}")
     with pytest.raises(sqlite3.OperationalError, match="full"):
         spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
     assert spool.account == OutletAccount(1, 0, 1, {})
-    spool._there.execute("PRAGMA max_page_count = 100000")
+    spool._open_database.execute("PRAGMA max_page_count = 100000")
     spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
     assert spool.account == OutletAccount(199, 0, 199, {})
     spool.close()

@@ -312,7 +312,7 @@ def test_decode_ever_new_bodies_gives_their_messages_and_keeps_a_bounded_number(
             assert fresh.decode(CAMERA, frame) == report
             assert fresh.decode(CAMERA, Frame(frame.message_id, frame.payload + b"more")) == report
     codec = fresh.encoder(m.StatusReport)
-    assert len(codec._known) == 256
+    assert len(codec._messages) == 256
     first = fresh.to_frame(reports[0])
     assert fresh.decode(CAMERA, first) is fresh.decode(CAMERA, first)
 

@@ -332,7 +332,7 @@ STATUS = m.StatusReport(status=Status.RUNNING)
 
 @pytest.mark.parametrize(
     ("message", "most"),
-    [(SMALL, machine.MANY_FRAMES), (STATUS, machine.MANY_EVENTS)],
+    [(SMALL, machine.MAX_FRAMES_PER_READ), (STATUS, machine.MAX_EVENTS_PER_READ)],
     ids=["results", "statuses"],
 )
 def test_reads_shrink_until_they_have_no_more_frames_than_one_turn_takes(

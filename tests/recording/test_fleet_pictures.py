@@ -113,7 +113,7 @@ async def test_each_result_has_the_first_picture_of_its_trigger(
 async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bound(
     tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_files, "ITEMS_PER_LOOK", 1)
+    monkeypatch.setattr(folder_files, "ITEMS_PER_CHECK", 1)
     async with NumberedCamera() as box:
         options: dict[str, Any] = {
             "pictures": "all",

@@ -92,7 +92,7 @@ class Disk:
 async def test_files_follow_and_no_result_is_lost_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_files, "ITEMS_PER_LOOK", 1)
+    monkeypatch.setattr(folder_files, "ITEMS_PER_CHECK", 1)
     async with NumberedCamera(rate=500) as box:
         async with recording(tmp_path, box.url, size=6000) as (recorder, _):
             await until(lambda: len(files(tmp_path)) >= 4)
@@ -120,7 +120,7 @@ async def test_files_follow_and_no_result_is_lost_between(
 async def test_each_file_says_what_the_camera_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_files, "ITEMS_PER_LOOK", 1)
+    monkeypatch.setattr(folder_files, "ITEMS_PER_CHECK", 1)
     async with NumberedCamera() as box, recording(tmp_path, box.url, size=6000) as (_, agent):
         camera = agent.hosts[NAME].camera
         for _ in range(60):

@@ -62,7 +62,7 @@ async def never(_request: Any) -> Any:
 
 async def test_publish(bridge: Bridge, node: RosbridgeNode) -> None:
     publisher = node.publisher("~/status", STRING)
-    assert publisher.heard
+    assert publisher.has_subscribers
     publisher.publish(data="one")
     publisher.publish({"data": "two"})
     publisher.publish(publisher.type.new(data="three"))
@@ -127,7 +127,7 @@ async def test_without_a_bridge_the_last_latched_message_is_kept(bridge: Bridge)
             status.publish(data=f"s{number}")
             results.publish(data=f"r{number}")
         assert (status.dropped, results.dropped) == (0, 3)
-        assert (status.heard, results.heard) == (True, False)
+        assert (status.has_subscribers, results.has_subscribers) == (True, False)
         with pytest.raises(TimeoutError):
             await node.wait_connected(5)
         assert node.failure.startswith(f"{bridge.url}: [Errno ")
@@ -224,25 +224,25 @@ async def test_who_hears_pictures(bridge: Bridge) -> None:
     async with node_of(bridge) as node:
         image, text = node.publisher("~/image", IMAGE), node.publisher("~/text", STRING)
         await node.wait_connected(60)
-        assert image.heard
-        assert text.heard
+        assert image.has_subscribers
+        assert text.has_subscribers
         await asyncio.sleep(5)
-        assert image.heard
+        assert image.has_subscribers
         subscribers = {"values": {"subscribers": []}, "result": True}
         await asyncio.sleep(5)
-        assert not image.heard
-        assert text.heard
+        assert not image.has_subscribers
+        assert text.has_subscribers
         image.publish(data=b"abc")  # it may be said all the same
         await bridge.until(lambda: bridge.published)
         for nothing in (None, {"values": "none", "result": False}, {"values": {}}, {}):
             subscribers = nothing
             await asyncio.sleep(5)
-            assert image.heard
+            assert image.has_subscribers
             subscribers = {"values": {"subscribers": []}, "result": True}
             await bridge.restart()
             await node.wait_connected(60)
             await asyncio.sleep(5)
-            assert not image.heard
+            assert not image.has_subscribers
 
 
 async def test_what_ros1_has_not_is_left_out(
@@ -252,7 +252,7 @@ async def test_what_ros1_has_not_is_left_out(
     absent = node.publisher("~/detections", "vision_msgs/msg/Detection3DArray")
     served = node.serve("~/list_parameters", PARAMETERS, yes)
     absent.publish(detections=[])
-    assert not absent.heard
+    assert not absent.has_subscribers
     there = node.publisher("~/status", STRING)
     there.publish(data="a")
     await bridge.until(lambda: bridge.published)

@@ -70,7 +70,7 @@ class PaperPublisher:
     """Keeps what is published, as who hears it would read it."""
 
     def __init__(self, node: PaperNode, name: str, kind: str, qos: QoS) -> None:
-        self.name, self.qos, self.heard, self.closed = name, qos, True, False
+        self.name, self.qos, self.has_subscribers, self.closed = name, qos, True, False
         self.type = node.types.message(kind)
         self.messages: list[Any] = []
 

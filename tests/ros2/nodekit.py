@@ -35,7 +35,7 @@ class NotedPublisher:
     def __init__(self, node: NotedNode, topic: str, kind: str, qos: Any) -> None:
         self.node, self.topic, self.qos = node, topic, qos
         self.type = TYPES.message(kind)
-        self.heard = True
+        self.has_subscribers = True
         self.fails = False
         self.closed = False
         self.said: list[Published] = []

@@ -223,8 +223,8 @@ async def test_calibrated_results_are_in_the_robots_frame() -> None:
 async def test_nothing_is_made_that_nobody_hears() -> None:
     async with published() as (_, camera, node, results):
         for one in node.publishers.values():
-            one.heard = False
-        node.publishers["/line1/cam3/detections"].heard = True
+            one.has_subscribers = False
+        node.publishers["/line1/cam3/detections"].has_subscribers = True
         await camera.trigger()
         await until(lambda: results.taken == 1)
         assert [len(node.said(topic)) for topic in TOPICS] == [0, 0, 1]
@@ -389,7 +389,7 @@ async def test_another_node_hears_each_result_once_over_tcp(count: int) -> None:
         heard = {
             topic: viewer.subscribe(f"/line1/cam3/{topic}", kind) for topic, kind in kinds.items()
         }
-        await until(lambda: all(one.heard for one in results._publishers.values()))
+        await until(lambda: all(one.has_subscribers for one in results._publishers.values()))
         for number in range(1, count + 1):
             got = await camera.trigger()
             said, poses, found = [await anext(one) for one in heard.values()]
@@ -412,7 +412,7 @@ async def test_results_at_once_reach_another_node() -> None:
         published(node) as (_, camera, _, results),
     ):
         heard = viewer.subscribe("/line1/cam3/results", RESULT, qos=QoS(depth=1000))
-        await until(lambda: results.heard)
+        await until(lambda: results.has_subscribers)
         got = await camera.trigger()
         await until(lambda: results.taken == 1)
         await anext(heard)

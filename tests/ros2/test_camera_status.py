@@ -116,11 +116,11 @@ async def test_nothing_is_made_where_nobody_hears() -> None:
     async with seen() as one:
         await asyncio.sleep(0)
         topic = one.node.topics[DIAGNOSTICS]
-        topic.heard = False
+        topic.has_subscribers = False
         count = len(topic.said)
         await asyncio.sleep(5.5)
         assert len(topic.said) == count
-        topic.heard = True
+        topic.has_subscribers = True
         await asyncio.sleep(1)
         assert len(topic.said) == count + 1
 
@@ -337,7 +337,7 @@ def test_state_that_is_known_is_said_in_one_way(known: KnownState, said: tuple[A
     )
     got = message.decode(message.encode(fields))
     assert (got.ready, got.application_id, got.error, how.level, how.text) == said
-    assert health(known, heard=False).level == (how.level if known.connected else STALE)
+    assert health(known, session_alive=False).level == (how.level if known.connected else STALE)
 
 
 async def test_unknown_bits_are_kept() -> None:

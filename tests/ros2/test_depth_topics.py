@@ -88,7 +88,7 @@ async def test_all_that_is_heard_is_what_was_found() -> None:
         hears = {
             name: there.subscribe(f"/line1/cam3/{name}", kind) for name, kind in TOPICS.items()
         }
-        await until(lambda: all(one.heard for one in topics._publishers.values()))
+        await until(lambda: all(one.has_subscribers for one in topics._publishers.values()))
         frame = depth_frame()
         pair.frames.put_nowait(frame)
         came = {name: await soon(anext(one)) for name, one in hears.items()}
@@ -133,8 +133,8 @@ async def test_a_pair_of_the_callers_stays_open_and_clouds_may_be_dense() -> Non
         topics.start()
         depths = there.subscribe("/line1/cam3/depth/image_rect", TOPICS["depth/image_rect"])
         clouds = there.subscribe("/line1/cam3/points2", TOPICS["points2"])
-        await until(lambda: topics._publishers["points2"].heard)
-        await until(lambda: topics._publishers["depth/image_rect"].heard)
+        await until(lambda: topics._publishers["points2"].has_subscribers)
+        await until(lambda: topics._publishers["depth/image_rect"].has_subscribers)
         frame = depth_frame()
         pair.frames.put_nowait(frame)
         depth, cloud = await soon(anext(depths)), await soon(anext(clouds))

@@ -64,7 +64,7 @@ async def test_messages_come_in_order_and_once() -> None:
     async with two() as (cam, viewer):
         says = cam.publisher("~/chatter", STRING, qos=QoS(depth=2000))
         hears = viewer.subscribe("/cam/chatter", STRING, qos=QoS(depth=2000))
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         await asyncio.sleep(0.5)  # who hears knows of us, too
         for number in range(1000):
             says.publish(data=str(number))
@@ -195,7 +195,7 @@ async def test_time_is_that_of_the_topic_clock() -> None:
         clock = viewer.publisher("/clock", "rosgraph_msgs/msg/Clock")
         says = cam.publisher("~/image", "sensor_msgs/msg/Image")
         hears = viewer.subscribe("/cam/image", "sensor_msgs/msg/Image")
-        await until(lambda: clock.heard and says.heard)
+        await until(lambda: clock.has_subscribers and says.has_subscribers)
         await asyncio.sleep(0.5)
 
         def tick() -> bool:
@@ -236,7 +236,7 @@ async def test_a_context_that_somebody_shuts_down_is_a_typed_error(
             says.publish(data="a")
         with pytest.raises(RosError, match="context was shut down"):
             cam.publisher("~/other", STRING)
-        assert not says.heard
+        assert not says.has_subscribers
         await cam.stop()
         assert time.monotonic() - start < 10
         await cam.start()  # it may be opened again

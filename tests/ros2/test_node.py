@@ -50,7 +50,7 @@ async def test_messages_come_in_order_with_number_and_publisher() -> None:
     async with two_nodes() as (here, there):
         hears = there.subscribe("/line1/chatter", STRING)
         says = here.publisher("chatter", STRING)
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         for n in range(20):
             says.publish(data=str(n))
             message = await soon(anext(hears))
@@ -78,7 +78,7 @@ async def test_the_oldest_makes_room_for_who_reads_slowly() -> None:
     async with two_nodes() as (here, there):
         hears = there.subscribe("/line1/chatter", STRING, qos=QoS(depth=3))
         says = here.publisher("chatter", STRING)
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         for n in range(10):
             says.publish(data=str(n))
         await until(lambda: hears.statistics().offered == 10)
@@ -90,7 +90,7 @@ async def test_long_messages_come_whole_and_in_order() -> None:
     async with two_nodes() as (here, there):
         hears = there.subscribe("/image", "sensor_msgs/msg/Image", qos=QoS(depth=5))
         says = here.publisher("/image", "sensor_msgs/msg/Image", qos=QoS(depth=5))
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         for n in range(8):
             says.publish(height=n, data=bytes([n]) * 1_000_000)
             message = await soon(anext(hears))
@@ -103,7 +103,7 @@ async def test_what_is_no_message_is_left_out_and_told(caplog: pytest.LogCapture
     async with two_nodes() as (here, there):
         hears = there.subscribe("/line1/chatter", STRING)
         says = here.publisher("chatter", STRING)
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         session, key = here.context.zenoh.session, says.entity.key
         extra = Attachment(1, 1, bytes(16)).encode()
         session.put(key, b"\0\1\0\0\xff\xff\xff\xff", attachment=extra)
@@ -376,7 +376,7 @@ async def test_nodes_of_one_session_do_not_collide() -> None:
         await until(lambda: viewer.graph.nodes() == ["/twin", "/viewer"])
         assert len(viewer.graph.ends("/chatter", "MP")) == 1
         hears, says = viewer.subscribe("/chatter", STRING), one.publisher("/chatter", STRING)
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         says.publish(data="still here")
         assert (await soon(anext(hears))).data == "still here"
 
@@ -391,7 +391,7 @@ async def test_domains_are_apart() -> None:
         there.subscribe("/chatter", STRING)
         await until(lambda: there.graph.ends("/chatter", "MS"))
         assert there.graph.nodes() == ["/viewer"]
-        assert not says.heard
+        assert not says.has_subscribers
 
 
 async def test_who_has_another_type_is_told(caplog: pytest.LogCaptureFixture) -> None:
@@ -514,7 +514,7 @@ async def test_a_burst_comes_whole() -> None:
     async with two_nodes() as (here, there):
         hears = there.subscribe("/line1/chatter", STRING, qos=QoS(depth=2000))
         says = here.publisher("chatter", STRING, qos=QoS(depth=5))
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         for _ in range(2):
             for n in range(500):
                 says.publish(data=f"{n} {'x' * 4000}")
@@ -534,7 +534,7 @@ async def test_pause_of_a_link_loses_nothing_of_a_reliable_topic() -> None:
     ):
         hears = there.subscribe("/chatter", STRING, qos=QoS(depth=1000))
         says = here.publisher("chatter", STRING)
-        await until(lambda: says.heard)
+        await until(lambda: says.has_subscribers)
         link.stall()
         for n in range(300):
             says.publish(data=f"{n} {'x' * 50_000}")

@@ -77,7 +77,7 @@ async def given(driver: ScriptedDriver, *frames: Any) -> None:
 async def heard(node: Node, topic: str, kind: str) -> None:
     """Wait until a node knows that somebody hears a topic of its own."""
     with contextlib.closing(node.publisher(topic, kind, qos=DRIVER)) as other:
-        await until(lambda: other.heard)
+        await until(lambda: other.has_subscribers)
 
 
 def readers(driver: ScriptedDriver) -> int:
@@ -192,7 +192,7 @@ async def test_a_jpeg_goes_as_it_came_and_decoded() -> None:
 async def test_what_ends_or_fails_is_told_once_and_tried_again(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(picture_stream, "LOOK_INTERVAL", 0.01)
+    monkeypatch.setattr(picture_stream, "CHECK_INTERVAL", 0.01)
     monkeypatch.setattr(picture_stream, "REOPEN_BACKOFF", Backoff(initial=0.01, maximum=0.02))
     async with pictures() as (driver, _, _, there):
         images = there.subscribe(f"{CAM}/image_raw", IMAGE)

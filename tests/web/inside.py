@@ -24,7 +24,7 @@ from smartcam.web._fleet import MAX_VIEWERS as FLEET_MAX_VIEWERS
 from smartcam.web._fleet_rows import ERROR_MARK_SECONDS, MAX_KEPT_BYTES, MAX_QUEUE, line_of
 from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS
 from smartcam.web._fleet_socket import PROTOCOL as FLEET_SOCKET_PROTOCOL
-from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
+from smartcam.web._fleet_view import BAR_DURATION, PERIOD, SERIES_DURATION, SORTS, Filter
 from smartcam.web._history import (
     BAR_SECONDS,
     MAX_BARS,

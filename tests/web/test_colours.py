@@ -19,7 +19,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.frames import Frame, FrameSource, find_format
 from smartcam.web import ColourSite
 from smartcam.web import _colours as colours_module
-from smartcam.web._colours import CALLS, MAX_KEPT, MAX_LOOKS, PICTURES_PER_VIEWER
+from smartcam.web._colours import CALLS, MAX_LOOKS, MAX_VIEWERS_KEPT, PICTURES_PER_VIEWER
 from tests import ROOT
 from tests.cli.commandline import run
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
@@ -163,13 +163,13 @@ async def test_click_takes_the_colours_of_the_picture_that_was_shown() -> None:
 
 async def test_pictures_of_few_are_kept_and_two_of_each() -> None:
     async with world() as all_of:
-        for number in range(MAX_KEPT + 1):
+        for number in range(MAX_VIEWERS_KEPT + 1):
             await all_of.get(coloured(number), viewer=f"viewer {number}")
-        kept = [f"viewer {number}" for number in range(1, MAX_KEPT + 1)]
-        assert list(all_of.site._kept) == kept
+        kept = [f"viewer {number}" for number in range(1, MAX_VIEWERS_KEPT + 1)]
+        assert list(all_of.site._pictures) == kept
         for number in range(4):
             await all_of.get(coloured(number), viewer=kept[0])
-        assert [one.sequence for one in all_of.site._kept[kept[0]]] == [2, 3]
+        assert [one.sequence for one in all_of.site._pictures[kept[0]]] == [2, 3]
         assert PICTURES_PER_VIEWER == 2
         gone = await all_of.refused("/api/look", viewer="viewer 0", range=BLACK, again=True)
         assert gone.status == 409
@@ -268,7 +268,7 @@ def test_quality_that_is_none_is_reported() -> None:
 def test_document_has_every_bound() -> None:
     page = (ROOT / "docs" / "tower.md").read_text(encoding="utf-8")
     assert PICTURES_PER_VIEWER == 2
-    assert f"two pictures are kept for each of the last {MAX_KEPT}" in page
+    assert f"two pictures are kept for each of the last {MAX_VIEWERS_KEPT}" in page
     assert f"At most {MAX_LOOKS} may wait" in page
 
 

@@ -159,7 +159,7 @@ async def test_second_head_that_does_not_become_whole_ends_the_connection(
 async def test_connection_without_another_request_ends(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(connections, "KEEP_ALIVE", 0.05)
+    monkeypatch.setattr(connections, "KEEP_ALIVE_TIMEOUT", 0.05)
     with caplog.at_level(logging.INFO, logger="smartcam.web"):
         async with served() as world, Raw.connected(world.site) as raw:
             assert (await raw.call("GET /api HTTP/1.1", "Host: localhost"))[0] == 200
@@ -170,7 +170,7 @@ async def test_connection_without_another_request_ends(
 async def test_answer_takes_as_long_as_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     async with served() as world, world.events() as events:
         await events.next("clock")
-        for name in ("HEAD_TIMEOUT", "KEEP_ALIVE"):
+        for name in ("HEAD_TIMEOUT", "KEEP_ALIVE_TIMEOUT"):
             monkeypatch.setattr(connections, name, 0.001)
         for _ in range(2):  # which come once a second
             await events.next("clock")
@@ -378,6 +378,6 @@ async def test_half_requests_do_not_take_the_process_its_descriptors(most: int) 
 
 
 def test_bounds_fit_each_other() -> None:
-    assert connections.HEAD_TIMEOUT <= connections.KEEP_ALIVE
-    assert routes.READ_TIMEOUT <= connections.KEEP_ALIVE
+    assert connections.HEAD_TIMEOUT <= connections.KEEP_ALIVE_TIMEOUT
+    assert routes.READ_TIMEOUT <= connections.KEEP_ALIVE_TIMEOUT
     assert emulator.MAX_WAIT > 0

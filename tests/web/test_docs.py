@@ -18,8 +18,8 @@ from smartcam.web import EmulatorSite
 from tests import ROOT
 from tests.web.inside import (
     ALIVE_INTERVAL,
+    BAR_DURATION,
     BAR_SECONDS,
-    BUCKET,
     ERROR_MARK_SECONDS,
     LINGER,
     MAX_BARS,
@@ -30,7 +30,7 @@ from tests.web.inside import (
     MAX_RESULTS,
     MAX_ROWS,
     PERIOD,
-    SERIES,
+    SERIES_DURATION,
     SORTS,
     Filter,
 )
@@ -70,7 +70,12 @@ def test_live_page_has_its_numbers() -> None:
 
 
 def test_fleet_page_has_its_numbers() -> None:
-    assert (PERIOD, SERIES, BUCKET, ALIVE_INTERVAL) == (0.2, 600, 5, 5.0)  # which it has as words
+    assert (PERIOD, SERIES_DURATION, BAR_DURATION, ALIVE_INTERVAL) == (
+        0.2,
+        600,
+        5,
+        5.0,
+    )  # which it has as words
     said = {
         f"for {ERROR_MARK_SECONDS:g} s after a loss",
         f"that it shows, {MAX_ROWS} at most",

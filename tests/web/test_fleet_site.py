@@ -20,7 +20,7 @@ from smartcam.web import FleetSite
 from tests.handmade import until
 from tests.web.inside import (
     ALIVE_INTERVAL,
-    BUCKET,
+    BAR_DURATION,
     CALLS,
     ERROR_MARK_SECONDS,
     MAX_KEPT_BYTES,
@@ -340,7 +340,7 @@ async def test_more_events_than_are_kept_are_made_good(monkeypatch: pytest.Monke
 
 
 async def test_cameras_that_are_gone_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_module, "MAX_GONE", 3)
+    monkeypatch.setattr(view_module, "MAX_REMOVED", 3)
     async with served(10) as world, world.looking() as looker:
         for name in names(8):
             world.fleet.leave(name)
@@ -382,7 +382,7 @@ async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> 
         for _ in range(MAX_QUEUE + 10):  # of these ten have no room
             world.fleet["line01/cam002"].send(GOOD)
         await asyncio.sleep(1.5)
-        later = time.time() + 2 * BUCKET
+        later = time.time() + 2 * BAR_DURATION
         monkeypatch.setattr(time, "time", lambda: later)
         await asyncio.sleep(1.5)
         sums = [sum(bar[place] for bar in view.series) for place in (1, 2, 3, 4)]

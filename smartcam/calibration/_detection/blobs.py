@@ -66,12 +66,12 @@ class Pieces(NamedTuple):
         chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= MAX_PART_OF_IMAGE * self.dark.size)
         chosen &= areas >= MIN_RECTANGLE_SHARE * wide * high
         chosen[0] = False
-        kept = np.flatnonzero(chosen)
-        if len(kept) > most:
-            kept = kept[np.argsort(areas[kept])[-most:]]
+        chosen_places = np.flatnonzero(chosen)
+        if len(chosen_places) > most:
+            chosen_places = chosen_places[np.argsort(areas[chosen_places])[-most:]]
         number = np.full(len(areas), -1, dtype=np.int32)
-        number[kept] = np.arange(len(kept))
-        pieces = self._some(kept)
+        number[chosen_places] = np.arange(len(chosen_places))
+        pieces = self._selected(chosen_places)
         good = _filled(self, number, pieces)
         return Spots(pieces.points[good], pieces.areas[good])
 
@@ -81,10 +81,10 @@ class Pieces(NamedTuple):
         chosen = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
         chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
         chosen[0] = False
-        return self._some(np.flatnonzero(chosen))
+        return self._selected(np.flatnonzero(chosen))
 
-    def _some(self, kept: NDArray[np.intp]) -> Spots:
-        middles, areas = self.middles[kept], self.boxes[kept, 4]
+    def _selected(self, places: NDArray[np.intp]) -> Spots:
+        middles, areas = self.middles[places], self.boxes[places, 4]
         return Spots(middles.astype(np.float64), areas.astype(np.float64))
 
 

@@ -149,12 +149,12 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
         seen = find_saddles(reduced(image.bytes, times))
         largest: Lattice = {}
         grids = lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS)
-        for found in grids:
-            largest = max(largest, found, key=len)
+        for candidate_grid in grids:
+            largest = max(largest, candidate_grid, key=len)
             if len(largest) >= count:
                 break
         if largest:
-            again = any(_shape(one) == _shape(largest) for one in grids)
+            again = any(_shape(grid) == _shape(largest) for grid in grids)
             points = (seen.points[list(largest.values())] + 0.5) * times - 0.5
             yield Board(points, np.array(list(largest), dtype=np.intp), again).trimmed()
 
@@ -166,24 +166,24 @@ def _shape(grid: Lattice) -> list[int]:
 
 def completed(image: GreyImage, board: Board) -> Board | None:
     """Return the board with missed corners added; None if the fits find no corners."""
-    some = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
-    _, signs = _fitted(image, board, some)
-    sign = float(parity(some) @ signs)
-    if abs(sign) < MIN_FITTED_SHARE * len(some):
+    sampled = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
+    _, signs = _fitted(image, board, sampled)
+    sign = float(parity(sampled) @ signs)
+    if abs(sign) < MIN_FITTED_SHARE * len(sampled):
         return None
-    near = board.places
+    places = board.places
     for _ in range(MAX_ROUNDS):
         missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
         # a new corner beside an empty place may predict that place better
-        beside = np.abs(missing[:, None] - near).max(axis=2).min(axis=1, initial=2) <= 1
+        beside = np.abs(missing[:, None] - places).max(axis=2).min(axis=1, initial=2) <= 1
         missing = missing[beside]
         points, signs = _fitted(image, board, missing)
         right = parity(missing) * signs * sign > 0
         if not right.any():
             break
-        near = missing[right]
+        places = missing[right]
         board = Board(
-            np.concatenate([board.points, points[right]]), np.concatenate([board.places, near])
+            np.concatenate([board.points, points[right]]), np.concatenate([board.places, places])
         ).trimmed()
     return board
 

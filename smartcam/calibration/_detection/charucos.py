@@ -80,16 +80,16 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE if the dictionary is unknown.
     """
     sighting = _numbered(image, target)
-    ids, found = sighting.ids, sighting.points
+    ids, points = sighting.ids, sighting.points
     flat = target.points[ids, :2]
-    matrix = fit_homography(flat, found)
+    matrix = fit_homography(flat, points)
     if matrix is None:
         raise _not_found(target, "all in a line", len(ids))
     ways = local_steps(partial(apply_homography, matrix), flat, FITTED_SHARE * target.square)
     clear = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
         ways, axis=2
     )
-    corners = refine_corners(image, found, ways, clear)
+    corners = refine_corners(image, points, ways, clear)
     row, column = np.divmod(ids, target.columns - 1)
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)
     seen = corners.fitted & (colours * (colours @ corners.fitted) > 0)
@@ -225,8 +225,8 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sight
     )
     if not good.any():
         return best
-    kept = [quad for quad, fits in zip(quads, good, strict=True) if fits]
-    quads, numbers, *_ = finder.refineDetectedMarkers(bytes_, board, kept, numbers[good], others)
+    shaped = [quad for quad, fits in zip(quads, good, strict=True) if fits]
+    quads, numbers, *_ = finder.refineDetectedMarkers(bytes_, board, shaped, numbers[good], others)
     read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
     ids, corners = _between(bytes_, board, read.selected(agreeing(read, flat).good))
     if len(ids) <= len(best.ids):
@@ -259,10 +259,12 @@ def _between(
     detector = cv2.aruco.CharucoDetector(board, given)
     quads = [quad[None].astype(np.float32) for quad in markers.quads]
     numbers = markers.ids.astype(np.int32)[:, None]
-    corners, found, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
-    if found is None or not len(found):
+    corners, charuco_corners, *_ = detector.detectBoard(
+        bytes_, markerCorners=quads, markerIds=numbers
+    )
+    if charuco_corners is None or not len(charuco_corners):
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
-    ids = np.asarray(found, dtype=np.intp).ravel()
+    ids = np.asarray(charuco_corners, dtype=np.intp).ravel()
     points = np.array(corners, dtype=np.float64).reshape(-1, 2)
     at = np.asarray(board.getChessboardCorners(), dtype=np.float64)[ids, :2]
     flat = _map(board)[markers.ids]
@@ -298,8 +300,8 @@ def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
     areas = _areas(quads)
     middles = np.array(quads, dtype=np.float64).reshape(-1, 4, 2).mean(axis=1)
     most = len(board.getIds())
-    found = lattices(middles, alike_areas(areas), least=MIN_QUADRANGLES, most=most)
-    sides = [_side([quads[one] for one in grid.values()]) for grid in found]
+    grids = lattices(middles, alike_areas(areas), least=MIN_QUADRANGLES, most=most)
+    sides = [_side([quads[index] for index in grid.values()]) for grid in grids]
     return max((side for side in sides if side > MIN_MODULE_PIXELS * _modules(board)), default=0.0)
 
 

@@ -74,25 +74,25 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
     seen = _Search()
-    for found in _candidates(image, target, seen):
-        part = found.part
-        corners = _refined(image, found, _steps(found.points, part))
+    for candidate in _candidates(image, target, seen):
+        part = candidate.part
+        corners = _refined(image, candidate, _steps(candidate.points, part))
         if not _looks_right(corners, part):
             continue
-        corners = _without_strays(image, corners, found.seen, part)
+        corners = _without_strays(image, corners, candidate.seen, part)
         ways = arrangements(corners.points, rows_of(part.columns, part.rows), part)
         if part == target:
-            way, margin = _number(image, target, corners, ways)
+            arrangement, margin = _number(image, target, corners, ways)
         else:
             numbered = _number_part(image, part, corners, ways)
             if numbered is None:
                 continue
-            way, margin = numbered
+            arrangement, margin = numbered
         break
     else:
         raise _not_found(target, seen)
-    order = way.order.ravel()
-    shown = np.flatnonzero((found.seen | corners.fitted)[order])
+    order = arrangement.order.ravel()
+    shown = np.flatnonzero((candidate.seen | corners.fitted)[order])
     row, column = np.divmod(shown, part.columns)
     order = order[shown]
     return TargetView(
@@ -103,7 +103,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
         covariance=corners.covariance[order],
         margin=margin,
         name=name,
-        warnings=(_ANOTHER,) if found.again else (),
+        warnings=(_ANOTHER,) if candidate.again else (),
     )
 
 
@@ -138,27 +138,27 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterat
     count = target.columns * target.rows
     looked_at: list[Board] = []
     for board in boards(image, count, most=(target.columns + 2) * (target.rows + 2)):
-        found = board.by_rows(target.columns, target.rows)
-        if found is not None:
-            yield _BoardCorners(found, np.ones(count, dtype=np.bool_), target, board.again)
+        grid = board.by_rows(target.columns, target.rows)
+        if grid is not None:
+            yield _BoardCorners(grid, np.ones(count, dtype=np.bool_), target, board.again)
         small = min(board.shape) < 3 or len(board.places) < min(
             MIN_CORNERS_CONNECTED, MIN_FITTED_SHARE * count
         )
-        if small or any(one.shows(board) for one in looked_at):
+        if small or any(seen_board.shows(board) for seen_board in looked_at):
             continue
-        whole = completed(image, board)
-        if whole is None:
+        completed_board = completed(image, board)
+        if completed_board is None:
             continue
-        looked_at.append(whole)
-        if seen.shape is None or math.prod(whole.shape) > math.prod(seen.shape):
-            seen.shape = whole.shape
-        filled = whole.filled()
-        for part in _parts(target, whole.shape):
-            found = filled.by_rows(part.columns, part.rows)
-            if found is not None and len(whole.places) >= MIN_FITTED_SHARE * len(found):
-                there = np.asarray(np.isin(found, whole.points).all(axis=1))
-                yield _BoardCorners(found, there, part)
-        if whole.is_full and len(whole.places) >= MIN_FITTED_SHARE * count:
+        looked_at.append(completed_board)
+        if seen.shape is None or math.prod(completed_board.shape) > math.prod(seen.shape):
+            seen.shape = completed_board.shape
+        filled = completed_board.filled()
+        for part in _parts(target, completed_board.shape):
+            grid = filled.by_rows(part.columns, part.rows)
+            if grid is not None and len(completed_board.places) >= MIN_FITTED_SHARE * len(grid):
+                same = np.asarray(np.isin(grid, completed_board.points).all(axis=1))
+                yield _BoardCorners(grid, same, part)
+        if completed_board.is_full and len(completed_board.places) >= MIN_FITTED_SHARE * count:
             return
 
 
@@ -171,24 +171,24 @@ def _parts(target: Checkerboard, shape: tuple[int, int]) -> Iterator[Checkerboar
             yield replace(target, columns=columns, rows=rows)
 
 
-def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
+def _refined(image: GreyImage, board: _BoardCorners, steps: Array) -> Corners:
     """Return the refined corners; one that is not visible keeps its place, as not fitted.
 
     ``steps`` (N, 2, 2) lead to the next corners, pixels.
     """
-    points, some = found.points, found.seen.copy()
+    points, seen = board.points, board.seen.copy()
     inside = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
-    doubted = inside & ~some
-    some[doubted] = like_corners(image, points[doubted], steps[doubted])
-    some &= inside
-    if some.all():
+    doubted = inside & ~seen
+    seen[doubted] = like_corners(image, points[doubted], steps[doubted])
+    seen &= inside
+    if seen.all():
         return refine_corners(image, points, FITTED_SHARE * steps)
     covariance = np.tile(UNREFINED_SIGMA_PX**2 * np.eye(2), (len(points), 1, 1))
-    corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(some))
-    if some.any():
-        found_there = refine_corners(image, points[some], FITTED_SHARE * steps[some])
-        for mine, other in zip(corners, found_there, strict=True):
-            mine[some] = other
+    corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(seen))
+    if seen.any():
+        found_there = refine_corners(image, points[seen], FITTED_SHARE * steps[seen])
+        for array, other in zip(corners, found_there, strict=True):
+            array[seen] = other
     return corners
 
 
@@ -223,8 +223,8 @@ def _without_strays(
     covariance = again.covariance.copy()
     doubted = ~again.fitted | (back > most)
     covariance[doubted] += back[doubted, None, None] ** 2 * np.eye(2)
-    for mine, other in zip(corners, again._replace(covariance=covariance), strict=True):
-        mine[stray] = other
+    for array, other in zip(corners, again._replace(covariance=covariance), strict=True):
+        array[stray] = other
     return corners
 
 
@@ -248,9 +248,12 @@ def _not_found(target: Checkerboard, seen: _Search) -> CalibrationError:
 def _number(
     image: GreyImage, target: Checkerboard, corners: Corners, ways: list[Arrangement]
 ) -> tuple[Arrangement, float | None]:
-    what = f"checkerboard of {target.columns} x {target.rows} corners"
+    name = f"checkerboard of {target.columns} x {target.rows} corners"
     if target.origin_mark:
-        shades = {int(way.order[0, 0]): _shades(image, target, corners, way) for way in ways}
+        shades = {
+            int(arrangement.order[0, 0]): _shades(image, target, corners, arrangement)
+            for arrangement in ways
+        }
         dark, light = np.mean([[shade.black, shade.white] for shade in shades.values()], axis=0)
         outside = sum(shade.area is None for shade in shades.values())
         note = f" ({outside} of the 4 such areas outside of the image)" if outside else ""
@@ -261,22 +264,22 @@ def _number(
             part = 1.0 if area is None else (area - black) / max(white - black, 1.0)
             return float(dark + (light - dark) * part)
 
-        return marked(ways, level, f"{what} with a dark area at the origin{note}")
-    proper = [way for way in ways if way.proper]
-    black = [way for way in proper if _blackness(target, corners, way) > 0]
+        return marked(ways, level, f"{name} with a dark area at the origin{note}")
+    proper = [arrangement for arrangement in ways if arrangement.proper]
+    black = [arrangement for arrangement in proper if _blackness(target, corners, arrangement) > 0]
     if proper and not black and target.columns % 2 == target.rows % 2 == 1:
-        raise _white_origin(target, what)
-    return leftmost(black or ways, what), None
+        raise _white_origin(target, name)
+    return leftmost(black or ways, name), None
 
 
-def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
+def _white_origin(target: Checkerboard, label: str) -> CalibrationError:
     """Return the error for a board whose black corners are where the target has white ones.
 
     If the counts of columns and rows are both odd and differ, two corners that lie opposite each
     other are black, and turning the sheet exchanges no black one with a white one.
     """
     return Code.MIRRORED.refusal(
-        f"{what}: expected a black square outside of the corner at the origin, got a white one: "
+        f"{label}: expected a black square outside of the corner at the origin, got a white one: "
         "an image that is mirrored, or a negative, or the board is one of "
         f"{target.rows} x {target.columns}",
         "a black square",
@@ -293,20 +296,20 @@ def _number_part(
     the board that meet at the dot. So a place inside the board, or on another object, is not taken
     for its corner.
     """
-    found = []
-    for way in ways:
-        if not way.proper or _blackness(part, corners, way) <= 0:
+    numbers = []
+    for arrangement in ways:
+        if not arrangement.proper or _blackness(part, corners, arrangement) <= 0:
             continue
-        shades = _shades(image, part, corners, way)
-        light = min(_margin_levels(image, corners.points[way.order]), default=0.0)
+        shades = _shades(image, part, corners, arrangement)
+        light = min(_margin_levels(image, corners.points[arrangement.order]), default=0.0)
         middle = (shades.black + shades.white) / 2
         if (
             shades.area is not None
             and light - shades.area >= MIN_ORIGIN_CONTRAST
             and light > middle
         ):
-            found.append((way, light - shades.area))
-    return found[0] if len(found) == 1 else None
+            numbers.append((arrangement, light - shades.area))
+    return numbers[0] if len(numbers) == 1 else None
 
 
 def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
@@ -337,33 +340,37 @@ class _Shades(NamedTuple):
     area: float | None  # level of the area outside of the corner; None if that is not in the image
 
 
-def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
-    grid = corners.points[way.order]
-    squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
+def _shades(
+    image: GreyImage, target: Checkerboard, corners: Corners, arrangement: Arrangement
+) -> _Shades:
+    grid = corners.points[arrangement.order]
+    squares = sorted(
+        mean_level(image, _mapped_near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES
+    )
     area = (
         target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC
     )
-    seen = _near(grid, area)
+    seen = _mapped_near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
     level = mean_level(image, seen) if inside else None
     return _Shades(sum(squares[:2]) / 2, sum(squares[2:]) / 2, level)
 
 
-def _blackness(target: Checkerboard, corners: Corners, way: Arrangement) -> float:
+def _blackness(target: Checkerboard, corners: Corners, arrangement: Arrangement) -> float:
     """Return the number of corners that show a black square at the origin, minus the others."""
-    order = way.order
+    order = arrangement.order
     # gains refer to the found grid's columns and rows, which may run against the target's
     against = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
     signs = np.sign(corners.gains[order.ravel()])
     return against * float(parity(rows_of(target.columns, target.rows)) @ signs)
 
 
-def _near(grid: Array, at: Array) -> Array:
+def _mapped_near(grid: Array, at: Array) -> Array:
     """Map places (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
 
     A place is given from this corner, in sides of a square.
     """
     places = rows_of(3, 3).astype(np.float64)
-    near = grid[:3, :3].reshape(-1, 2)
-    matrix = fit_homography(places, near)
-    return np.full_like(at, near[0]) if matrix is None else apply_homography(matrix, at)
+    nearest = grid[:3, :3].reshape(-1, 2)
+    matrix = fit_homography(places, nearest)
+    return np.full_like(at, nearest[0]) if matrix is None else apply_homography(matrix, at)

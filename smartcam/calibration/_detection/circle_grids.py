@@ -72,10 +72,10 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
     seen = _Counted()
-    for inked, found, ways in _grids(image, target, seen):
-        if _is_whole(inked, target, found[ways[0].order.ravel()]):
-            return _view(inked, target, found, ways, name)
-        seen.largest = len(found) + 1
+    for inked, points, ways in _grids(image, target, seen):
+        if _is_whole(inked, target, points[ways[0].order.ravel()]):
+            return _view(inked, target, points, ways, name)
+        seen.largest = len(points) + 1
     raise _not_found(target, seen)
 
 
@@ -97,11 +97,11 @@ def _grids(
     """
     for light, scale, spots in _looks(image.bytes, target):
         for points, places in _laid_out(spots, target, seen):
-            found = (points + 0.5) / scale - 0.5
-            ways = arrangements(found, places, target)
-            if ways and _is_flat(target, found[ways[0].order.ravel()]):
+            centres = (points + 0.5) / scale - 0.5
+            ways = arrangements(centres, places, target)
+            if ways and _is_flat(target, centres[ways[0].order.ravel()]):
                 dark = GreyImage(255 - image.levels, 255 - image.bytes) if light else image
-                yield dark, found, ways
+                yield dark, centres, ways
 
 
 def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
@@ -169,8 +169,8 @@ def _is_flat(target: CircleGrid, points: Array) -> bool:
     flat = target.points[:, :2]
     mapped = GridMap(flat, points)
     steps = np.linalg.norm(local_steps(mapped, flat, target.spacing), axis=2).min(axis=1)
-    off = np.linalg.norm(mapped(flat) - points, axis=1)
-    return bool((off < MAX_OFFSET_RATIO * steps).all())
+    distances = np.linalg.norm(mapped(flat) - points, axis=1)
+    return bool((distances < MAX_OFFSET_RATIO * steps).all())
 
 
 def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
@@ -211,11 +211,11 @@ def _contrast(image: GreyImage, target: CircleGrid, mapped: GridMap) -> tuple[fl
 def _next_to(target: CircleGrid) -> Array:
     """Return the places around the grid where rows and columns would go on, (N, 2), metres."""
     half = target.spacing / 2
-    own = np.rint(target.points[:, :2] / half).astype(np.intp)
+    half_steps = np.rint(target.points[:, :2] / half).astype(np.intp)
     steps = [(1, 1), (1, -1)] if target.asymmetric else [(2, 0), (0, 2)]
     ways = np.array(steps + [(-x, -y) for x, y in steps])
-    around = {(x, y) for x, y in (own[:, None] + ways).reshape(-1, 2).tolist()}
-    return half * np.array(sorted(around - {(x, y) for x, y in own.tolist()}))
+    around = {(x, y) for x, y in (half_steps[:, None] + ways).reshape(-1, 2).tolist()}
+    return half * np.array(sorted(around - {(x, y) for x, y in half_steps.tolist()}))
 
 
 def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Array:
@@ -223,20 +223,22 @@ def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Ar
     u, v = mapped((flat[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
     width, height = image.size
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    column, row = (np.rint(np.where(inside, one, 0)).astype(np.intp) for one in (u, v))
+    column, row = (
+        np.rint(np.where(inside, coordinates, 0)).astype(np.intp) for coordinates in (u, v)
+    )
     levels = np.where(inside, image.levels[row, column], np.nan)
     return levels.reshape(len(flat), len(RING_DIRECTIONS))
 
 
 def _view(
-    image: GreyImage, target: CircleGrid, found: Array, ways: list[Arrangement], name: str
+    image: GreyImage, target: CircleGrid, points: Array, ways: list[Arrangement], name: str
 ) -> TargetView:
-    way, margin = _number(image, target, found, ways)
-    flat, order = target.points[:, :2], way.order.ravel()
+    arrangement, margin = _number(image, target, points, ways)
+    flat, order = target.points[:, :2], arrangement.order.ravel()
     diameters = np.full(len(flat), target.diameter)
     diameters[0] = target.origin_diameter or target.diameter
-    seen = GridMap(flat, found[order])
-    dots = _refine(image, target, seen, found[order], diameters)
+    seen = GridMap(flat, points[order])
+    dots = _refine(image, target, seen, points[order], diameters)
     shifts = GridMap(flat, dots.points - seen.shifts(flat, diameters)).shifts(flat, diameters)
     return TargetView(
         target=target,
@@ -268,18 +270,20 @@ def _refine(
 
 
 def _number(
-    image: GreyImage, target: CircleGrid, found: Array, ways: list[Arrangement]
+    image: GreyImage, target: CircleGrid, points: Array, ways: list[Arrangement]
 ) -> tuple[Arrangement, float | None]:
-    what = f"{target.columns} x {target.rows} dots"
+    name = f"{target.columns} x {target.rows} dots"
     if target.origin_diameter is None:
-        return leftmost(ways, what), None
+        return leftmost(ways, name), None
     flat = target.points[:, :2]
     rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
     between = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
     seen = {}
-    for way in ways:
-        mapped = GridMap(flat, found[way.order.ravel()])
-        seen[int(way.order[0, 0])] = [mean_level(image, mapped(at)) for at in (rim, between)]
+    for arrangement in ways:
+        mapped = GridMap(flat, points[arrangement.order.ravel()])
+        seen[int(arrangement.order[0, 0])] = [
+            mean_level(image, mapped(at)) for at in (rim, between)
+        ]
     light = sum(paper for _, paper in seen.values()) / len(seen)
 
     def level(order: NDArray[np.intp]) -> float:
@@ -287,20 +291,20 @@ def _number(
         dark, paper = seen[int(order[0, 0])]
         return dark * light / max(paper, 1.0)
 
-    return marked(ways, level, f"{what}, of which the larger one is the origin")
+    return marked(ways, level, f"{name}, of which the larger one is the origin")
 
 
 def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
     """Return an error that reports the dots seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:
-        what = "saw more than these in rows and columns, as of a larger grid"
+        seen_grid = "saw more than these in rows and columns, as of a larger grid"
     else:
-        what = f"saw {seen.spots} dark spots and no such grid among them"
+        seen_grid = f"saw {seen.spots} dark spots and no such grid among them"
         if seen.largest:
-            what += f", at most {seen.largest} in rows and columns"
+            seen_grid += f", at most {seen.largest} in rows and columns"
     return Code.TARGET_NOT_FOUND.refusal(
-        f"circles: expected {target.columns} x {target.rows} dots, {what}",
+        f"circles: expected {target.columns} x {target.rows} dots, {seen_grid}",
         count,
         seen.largest or seen.spots,
     )

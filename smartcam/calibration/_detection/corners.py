@@ -108,20 +108,20 @@ def _start(image: GreyImage, points: Array, reach: Array) -> Array:
     cv2 = load("cv2")
     half = int(np.clip(0.8 * reach.min(), 2, 5))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-2)
-    found = points.astype(np.float32).reshape(-1, 1, 2)
-    found = cv2.cornerSubPix(image.bytes, found, (half, half), (-1, -1), stop)
-    refined: Array = np.array(found, dtype=np.float64).reshape(-1, 2)
+    at = points.astype(np.float32).reshape(-1, 1, 2)
+    at = cv2.cornerSubPix(image.bytes, at, (half, half), (-1, -1), stop)
+    refined: Array = np.array(at, dtype=np.float64).reshape(-1, 2)
     return refined
 
 
-def _guess(near: Array, ways: Array) -> Array:
+def _guess(start: Array, ways: Array) -> Array:
     """Return the values (N, 7) that a fit begins with: the edges along the given steps."""
-    values = np.zeros((len(near), 7))
+    values = np.zeros((len(start), 7))
     # an edge along (x, y) has the normal (-y, x), and its points fulfil cos(angle) u + sin(angle) v
     # = place
     angles = np.arctan2(ways[:, :, 0], -ways[:, :, 1])
     values[:, ANGLES] = angles
-    values[:, PLACES] = np.cos(angles) * near[:, :1] + np.sin(angles) * near[:, 1:]
+    values[:, PLACES] = np.cos(angles) * start[:, :1] + np.sin(angles) * start[:, 1:]
     return values
 
 
@@ -137,16 +137,16 @@ def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
     cosines, sines = np.cos(narrow[:, ANGLES]), np.sin(narrow[:, ANGLES])
     places = narrow[:, PLACES]
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
-    far, along, shapes, slopes = [], [], [], []
+    signed, along, shapes, slopes = [], [], [], []
     # d = cos(a) x + sin(a) y - place moves with place by -1, and with a by cos(a) y - sin(a) x, the
     # way along the edge. The level gain E(d1 / s) E(d2 / s) + offset, E = erf, moves with d1 by
     # gain E'(d1 / s) E(d2 / s) / s, and with the blur, to which s is in proportion, by
     # -gain (E'_1 d1 / s E_2 + E'_2 d2 / s E_1) / blur.
     for side in (0, 1):
         cosine, sine, place = (part[:, [side]] for part in (cosines, sines, places))
-        far.append((cosine * x + sine * y - place) * scale)
+        signed.append((cosine * x + sine * y - place) * scale)
         along.append(cosine * y - sine * x)
-        shape, slope = edge(far[side])
+        shape, slope = edge(signed[side])
         shapes.append(shape)
         slopes.append(slope)
     half = np.float32(1 - alone / 2)
@@ -159,12 +159,12 @@ def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
         first * along[0],
         second,
         second * along[1],
-        first * far[0] + second * far[1],
+        first * signed[0] + second * signed[1],
         product,
         weights,
     )
-    steep, one = gain * scale, np.ones_like(gain)
-    factors = (-steep, steep, -steep, steep, -gain / blur, one, one)
+    steep, ones = gain * scale, np.ones_like(gain)
+    factors = (-steep, steep, -steep, steep, -gain / blur, ones, ones)
     return fits_of(values, columns, factors, windows.levels - gain * product - offset * weights)
 
 

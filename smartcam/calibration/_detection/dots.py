@@ -84,8 +84,8 @@ class GridMap:
         self._scale = np.abs(flat - self._middle).max()
         self._bend = np.zeros((10, 2))
         if len(flat) >= MIN_DOTS_FOR_LENS and homography is not None:
-            off = pixels - apply_homography(homography, flat)
-            self._bend[:] = np.linalg.lstsq(self._powers(flat), off, rcond=None)[0]
+            distances = pixels - apply_homography(homography, flat)
+            self._bend[:] = np.linalg.lstsq(self._powers(flat), distances, rcond=None)[0]
 
     def _powers(self, flat: Array) -> Array:
         x, y = ((flat - self._middle) / self._scale).T
@@ -122,12 +122,12 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     if longest > MAX_REACH_PX:
         return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH_PX))
     windows = cut_windows(image, points, reaches, MAX_REACH_PX, round_=True)
-    near = points - windows.middle
-    guess = _guess(near, radii)
+    offsets = points - windows.middle
+    guess = _guess(offsets, radii)
     fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=MAX_RESIDUAL_RATIO)
     a, b, d = fits.values[:, SHAPE].T
     inverse_area = a * d - b * b  # the area is pi / det S
-    moved = np.linalg.norm(fits.values[:, MIDDLE] - near, axis=1)
+    moved = np.linalg.norm(fits.values[:, MIDDLE] - offsets, axis=1)
     smallest = np.linalg.norm(radii, axis=2).min(axis=1)
     good &= (inverse_area > 0) & (moved < np.maximum(smallest, 1.0)) & (fits.values[:, GAIN] > 0)
     middles = np.where(good[:, None], fits.values[:, MIDDLE] + windows.middle, points)
@@ -153,10 +153,10 @@ def _refine_smaller(
     )
 
 
-def _guess(near: Array, radii: Array) -> Array:
+def _guess(start: Array, radii: Array) -> Array:
     """Return the values (N, 8) that a fit begins with: the ellipses of the given radii."""
-    values = np.zeros((len(near), 8))
-    values[:, MIDDLE] = near
+    values = np.zeros((len(start), 8))
+    values[:, MIDDLE] = start
     # With W the ways (as rows) to the rim, m + W^T c is the rim for |c| = 1, so |W^-T (p - m)| = 1
     # there. S = (W^T W)^(-1/2) is the symmetric matrix with the same lengths |S (p - m)|.
     lengths, axes = np.linalg.eigh(radii.transpose(0, 2, 1) @ radii)
@@ -181,8 +181,8 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     by_x, by_y = a * across + b * down, b * across + d * down
     steep = 1 / np.maximum(np.sqrt(by_x * by_x + by_y * by_y), np.float32(1e-6))
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
-    far = (radius - 1) * steep * scale
-    shape, slope = edge(far)
+    inward = (radius - 1) * steep * scale
+    shape, slope = edge(inward)
     slope = slope * weights
     rise = slope * steep
     product = shape * weights
@@ -192,10 +192,10 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
         rise * across * x,
         rise * (across * y + down * x),
         rise * down * y,
-        slope * far,
+        slope * inward,
         product,
         weights,
     )
-    one, tall = np.ones_like(gain), gain * scale
-    factors = (-tall, -tall, tall, tall, tall, -gain / blur, one, one)
+    ones, tall = np.ones_like(gain), gain * scale
+    factors = (-tall, -tall, tall, tall, tall, -gain / blur, ones, ones)
     return fits_of(values, columns, factors, windows.levels - gain * product - offset * weights)

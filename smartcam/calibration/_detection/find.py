@@ -77,7 +77,7 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
             return find_circles(grey, target, name)
         case MarkerGrid():
             return find_marker_grid(grey, target, name)
-    got = type(target).__name__
+    type_name = type(target).__name__
     raise Code.SHAPE.unexpected(
-        "target: expected a Checkerboard, Charuco, CircleGrid or MarkerGrid", got=got
+        "target: expected a Checkerboard, Charuco, CircleGrid or MarkerGrid", got=type_name
     )

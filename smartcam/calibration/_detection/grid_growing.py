@@ -130,10 +130,10 @@ class _Grown:
         Dots whose neighbours lie most exactly opposite each other come first.
         """
         points = self._points
-        _, near = self._tree.query(points, min(neighbours + 1, len(points)))
-        near = near[:, 1:]
-        alike = self._alike(near, np.arange(len(points))[:, None])
-        ways = points[near] - points[:, None]
+        _, neighbours_of = self._tree.query(points, min(neighbours + 1, len(points)))
+        neighbours_of = neighbours_of[:, 1:]
+        alike = self._alike(neighbours_of, np.arange(len(points))[:, None])
+        ways = points[neighbours_of] - points[:, None]
         # |a + b|^2 = |a|^2 + |b|^2 + 2 a b, all pairs by one product
         products = ways @ ways.transpose(0, 2, 1)
         squares = np.maximum(np.einsum("nii->ni", products), 1e-18)
@@ -171,19 +171,19 @@ class _Grown:
             waves += 1
             around = self._around(reached, MAX_FIRST_STEP_OFFSET if waves < 2 else MAX_STEP_OFFSET)
             wave, reached = reached, []
-            for (here, dot, steps, like), sides in zip(wave, around, strict=True):
+            for (place, dot, steps, like), sides in zip(wave, around, strict=True):
                 for side, fits in enumerate(sides):
                     column, row = _AROUND[side]
-                    neighbour = (here[0] + column, here[1] + row)
-                    free = next((one for one in fits if one not in taken), None)
+                    neighbour = (place[0] + column, place[1] + row)
+                    free = next((fit for fit in fits if fit not in taken), None)
                     if free is None or neighbour in places:
                         continue
                     places[neighbour] = free
                     taken.add(free)
                     step = steps.copy()
                     step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
-                    own = bool(self._alike(np.array(free), np.array(like)))
-                    reached.append((neighbour, free, step, free if own else like))
+                    is_free = bool(self._alike(np.array(free), np.array(like)))
+                    reached.append((neighbour, free, step, free if is_free else like))
         return places
 
     def complete(self, places: Lattice, most: int) -> None:
@@ -206,9 +206,9 @@ class _Grown:
             longest = MAX_STEP_OFFSET * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(
                 axis=1
             )
-            off, near = self._tree.query(mapped(at))
-            fits = (off < longest) & self._follows(near, np.array(list(next_to.values())))
-            for place, dot, fit in zip(next_to, near.tolist(), fits.tolist(), strict=True):
+            distances, nearest = self._tree.query(mapped(at))
+            fits = (distances < longest) & self._follows(nearest, np.array(list(next_to.values())))
+            for place, dot, fit in zip(next_to, nearest.tolist(), fits.tolist(), strict=True):
                 if fit and dot not in taken:
                     places[place] = dot
                     taken.add(dot)
@@ -226,15 +226,15 @@ class _Grown:
         steps = np.stack([steps for _, _, steps, _ in reached])
         ways = np.concatenate([steps, -steps], axis=1)
         ahead = self._points[dots][:, None] + ways
-        off, near = self._tree.query(ahead, min(3, len(self._points)))
-        fits = off < limit * np.linalg.norm(ways, axis=2)[:, :, None]
-        fits &= self._follows(near, like[:, None, None])
+        distances, nearest = self._tree.query(ahead, min(3, len(self._points)))
+        fits = distances < limit * np.linalg.norm(ways, axis=2)[:, :, None]
+        fits &= self._follows(nearest, like[:, None, None])
         return [
             [
                 [dot for dot, fit in zip(*side, strict=True) if fit]
-                for side in zip(*one, strict=True)
+                for side in zip(*dots_and_fits, strict=True)
             ]
-            for one in zip(near.tolist(), fits.tolist(), strict=True)
+            for dots_and_fits in zip(nearest.tolist(), fits.tolist(), strict=True)
         ]
 
 
@@ -258,6 +258,6 @@ def _is_regular(points: Array, grid: Lattice) -> bool:
     places = np.array(list(grid), dtype=np.float64)
     pixels = points[list(grid.values())]
     seen = GridMap(places, pixels)
-    off = np.linalg.norm(seen(places) - pixels, axis=1)
+    distances = np.linalg.norm(seen(places) - pixels, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
-    return bool(np.median(off / steps) < MAX_MEDIAN_OFFSET)
+    return bool(np.median(distances / steps) < MAX_MEDIAN_OFFSET)

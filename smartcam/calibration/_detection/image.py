@@ -67,12 +67,12 @@ def grey_image(image: Any) -> GreyImage:
         and kind in (np.uint8, np.uint16)
         and all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in shape[:2])
     ):
-        what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
+        received = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
         raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
             f"{MIN_SIDE_PX} to {MAX_SIDE_PX} pixels wide and high",
             "uint8 or uint16, (H, W) or (H, W, 3)",
-            what,
+            received,
         )
     cv2 = load("cv2")
     flat = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if len(shape) == 3 else image

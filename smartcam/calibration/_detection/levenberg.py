@@ -55,8 +55,8 @@ class Fits(NamedTuple):
 
     def put(self, which: NDArray[np.intp], others: Fits, chosen: NDArray[np.bool_]) -> None:
         """Replace the fits at the indices ``which``, where ``chosen``, by those of others."""
-        for mine, other in zip(self, others, strict=True):
-            mine[which[chosen]] = other[chosen]
+        for array, other in zip(self, others, strict=True):
+            array[which[chosen]] = other[chosen]
 
 
 def fits_of(

@@ -48,7 +48,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
 
     Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE if the dictionary is unknown.
     """
-    what = f"grid of {target.columns} x {target.rows} markers"
+    kind_text = f"grid of {target.columns} x {target.rows} markers"
     board = target.points[target.corners, :2]
     best, strays, read = Markers(np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)), (), 0
     against = 0
@@ -66,10 +66,10 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
         if good.sum() > len(best.ids):
             best = markers.selected(good)
             strays = tuple(sorted((markers.ids[~good] + target.first_id).tolist()))
-    check_one_board(len(best.ids), against, what)
+    check_one_board(len(best.ids), against, kind_text)
     if len(best.ids) < MIN_AGREEING_MARKERS:
         raise Code.TARGET_NOT_FOUND.refusal(
-            f"{what}: expected at least {MIN_AGREEING_MARKERS} that stand to each other as "
+            f"{kind_text}: expected at least {MIN_AGREEING_MARKERS} that stand to each other as "
             f"on the board, found {len(best.ids)} of {read} markers of its dictionary",
             MIN_AGREEING_MARKERS,
             len(best.ids),
@@ -131,8 +131,8 @@ def marker_patterns(target: MarkerGrid) -> NDArray[np.bool_]:
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
     modules = int(dictionary.markerSize) + 2 * target.border
     drawn = [
-        dictionary.generateImageMarker(target.first_id + one, modules, borderBits=target.border)
-        for one in range(count)
+        dictionary.generateImageMarker(target.first_id + marker, modules, borderBits=target.border)
+        for marker in range(count)
     ]
     patterns: NDArray[np.bool_] = np.array(drawn) == 0
     return patterns[:, ::-1, ::-1] if target.kalibr else patterns

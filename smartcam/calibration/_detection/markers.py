@@ -80,16 +80,16 @@ class MarkerAgreement(NamedTuple):
     contrary: int  # count of markers that agree with each other at other places
 
 
-def marker_dictionary(name: str, needed: int, what: str) -> Any:
+def marker_dictionary(name: str, needed: int, label: str) -> Any:
     """Return OpenCV's dictionary of a name, which must have at least ``needed`` markers.
 
-    ``what`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
+    ``label`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
     """
     cv2 = load("cv2")
     number = getattr(cv2.aruco, name, None)
     if not (name.startswith("DICT_") and isinstance(number, int)):
         raise Code.SHAPE.refusal(
-            f"{what}: expected the name of one of OpenCV's dictionaries such as "
+            f"{label}: expected the name of one of OpenCV's dictionaries such as "
             f"DICT_5X5_250, got {name!r}",
             "DICT_5X5_250",
             name,
@@ -98,7 +98,7 @@ def marker_dictionary(name: str, needed: int, what: str) -> Any:
     count = len(dictionary.bytesList)
     if needed > count:
         raise Code.SHAPE.unexpected(
-            f"{what}: expected at least {needed} markers in {name}", needed, count
+            f"{label}: expected at least {needed} markers in {name}", needed, count
         )
     return dictionary
 
@@ -113,7 +113,7 @@ def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = 
     given = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
     if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
-        window = sorted(WINDOWS_PX, key=lambda one: len(lengths[one]))[len(WINDOWS_PX) // 2]
+        window = sorted(WINDOWS_PX, key=lambda place: len(lengths[place]))[len(WINDOWS_PX) // 2]
         given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
         if len(longest) > MAX_OUTLINES:
@@ -129,8 +129,8 @@ def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.
     cv2 = load("cv2")
     mean, kind = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
     dark = cv2.adaptiveThreshold(bytes_, 255, mean, kind, window, given.adaptiveThreshConstant)
-    found, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    lengths = np.array([len(one) for one in found], dtype=np.intp)
+    contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    lengths = np.array([len(contour) for contour in contours], dtype=np.intp)
     low, high = given.minMarkerPerimeterRate, given.maxMarkerPerimeterRate
     largest = max(bytes_.shape)  # OpenCV takes whole pixels
     return lengths[(lengths >= int(low * largest)) & (lengths <= int(high * largest))]
@@ -155,26 +155,26 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
     if largest.sum() < MIN_AGREEING_MARKERS or matrix is None:
         return MarkerAgreement(good, 0)
-    off = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
-    off /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
+    distances = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
+    distances /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
     away = np.linalg.norm(mapped[:, None] - mapped[largest], axis=2).min(axis=1) / pitch
     upright = _alike(slopes, derivatives(matrix, mapped))
-    joined = largest | ((off < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
+    joined = largest | ((distances < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
     good[known[joined]] = True
-    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
+    contrary = ~joined & (distances > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
     return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
 
 
-def check_one_board(agreed: int, contrary: int, what: str) -> None:
+def check_one_board(agreed: int, contrary: int, label: str) -> None:
     """Raise WRONG_TARGET if markers are arranged as on another board, or as on several.
 
     ``agreed`` markers are arranged as on the board; ``contrary`` others agree with each other, but
-    not with these. ``what`` names the target.
+    not with these. ``label`` names the target.
     """
     if contrary >= MIN_CONTRARY_MARKERS and 2 * contrary >= agreed:
         raise Code.WRONG_TARGET.refusal(
-            f"{what}: expected markers of one such board, got {agreed} that stand to each other as "
-            f"on it and {contrary} others that do so elsewhere: columns and rows are others, or "
+            f"{label}: expected markers of one such board, got {agreed} that stand to each other "
+            f"as on it and {contrary} others that do so elsewhere: columns and rows are others, or "
             "several boards with the same numbers are in the picture",
             f"{agreed + contrary} markers of one board",
             agreed,
@@ -192,8 +192,8 @@ def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Arra
     expected = seen + np.einsum("jkl,ijl->ijk", slopes, ways)
     # a corner of a square lies between the two next markers, and perspective beside one of them
     # is about the opposite of that beside the other
-    near = distances < 1.1 * distances.min(axis=1, keepdims=True)
-    shares = near / near.sum(axis=1, keepdims=True)
+    is_near = distances < 1.1 * distances.min(axis=1, keepdims=True)
+    shares = is_near / is_near.sum(axis=1, keepdims=True)
     places: Array = np.einsum("ij,ijk->ik", shares, expected)
     return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
 
@@ -213,7 +213,7 @@ def _slopes(quads: Array, flat: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     around = flat - flat.mean(axis=1, keepdims=True)
     seen = quads - quads.mean(axis=1, keepdims=True)
-    squares = (around**2).sum(axis=(1, 2)) / 2  # of a square's corners, the same along x and y
+    squares = (around**2).sum(axis=(1, 2)) / 2  # offsets of a square's corners, equal along x and y
     slopes: Array = seen.transpose(0, 2, 1) @ around / squares[:, None, None]
     return slopes
 
@@ -231,11 +231,11 @@ def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDAr
     # the mean of both derivatives predicts one marker from the other exactly to second order
     both = (slopes[:, None] + slopes[None]) / 2
     expected = np.einsum("ijkl,ijl->ijk", both, ways)
-    off = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
+    apart = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
     return np.asarray(
         (distances > 0)
         & (distances <= reach)
-        & (off < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
+        & (apart < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
         & _alike(slopes[:, None], slopes[None])
     )
 

@@ -95,38 +95,40 @@ def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
     return Arrangement(order, turn < 0, float(x[0] / np.hypot(*x)))
 
 
-def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
+def leftmost(ways: Sequence[Arrangement], label: str) -> Arrangement:
     """Return the proper arrangement whose x points most to the image's right, which is unique.
 
-    Raises MIRRORED if no arrangement is proper; ``what`` names the target.
+    Raises MIRRORED if no arrangement is proper; ``label`` names the target.
     """
-    proper = [way for way in ways if way.proper]
+    proper = [arrangement for arrangement in ways if arrangement.proper]
     if not proper:
         raise Code.MIRRORED.refusal(
-            f"{what}: expected an image of the sheet as one reads it, got one that is mirrored",
+            f"{label}: expected an image of the sheet as one reads it, got one that is mirrored",
             "y to the left of x",
             "y to the right of x",
         )
-    return max(proper, key=lambda way: way.rightward)
+    return max(proper, key=lambda arrangement: arrangement.rightward)
 
 
 def marked(
-    ways: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], what: str
+    ways: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], label: str
 ) -> tuple[Arrangement, float]:
     """Return the arrangement with a dark mark at its origin, and the mark's margin in grey levels.
 
     ``level`` returns the grey level, of 255, at the place where an arrangement would have its mark.
-    ``what`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too
+    ``label`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too
     little darker than the next corner, and MIRRORED.
     """
-    levels = {int(way.order[0, 0]): level(way.order) for way in ways}
+    levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in ways}
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
     margin = levels[second] - levels[origin]
     if not margin >= MIN_ORIGIN_CONTRAST:
         raise Code.AMBIGUOUS_ORIGIN.refusal(
-            f"{what}: expected the origin to be darker than the other corners by "
+            f"{label}: expected the origin to be darker than the other corners by "
             f"{MIN_ORIGIN_CONTRAST:g} grey levels of 255, got {margin:.0f}",
             MIN_ORIGIN_CONTRAST,
             margin,
         )
-    return leftmost([way for way in ways if way.order[0, 0] == origin], what), margin
+    return leftmost(
+        [arrangement for arrangement in ways if arrangement.order[0, 0] == origin], label
+    ), margin

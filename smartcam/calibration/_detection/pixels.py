@@ -40,8 +40,8 @@ class Windows(NamedTuple):
     def without(self, points: Array, radius: float) -> Windows:
         """Return the windows without the pixels within a radius of points (N, 2)."""
         u, v = (points - self.middle).astype(np.float32).T[:, :, None]
-        far = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
-        return self._replace(levels=self.levels * far, weights=self.weights * far)
+        outside = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
+        return self._replace(levels=self.levels * outside, weights=self.weights * outside)
 
     def selected(self, which: NDArray[np.bool_]) -> Windows:
         """Return the windows of the selected points."""
@@ -84,8 +84,8 @@ def cut_windows(
     within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
     if arm_widths is not None:
         within &= (np.abs(parts) <= arm_widths[:, :, None]).any(axis=1)
-    near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH_PX
-    weights = (inside & (within | near)).astype(np.float32)
+    is_near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH_PX
+    weights = (inside & (within | is_near)).astype(np.float32)
     return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
 
 

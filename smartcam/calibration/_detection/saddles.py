@@ -94,10 +94,10 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
         good &= swing >= np.partition(swing[good], -MAX_SADDLES_KEPT)[-MAX_SADDLES_KEPT]
     at = at[good]
     bends = np.stack([part[at[:, 1], at[:, 0]] for part in (xx, xy, xy, yy)], axis=1)
-    return Saddles(at + _way(smooth, at, bends), turns[good] / swing[good, None])
+    return Saddles(at + _steps_to_saddles(smooth, at, bends), turns[good] / swing[good, None])
 
 
-def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
+def _steps_to_saddles(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
     """Return the steps (N, 2), at most a pixel, from pixels to the saddles, where the slope is 0.
 
     ``bends`` (N, 4): second derivatives at the pixels.
@@ -112,8 +112,8 @@ def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
 
 def _comes_twice(levels: Array) -> NDArray[np.bool_]:
     """Return True for each circle (N, 16) with two like halves, each of a dark and a light part."""
-    here, opposite = levels[:, :8], levels[:, 8:]
-    common, apart = (here + opposite) / 2, (here - opposite) / 2
+    levels_here, opposite = levels[:, :8], levels[:, 8:]
+    common, apart = (levels_here + opposite) / 2, (levels_here - opposite) / 2
     middle = (common.max(axis=1) + common.min(axis=1)) / 2
     light = common > middle[:, None]
     changes = (light != np.roll(light, 1, axis=1)).sum(axis=1)

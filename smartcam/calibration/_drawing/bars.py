@@ -1,4 +1,4 @@
-"""Draw a bar or two for each view, with lines at the values to compare them with."""
+"""Draw one or two bars for each view, with lines at the values of all views together."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ WIDTH, HEIGHT = 900.0, 260.0
 """Width and height of a chart, pixels."""
 
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
-"""Pixels beside a chart, above it, below it, and on the right."""
+"""Margins of a chart on the left, above, below and on the right, pixels."""
 
 LETTER_WIDTH_PX: Final = 7.5
 """Approximate width of a letter, pixels."""
 
 MAX_BAR_RATIO: Final = 3.0
-"""Bars longer than this many times the longest bar of a used view are cut, and their value is
-written."""
+"""Bars longer than this many times the longest bar of a used view are cut, and labelled with their
+value."""
 
 MAX_LINES: Final = 5
 """A chart has at most this many horizontal lines."""
@@ -65,9 +65,9 @@ def short_names(names: Sequence[str]) -> list[str]:
     if len(set(names)) < 2:
         return list(names)
     begin = _common(names).rstrip(DIGITS)
-    rest = [one[len(begin) :] for one in names]
-    end = _common([one[::-1] for one in rest])[::-1].lstrip(DIGITS)
-    shorts = [one[: len(one) - len(end)] for one in rest]
+    tails = [name[len(begin) :] for name in names]
+    end = _common([tail[::-1] for tail in tails])[::-1].lstrip(DIGITS)
+    shorts = [tail[: len(tail) - len(end)] for tail in tails]
     return [short or name for short, name in zip(shorts, names, strict=True)]
 
 
@@ -90,22 +90,22 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
         yield text((LEFT - 8, y + 4), f"{number * step:.6g}", "", ' text-anchor="end"')
     yield text((LEFT - 8, top + HEAD - 12), chart.unit, "", ' text-anchor="end"')
     yield from _bars(chart, foot, zoom)
-    for one, kind in zip(chart.series, FILLS, strict=False):
-        if math.isfinite(one.level):
-            y = foot - one.level * zoom
+    for series, kind in zip(chart.series, FILLS, strict=False):
+        if math.isfinite(series.level):
+            y = foot - series.level * zoom
             yield line((LEFT, y), (LEFT + WIDTH, y), f"level {kind}-line")
     yield line((LEFT, foot), (LEFT + WIDTH, foot), "axis")
 
 
 def _largest(chart: Chart) -> float:
-    """Return the upper end of a chart, which views that were left out do not raise."""
+    """Return the upper end of a chart, from the views that were used."""
     used = [
         value
-        for one in chart.series
-        for value, off in (*zip(one.values, chart.off, strict=True), (one.level, False))
-        if math.isfinite(value) and not off
+        for series in chart.series
+        for value, left_out in (*zip(series.values, chart.off, strict=True), (series.level, False))
+        if math.isfinite(value) and not left_out
     ]
-    every = [value for one in chart.series for value in one.values if math.isfinite(value)]
+    every = [value for series in chart.series for value in series.values if math.isfinite(value)]
     most = max(used, default=0.0)
     return (
         max(most, min(max(every), MAX_BAR_RATIO * most)) if most else max(every, default=1.0) or 1.0
@@ -117,18 +117,18 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
     room = WIDTH / count
     width = min(0.8 * room / len(chart.series), 40.0)
     shorts = short_names(chart.names)
-    longest = max((len(one) for one in shorts), default=1)
+    longest = max((len(label) for label in shorts), default=1)
     # a name at each bar where there is room, else at each second, fifth, tenth, ...
     needed = math.ceil(LETTER_WIDTH_PX * (min(longest, 12) + 1) / room)
     each = next(n for n in (1, 2, 5, 10, 20, 50, 100, 10**9) if n >= needed)
     for number, (name, short) in enumerate(zip(chart.names, shorts, strict=True)):
         middle = LEFT + (number + 0.5) * room
         left_out = ", left out" if chart.off[number] else ""
-        for place, (one, kind) in enumerate(zip(chart.series, FILLS, strict=False)):
-            value = one.values[number]
+        for place, (series, kind) in enumerate(zip(chart.series, FILLS, strict=False)):
+            value = series.values[number]
             if math.isfinite(value):
                 x = middle + (place - len(chart.series) / 2) * width
-                label = f"{name}{left_out}: {one.name} {value:.3g} {chart.unit}"
+                label = f"{name}{left_out}: {series.name} {value:.3g} {chart.unit}"
                 fill = "off" if chart.off[number] else kind
                 height = min(value * zoom, HEIGHT)
                 yield rectangle((x, foot - height), (width, height), f'class="{fill}"', label)
@@ -144,10 +144,10 @@ def _legend(chart: Chart, y: float) -> Iterator[str]:
     entries = [
         (
             kind,
-            one.name
-            + (f" ({one.level:.3g} {chart.unit} in all)" if math.isfinite(one.level) else ""),
+            series.name
+            + (f" ({series.level:.3g} {chart.unit} in all)" if math.isfinite(series.level) else ""),
         )
-        for one, kind in zip(chart.series, FILLS, strict=False)
+        for series, kind in zip(chart.series, FILLS, strict=False)
     ]
     if any(chart.off):
         entries.append(("off", "left out"))

@@ -100,16 +100,20 @@ def draw_uncertainty(
     return draw_maps([Map(name, shown.size, shown.sigma, caption, points)], title, "px")
 
 
-def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[Any], Any]:
-    found = next((one for kind, one in table.items() if isinstance(calibration, kind)), None)
-    if found is None:
-        raise _wrong(what, "a calibration of a lens, a pair, or a camera on a robot", calibration)
-    chosen: Callable[[Any], Any] = found
+def _of(calibration: object, table: Mapping[type, Any], label: str) -> Callable[[Any], Any]:
+    drawing = next(
+        (drawing for kind, drawing in table.items() if isinstance(calibration, kind)), None
+    )
+    if drawing is None:
+        raise _wrong(label, "a calibration of a lens, a pair, or a camera on a robot", calibration)
+    chosen: Callable[[Any], Any] = drawing
     return chosen
 
 
-def _wrong(what: str, expected: str, got: object) -> CalibrationError:
-    return Code.WRONG_KIND.unexpected(f"{what}: expected {expected}", expected, type(got).__name__)
+def _wrong(label: str, expected: str, actual: object) -> CalibrationError:
+    return Code.WRONG_KIND.unexpected(
+        f"{label}: expected {expected}", expected, type(actual).__name__
+    )
 
 
 def _size(pixels: Array) -> tuple[int, int]:
@@ -118,70 +122,74 @@ def _size(pixels: Array) -> tuple[int, int]:
 
 
 def _figures_text(figures: MapFigures) -> str:
-    finite = {name: one for name, one in figures._asdict().items() if math.isfinite(one)}
+    finite = {name: figure for name, figure in figures._asdict().items() if math.isfinite(figure)}
     return ", ".join(f"{name} {value:.2g}" for name, value in finite.items())
 
 
 # ---------------------------------------------------------------------- bars
 
 
-def _lens_chart(one: IntrinsicCalibration) -> list[Chart]:
+def _lens_chart(calibration: IntrinsicCalibration) -> list[Chart]:
     return [
         Chart(
             "px",
             [
-                Series("residuals", [fit.rms for fit in one.views], one.rms),
-                Series("held out", [fit.held_out for fit in one.views], one.held_out),
+                Series("residuals", [fit.rms for fit in calibration.views], calibration.rms),
+                Series(
+                    "held out", [fit.held_out for fit in calibration.views], calibration.held_out
+                ),
             ],
-            [label(fit.view, number) for number, fit in enumerate(one.views)],
-            [not fit.used for fit in one.views],
+            [label(fit.view, number) for number, fit in enumerate(calibration.views)],
+            [not fit.used for fit in calibration.views],
         )
     ]
 
 
-def _pair_charts(one: StereoCalibration) -> list[Chart]:
-    names = _pair_names(one)
-    left_out = [not any(fit.used) for fit in one.pairs]
+def _pair_charts(calibration: StereoCalibration) -> list[Chart]:
+    names = _pair_names(calibration)
+    left_out = [not any(fit.used) for fit in calibration.pairs]
     sides = [
-        Series(f"residuals, {side}", [fit.rms[number] for fit in one.pairs])
+        Series(f"residuals, {side}", [fit.rms[number] for fit in calibration.pairs])
         for number, side in enumerate(("left", "right"))
     ]
-    held_out = [MILLIMETRES * fit.held_out for fit in one.pairs]
+    held_out = [MILLIMETRES * fit.held_out for fit in calibration.pairs]
     return [
         Chart("px", sides, names, left_out),
         Chart(
             "mm",
-            [Series("held out, lengths", held_out, MILLIMETRES * one.held_out)],
+            [Series("held out, lengths", held_out, MILLIMETRES * calibration.held_out)],
             names,
             left_out,
         ),
     ]
 
 
-def _robot_chart(one: HandEyeCalibration) -> list[Chart]:
-    together = math.nan if one.held_out_error is None else MILLIMETRES * one.held_out_error
+def _robot_chart(calibration: HandEyeCalibration) -> list[Chart]:
+    together = (
+        math.nan if calibration.held_out_error is None else MILLIMETRES * calibration.held_out_error
+    )
     return [
         Chart(
             "mm",
             [
-                Series("on the target", (MILLIMETRES * one.errors).tolist()),
-                Series("held out", (MILLIMETRES * one.leave_one_out).tolist(), together),
+                Series("on the target", (MILLIMETRES * calibration.errors).tolist()),
+                Series("held out", (MILLIMETRES * calibration.leave_one_out).tolist(), together),
             ],
-            _robot_names(one),
-            [not used for used in one.used],
+            _robot_names(calibration),
+            [not used for used in calibration.used],
         )
     ]
 
 
-def _pair_names(one: StereoCalibration) -> list[str]:
-    views = [fit.left or fit.right for fit in one.pairs]
+def _pair_names(calibration: StereoCalibration) -> list[str]:
+    views = [fit.left or fit.right for fit in calibration.pairs]
     return [label(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
 
 
-def _robot_names(one: HandEyeCalibration) -> list[str]:
-    if one.views:
-        return [label(view, number) for number, view in enumerate(one.views)]
-    return [f"pose {number}" for number in range(len(one.robot_poses))]
+def _robot_names(calibration: HandEyeCalibration) -> list[str]:
+    if calibration.views:
+        return [label(view, number) for number, view in enumerate(calibration.views)]
+    return [f"pose {number}" for number in range(len(calibration.robot_poses))]
 
 
 # ---------------------------------------------------------------------- scenes
@@ -196,50 +204,64 @@ def _corners(target: Target | None) -> Array:
 
 
 def _boards(
-    names: Iterable[str], poses: Iterable[Transform | None], off: Iterable[bool], target: Target
+    names: Iterable[str], poses: Iterable[Transform | None], unused: Iterable[bool], target: Target
 ) -> list[DrawnBoard]:
     return [
         DrawnBoard(name, pose.apply(_corners(target)), left_out)
-        for name, pose, left_out in zip(names, poses, off, strict=True)
+        for name, pose, left_out in zip(names, poses, unused, strict=True)
         if pose is not None
     ]
 
 
-def _lens_scene(one: IntrinsicCalibration) -> DrawnScene:
-    names = short_names([label(fit.view, number) for number, fit in enumerate(one.views)])
-    poses, off = [fit.transform for fit in one.views], [not fit.used for fit in one.views]
-    boards = _boards(names, poses, off, one.views[0].view.target)
-    return DrawnScene(boards, [DrawnCamera("camera", IDENTITY, one.camera)])
+def _lens_scene(calibration: IntrinsicCalibration) -> DrawnScene:
+    names = short_names([label(fit.view, number) for number, fit in enumerate(calibration.views)])
+    poses, left_out = (
+        [fit.transform for fit in calibration.views],
+        [not fit.used for fit in calibration.views],
+    )
+    boards = _boards(names, poses, left_out, calibration.views[0].view.target)
+    return DrawnScene(boards, [DrawnCamera("camera", IDENTITY, calibration.camera)])
 
 
-def _pair_scene(one: StereoCalibration) -> DrawnScene:
-    shown = next(view for fit in one.pairs for view in (fit.left, fit.right) if view is not None)
-    poses, off = [fit.transform for fit in one.pairs], [not any(fit.used) for fit in one.pairs]
-    boards = _boards(short_names(_pair_names(one)), poses, off, shown.target)
-    right = one.transform.rigid.inverse()
+def _pair_scene(calibration: StereoCalibration) -> DrawnScene:
+    shown = next(
+        view for fit in calibration.pairs for view in (fit.left, fit.right) if view is not None
+    )
+    poses, left_out = (
+        [fit.transform for fit in calibration.pairs],
+        [not any(fit.used) for fit in calibration.pairs],
+    )
+    boards = _boards(short_names(_pair_names(calibration)), poses, left_out, shown.target)
+    right = calibration.transform.rigid.inverse()
     return DrawnScene(
-        boards, [DrawnCamera("left", IDENTITY, one.left), DrawnCamera("right", right, one.right)]
+        boards,
+        [
+            DrawnCamera("left", IDENTITY, calibration.left),
+            DrawnCamera("right", right, calibration.right),
+        ],
     )
 
 
-def _robot_scene(one: HandEyeCalibration) -> DrawnScene:
-    names = short_names(_robot_names(one))
-    corners = _corners(one.target)
+def _robot_scene(calibration: HandEyeCalibration) -> DrawnScene:
+    names = short_names(_robot_names(calibration))
+    corners = _corners(calibration.target)
     base = [Axes("base", IDENTITY)]
-    flanges = [pose.rigid for pose in one.robot_poses]
+    flanges = [pose.rigid for pose in calibration.robot_poses]
     up = (0.0, 0.0, 1.0)
-    if one.setup == "eye-in-hand":
-        board = DrawnBoard("target", one.target_pose.apply(corners))
+    if calibration.setup == "eye-in-hand":
+        board = DrawnBoard("target", calibration.target_pose.apply(corners))
         cameras = [
-            DrawnCamera(name, flange @ one.camera_pose.rigid, one.camera)
+            DrawnCamera(name, flange @ calibration.camera_pose.rigid, calibration.camera)
             for name, flange in zip(names, flanges, strict=True)
         ]
         return DrawnScene([board], cameras, base, up)
     boards = [
-        DrawnBoard(name, (flange @ one.target_pose.rigid).apply(corners), not used)
-        for name, flange, used in zip(names, flanges, one.used, strict=True)
+        DrawnBoard(name, (flange @ calibration.target_pose.rigid).apply(corners), not used)
+        for name, flange, used in zip(names, flanges, calibration.used, strict=True)
     ]
-    return DrawnScene(boards, [DrawnCamera("camera", one.camera_pose.rigid, one.camera)], base, up)
+    return DrawnScene(
+        boards, [DrawnCamera("camera", calibration.camera_pose.rigid, calibration.camera)], base, up
+    )
 
 
 _CHARTS: Final[Mapping[type, Callable[[Any], list[Chart]]]] = {

@@ -51,7 +51,11 @@ def draw_file(
     if document.kind == PlaneCalibration.kind:
         return draw_plane(PlaneCalibration.from_data(data), title=title)
     kinds = (IntrinsicCalibration, StereoCalibration, HandEyeCalibration)
-    one = next(kind for kind in kinds if kind.kind == document.kind).from_data(data)
-    if isinstance(one, IntrinsicCalibration) and chosen == "uncertainty":
-        return draw_uncertainty(one, distance=distance, title=title)
-    return draw_scene(one, title=title) if chosen == "scene" else draw_views(one, title=title)
+    calibration = next(kind for kind in kinds if kind.kind == document.kind).from_data(data)
+    if isinstance(calibration, IntrinsicCalibration) and chosen == "uncertainty":
+        return draw_uncertainty(calibration, distance=distance, title=title)
+    return (
+        draw_scene(calibration, title=title)
+        if chosen == "scene"
+        else draw_views(calibration, title=title)
+    )

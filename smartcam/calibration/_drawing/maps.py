@@ -50,25 +50,25 @@ class Map(NamedTuple):
 
 def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
     """Return maps side by side, with one legend: their colours mean the same."""
-    finite = np.concatenate([one.values[np.isfinite(one.values)] for one in maps])
+    finite = np.concatenate([drawn.values[np.isfinite(drawn.values)] for drawn in maps])
     positive = finite[finite > 0.0]
     most = float(positive.max()) if len(positive) else 1.0
     least = float(positive.min()) if len(positive) else 0.1
     least = max(min(least, 0.999 * most), most / 10.0**MAX_DECADES)
-    height = max(WIDTH * one.size[1] / one.size[0] for one in maps)
+    height = max(WIDTH * drawn.size[1] / drawn.size[0] for drawn in maps)
     parts = [text((BORDER, 28), title, "title")] if title else []
-    for number, one in enumerate(maps):
-        parts += _map(one, BORDER + number * (WIDTH + BORDER), least, most)
+    for number, drawn in enumerate(maps):
+        parts += _map(drawn, BORDER + number * (WIDTH + BORDER), least, most)
     parts += _legend(HEAD + height + 44, least, most, unit)
     return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + height + FOOT, parts)
 
 
-def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
-    height = WIDTH * one.size[1] / one.size[0]
-    rows, columns = one.values.shape
+def _map(drawn: Map, left: float, least: float, most: float) -> Iterator[str]:
+    height = WIDTH * drawn.size[1] / drawn.size[0]
+    rows, columns = drawn.values.shape
     cell = np.array([WIDTH / columns, height / rows])
-    yield text((left, HEAD - 12), one.title)
-    levels = _levels(one.values, least, most)
+    yield text((left, HEAD - 12), drawn.title)
+    levels = _levels(drawn.values, least, most)
     yield '<g shape-rendering="crispEdges">'
     for row in range(rows):
         # one rectangle for each run of one colour
@@ -79,13 +79,13 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
             place = (left + start * cell[0], HEAD + row * cell[1])
             yield rectangle(place, ((end - start) * cell[0], cell[1]), fill)
     yield "</g>"
-    places = [left, HEAD] + (one.points + 0.5) * WIDTH / one.size[0]
+    places = [left, HEAD] + (drawn.points + 0.5) * WIDTH / drawn.size[0]
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in places.tolist())
     yield f'<path d="{dots}" class="seen"/>'
     yield rectangle((left, HEAD), (WIDTH, height), 'class="axis"')
-    yield from _numbers(one.values, left, height)
-    if one.caption:
-        yield text((left, HEAD + height + 20), one.caption)
+    yield from _numbers(drawn.values, left, height)
+    if drawn.caption:
+        yield text((left, HEAD + height + 20), drawn.caption)
 
 
 def _numbers(values: Array, left: float, height: float) -> Iterator[str]:

@@ -61,7 +61,7 @@ class DrawnCamera(NamedTuple):
     """A camera in the scene."""
 
     name: str
-    pose: Rigid  # from the camera's frame into the scene's
+    pose: Rigid  # transform from the camera's frame into the scene's
     model: CameraModel | None = None
 
 
@@ -127,52 +127,54 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
     """Draw a scene: cameras in orange, boards in blue, dashed if they were left out."""
     places = np.concatenate(
         [
-            *(one.corners for one in scene.boards),
-            *(np.atleast_2d(one.pose.translation) for one in scene.cameras),
-            *(np.atleast_2d(one.pose.translation) for one in scene.axes),
+            *(board.corners for board in scene.boards),
+            *(np.atleast_2d(camera.pose.translation) for camera in scene.cameras),
+            *(np.atleast_2d(axis.pose.translation) for axis in scene.axes),
         ]
     )
     extent = float(np.ptp(places, axis=0).max()) or 1.0
     length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
-    shapes = [_frustum(one, length) for one in scene.cameras]
-    ends = [one.pose.apply(ARROW * extent * np.eye(3)) for one in scene.axes]
+    shapes = [_frustum(camera, length) for camera in scene.cameras]
+    ends = [axis.pose.apply(ARROW * extent * np.eye(3)) for axis in scene.axes]
     sight = _ViewerProjection(scene, np.concatenate([places, *shapes, *ends]))
     items = [
         _Drawn(
-            sight.depth(one.corners),
-            polygon(sight.pixels(one.corners), "board-off" if one.off else "board", one.name),
-            one.name,
-            sight.pixels(one.corners.mean(axis=0)),
+            sight.depth(board.corners),
+            polygon(sight.pixels(board.corners), "board-off" if board.off else "board", board.name),
+            board.name,
+            sight.pixels(board.corners.mean(axis=0)),
         )
-        for one in scene.boards
+        for board in scene.boards
     ]
-    items += [_camera(sight, one, shape) for one, shape in zip(scene.cameras, shapes, strict=True)]
-    items.sort(key=lambda one: -one.depth)  # draw far objects first
+    items += [
+        _camera(sight, camera, shape) for camera, shape in zip(scene.cameras, shapes, strict=True)
+    ]
+    items.sort(key=lambda item: -item.depth)  # draw far objects first
     parts = [text((BORDER, 28), title, "title")] if title else []
-    parts += [one.svg for one in items]
-    for one, tips in zip(scene.axes, ends, strict=True):
-        start = sight.pixels(one.pose.translation)
+    parts += [item.svg for item in items]
+    for axes, tips in zip(scene.axes, ends, strict=True):
+        start = sight.pixels(axes.pose.translation)
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
             items.append(_Drawn(0.0, "", axis, tip))
-        items.append(_Drawn(0.0, "", one.name, start + LABEL_OFFSET_PX))
-    parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
+        items.append(_Drawn(0.0, "", axes.name, start + LABEL_OFFSET_PX))
+    parts += _labels([(item.label, item.at) for item in items[::-1] if item.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
 
 
 def _frustum(camera: DrawnCamera, length: float) -> Array:
     """Return a camera's centre, and the corners of its field of view at a depth, (5, 3)."""
-    x, y = 0.5, 0.375  # of a corner at depth 1
+    x, y = 0.5, 0.375  # coordinates of a corner at depth 1
     if camera.model is not None:
-        x, y = (math.tan(min(one, 2.0) / 2) for one in camera.model.field_of_view)
+        x, y = (math.tan(min(view_angle, 2.0) / 2) for view_angle in camera.model.field_of_view)
     rim = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
     return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *rim]))
 
 
 def _camera(sight: _ViewerProjection, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
-    sides = [line(centre, one, "camera") for one in rim]
+    sides = [line(centre, corner, "camera") for corner in rim]
     svg = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
     return _Drawn(sight.depth(shape), svg, camera.name, centre + LABEL_OFFSET_PX)
 
@@ -188,7 +190,7 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
             x, y = at + offset
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
-            if not outside and not any(_overlap(box, one) for one in occupied):
+            if not outside and not any(_overlap(box, placed) for placed in occupied):
                 occupied.append(box)
                 if math.hypot(*offset) > 25:
                     yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')

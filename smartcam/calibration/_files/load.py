@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 AnyCalibration: TypeAlias = PlaneCalibration | SheetCalibration
 
 KINDS: Final[Mapping[str, type[AnyCalibration]]] = {
-    one.kind: one for one in (PlaneCalibration, SheetCalibration)
+    kind.kind: kind for kind in (PlaneCalibration, SheetCalibration)
 }
 """Calibrations that a file may hold, by their kinds."""
 

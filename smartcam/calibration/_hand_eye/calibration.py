@@ -198,52 +198,57 @@ def calibrate_hand_eye(
     check_positive(allowed_error, "allowed_error", "metres")
     check_positive(most_scale, "most_scale", "parts of its size")
     transforms, order, robot = _robot(robot_poses, len(views), "views", setup)
-    if any(one.target != views[0].target for one in views):
+    if any(view.target != views[0].target for view in views):
         raise Code.DIFFERENT_TARGETS.refusal(
             "hand-eye: expected views of one target, got views of several", views[0].target
         )
     ordered = [views[i] for i in order]
-    lens, own, of_sheet = camera, None, list[Remark]()
+    lens, lens_calibration, of_sheet = camera, None, list[Remark]()
     if lens is None:
         # A sheet bent by a tenth of a millimetre, which views cannot show, makes cameras 1.7 mm off
         # where 0.7 mm are expected, if the views alone tell the lens (measured in simulation).
         few = len(ordered[0].target.points) <= MAX_FREE_POINTS
         alone: Sheet = "free" if few else "exact"
-        own = calibrate_intrinsics(ordered, sheet="auto" if adjust == "auto" else alone)
-        lens = own.camera
-        of_sheet = [one for one in own.warnings if one.code == Code.SHEET_NOT_EXACT]
-    located = [locate(one, lens) for one in ordered]
+        lens_calibration = calibrate_intrinsics(
+            ordered, sheet="auto" if adjust == "auto" else alone
+        )
+        lens = lens_calibration.camera
+        of_sheet = [
+            warning for warning in lens_calibration.warnings if warning.code == Code.SHEET_NOT_EXACT
+        ]
+    located = [locate(view, lens) for view in ordered]
     if ordered[0].target.half_turn_symmetric:
         ordered = _numbered_alike(ordered, robot, located)
-        located = [locate(one, lens) for one in ordered]
+        located = [locate(view, lens) for view in ordered]
         views = [ordered[i] for i in np.argsort(order)]
     ordered, strays = without_strays(ordered, located, lens, given=camera is not None)
-    located = [locate(one, lens) for one in ordered] if strays else located
-    poses = Rigid.stacked(one.transform.rigid for one in located)
+    located = [locate(view, lens) for view in ordered] if strays else located
+    poses = Rigid.stacked(view.transform.rigid for view in located)
     seen = _observations(ordered, located, lens)
     problem = Problem(
         robot=robot,
         seen=seen,
         poses=poses,
-        given=_given(ordered),
+        given=_checked_views(ordered),
         sigmas=_positive(robot_sigmas),
-        lens=None if own is None else own.covariance,
+        lens=None if lens_calibration is None else lens_calibration.covariance,
     )
-    named = [one.name or f"pose {i}" for i, one in zip(order, ordered, strict=True)]
-    kept = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
-    if own is not None:  # a sheet bent by 0.15 mm would bend a lens that takes it as flat
-        kept += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
-    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *kept)}
+    named = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
+    bend_places = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    if lens_calibration is not None:
+        # a sheet bent by 0.15 mm would bend a lens that takes it as flat
+        bend_places += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
+    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *bend_places)}
     free["scale and camera"] = (0, *free["camera"])
-    if own is not None and adjust == "auto":
+    if lens_calibration is not None and adjust == "auto":
         # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
         # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
         del free[NOTHING], free["scale"]
-    asked = _Asked(_allowed(free, adjust), method, drop_bad, order, most_scale)
-    result = _without_bad(problem, asked, named, transforms, ordered)
+    request = _Asked(_allowed(free, adjust), method, drop_bad, order, most_scale)
+    result = _without_bad(problem, request, named, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
-        strays = [one for one in strays if one.code != Code.WRONG_LENS]
+        strays = [outlier for outlier in strays if outlier.code != Code.WRONG_LENS]
     return dataclasses.replace(
         result,
         warnings=(*result.warnings, *remarks, *of_sheet, *strays),
@@ -300,7 +305,7 @@ def calibrate_hand_eye_from_poses(
     check_positive(most_scale, "most_scale", "parts of its size")
     transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
     seen = [target_poses[i] for i in order]
-    poses = Rigid.stacked(one.rigid for one in seen)
+    poses = Rigid.stacked(pose.rigid for pose in seen)
     scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
     white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
@@ -311,16 +316,16 @@ def calibrate_hand_eye_from_poses(
     )
     named = [f"pose {i}" for i in order]
     free = _allowed({NOTHING: (), "scale": (0,)}, adjust)
-    asked = _Asked(free, method, drop_bad, order, most_scale)
+    request = _Asked(free, method, drop_bad, order, most_scale)
     return dataclasses.replace(
-        _without_bad(problem, asked, named, transforms, seen),
-        target_poses=tuple(Transform(CAMERA, TARGET, *one.rigid) for one in target_poses),
+        _without_bad(problem, request, named, transforms, seen),
+        target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
         allowed_error=allowed_error,
     )
 
 
 def _robot(
-    robot_poses: Sequence[Transform | Pose], count: int, what: str, setup: str
+    robot_poses: Sequence[Transform | Pose], count: int, label: str, setup: str
 ) -> tuple[list[Transform], list[int], RobotPoses]:
     """Return the robot's poses, an order that depends only on their values, and the sorted poses.
 
@@ -330,20 +335,22 @@ def _robot(
     robot_poses = as_list(robot_poses, object, "pose of the robot")
     if len(robot_poses) != count:
         raise Code.SHAPE.refusal(
-            f"hand-eye: expected as many {what} as poses of the robot, got {count} and "
+            f"hand-eye: expected as many {label} as poses of the robot, got {count} and "
             f"{len(robot_poses)}",
             len(robot_poses),
             count,
         )
     transforms = [as_transform(pose, "flange").undated() for pose in robot_poses]
-    for one in transforms:
-        if one.label != transforms[0].label:
+    for transform in transforms:
+        if transform.label != transforms[0].label:
             raise Code.WRONG_FRAME.unexpected(
                 f"hand-eye: expected all poses of the robot to be {transforms[0].label}",
                 transforms[0].label,
-                one.label,
+                transform.label,
             )
-    rows = np.array([[*one.translation, *one.rotation.ravel()] for one in transforms])
+    rows = np.array(
+        [[*transform.translation, *transform.rotation.ravel()] for transform in transforms]
+    )
     order = np.lexsort(rows.T[::-1]).tolist() if len(rows) else []
     ordered = Rigid.stacked(transforms[i].rigid for i in order)
     robot = RobotPoses(ordered, in_hand)
@@ -369,14 +376,16 @@ def _numbered_alike(
 ) -> list[TargetView]:
     """Return views with one origin, for a target that looks the same after half a turn."""
     target = views[0].target
-    poses = Rigid.stacked(one.transform.rigid for one in located)
+    poses = Rigid.stacked(view.transform.rigid for view in located)
     arm = float(np.ptp(target.points, axis=0).max())
     other = other_numbering(robot, poses, half_turn(target), arm).tolist()
-    return [half_turned(one) if turned else one for one, turned in zip(views, other, strict=True)]
+    return [
+        half_turned(view) if turned else view for view, turned in zip(views, other, strict=True)
+    ]
 
 
-def _given(views: Sequence[TargetView]) -> Any:
-    counts = np.array([len(one.ids) for one in views])
+def _checked_views(views: Sequence[TargetView]) -> Any:
+    counts = np.array([len(view.ids) for view in views])
     return np.arange(counts.max())[None] < counts[:, None]
 
 
@@ -384,17 +393,17 @@ def _observations(
     views: Sequence[TargetView], located: Sequence[TargetPose], camera: CameraModel
 ) -> PixelObservations:
     """Return the views' points, with noise as large as the views themselves show."""
-    off = np.concatenate([one.residuals for one in located])
-    noise = np.concatenate([one.covariance for one in views])
-    more = excess(off, noise, off.size - 6 * len(views))
-    given = _given(views)
+    residuals = np.concatenate([view.residuals for view in located])
+    noise = np.concatenate([view.covariance for view in views])
+    more = excess(residuals, noise, residuals.size - 6 * len(views))
+    given = _checked_views(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))
-    for index, one in enumerate(views):
-        points[index], pixels[index] = one.object_points[0], one.points[0]
+    for index, view in enumerate(views):
+        points[index], pixels[index] = view.object_points[0], view.points[0]
         mask = given[index]
-        points[index, mask], pixels[index, mask] = one.object_points, one.points
-        white[index, mask] = whitening(one.covariance, more)
+        points[index, mask], pixels[index, mask] = view.object_points, view.points
+        white[index, mask] = whitening(view.covariance, more)
     return PixelObservations(white, camera, points, pixels, bends(points, given))
 
 
@@ -416,7 +425,7 @@ class _Asked(NamedTuple):
 
 def _without_bad(
     problem: Problem,
-    asked: _Asked,
+    request: _Asked,
     named: Sequence[str],
     transforms: Sequence[Transform],
     seen: Sequence[TargetView | Transform],
@@ -426,10 +435,10 @@ def _without_bad(
     ``transforms`` are the robot's poses as given, all else is in the order of their values. Raises
     ``SCALE_MISMATCH``, besides the errors of poses that do not fit.
     """
-    robot_poses = [transforms[i] for i in asked.order]
-    used, remarks = _near(problem, asked, named)
-    result = _solved(problem.taken(used), asked, robot_poses[0])
-    while len(bad := _bad(result)) and asked.drop_bad:
+    robot_poses = [transforms[i] for i in request.order]
+    used, remarks = _start_poses(problem, request, named)
+    result = _solved(problem.taken(used), request, robot_poses[0])
+    while len(bad := _bad(result)) and request.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
         worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
         fewer = np.delete(used, worst)
@@ -443,22 +452,22 @@ def _without_bad(
         for index in worst:
             number = int(used[index])
             remarks[number] = _bad_view(result, index, named[number], "was not used")
-        used, result = fewer, _solved(problem.taken(fewer), asked, robot_poses[0])
+        used, result = fewer, _solved(problem.taken(fewer), request, robot_poses[0])
     for index in bad:
         number = int(used[index])
-        kept = _bad_view(result, index, named[number], "is used all the same")
-        remarks.setdefault(number, kept)
+        remark = _bad_view(result, index, named[number], "is used all the same")
+        remarks.setdefault(number, remark)
     errors, left_out = np.full((2, problem.count), np.nan)
     unused = np.setdiff1d(np.arange(problem.count), used)
     left: list[int] = unused.tolist()
     for number in left:
-        (off,) = result.point_errors([robot_poses[number]], [seen[number]])
-        if np.isfinite(off).all():
-            errors[number] = left_out[number] = math.sqrt(float((off**2).mean()))
+        (errors_of_pose,) = result.point_errors([robot_poses[number]], [seen[number]])
+        if np.isfinite(errors_of_pose).all():
+            errors[number] = left_out[number] = math.sqrt(float((errors_of_pose**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
-    some, back = problem.taken(used), np.argsort(asked.order)
-    _check_fit(some, result)
-    _check_scale(result.target_scale, asked.most_scale)
+    sampled, back = problem.taken(used), np.argsort(request.order)
+    _check_fit(sampled, result)
+    _check_scale(result.target_scale, request.most_scale)
     return dataclasses.replace(
         result,
         errors=errors[back],
@@ -466,8 +475,8 @@ def _without_bad(
         robot_poses=tuple(transforms),
         used=tuple(np.isin(back, used).tolist()),
         warnings=(
-            *_size_remark(some, asked),
-            *_remarks(some, result),
+            *_size_remark(sampled, request),
+            *_remarks(sampled, result),
             *_moved_remark(problem.taken(unused), result, [named[i] for i in left]),
             *remarks.values(),
         ),
@@ -485,18 +494,18 @@ def _moved_remark(
     arm = float(np.linalg.norm(seen.translation, axis=1).mean())
     places = {"target": target.before(between.inverse() @ (camera @ seen))}
     places["camera"] = camera.before(between @ (target @ seen.inverse()))
-    for what, steps in places.items():
+    for thing, steps in places.items():
         if (move := common_move(steps * np.repeat([arm, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
-                f"the {what} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
+                f"the {thing} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
                 f"{', '.join(named)} were left out, and agree on another place of it than all "
                 "others; which of both holds now, they cannot tell"
             )
             return
 
 
-def _near(
-    problem: Problem, asked: _Asked, named: Sequence[str]
+def _start_poses(
+    problem: Problem, request: _Asked, named: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
     """Return the poses to begin with, and remarks, by number, on those that belong to other views.
 
@@ -506,7 +515,7 @@ def _near(
     gross = agreed.gross(most_error(problem))
     left = problem.count - len(gross)
     drop = (
-        asked.drop_bad
+        request.drop_bad
         and left >= MIN_GOOD_POSES
         and len(gross) <= MAX_BAD_POSE_SHARE * problem.count
     )
@@ -546,26 +555,26 @@ def _bad_view(result: HandEyeCalibration, index: int, name: str, done: str) -> R
     )
 
 
-def _solved(problem: Problem, asked: _Asked, pose: Transform) -> HandEyeCalibration:
-    check_choice(asked.method, ["auto", *METHODS], "method")
-    chosen, found = candidates(problem, asked.free, asked.method)
+def _solved(problem: Problem, request: _Asked, pose: Transform) -> HandEyeCalibration:
+    check_choice(request.method, ["auto", *METHODS], "method")
+    chosen, candidates_ = candidates(problem, request.free, request.method)
     if chosen is None:
         raise poor_fit(f"none at all {problem.count} poses", None)
-    return _result(problem, chosen, found, pose)
+    return _result(problem, chosen, candidates_, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
     """Raise ``POOR_FIT`` if poses and views do not belong together."""
     errors = result.errors if result.held_out_error is None else result.leave_one_out
-    off, most = float(np.median(errors)), most_error(problem)
-    if off > most:
-        raise poor_fit(f"one {1e3 * off:.3g} mm off, {1e3 * most:.3g} mm at most expected", off)
+    error, most = float(np.median(errors)), most_error(problem)
+    if error > most:
+        raise poor_fit(f"one {1e3 * error:.3g} mm off, {1e3 * most:.3g} mm at most expected", error)
 
 
 def _result(
     problem: Problem,
     chosen: Candidate,
-    found: Sequence[Candidate],
+    considered: Sequence[Candidate],
     pose: Transform,
 ) -> HandEyeCalibration:
     in_hand, solution = problem.robot.in_hand, chosen.solution
@@ -582,9 +591,10 @@ def _result(
         target_scale=seen.scale(solution.change),
         method=chosen.name,
         candidates={
-            one.name: one.held_out if math.isfinite(one.held_out) else None for one in found
+            candidate.name: candidate.held_out if math.isfinite(candidate.held_out) else None
+            for candidate in considered
         },
-        errors=np.array([math.sqrt(float((one**2).mean())) for one in errors]),
+        errors=np.array([math.sqrt(float((error**2).mean())) for error in errors]),
         mean_error=float(np.concatenate(errors).mean()),
         leave_one_out=held_out,
         held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
@@ -619,19 +629,21 @@ def _covariance(chosen: Candidate) -> Array:
         return np.full((12, 12), np.nan)
     cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
-    whole, left = solution.information, others.information
-    if whole is None or left is None:  # solved without a part of the poses, not without each
+    information, left = solution.information, others.information
+    if information is None or left is None:  # solved without a part of the poses, not without each
         return jackknife(steps[:MAX_FOLDS])
-    if len(whole) > 12:
+    if len(information) > 12:
         steps = np.concatenate([steps, others.change - solution.change], axis=1)
     places = of_one_place(chosen.problem.robot.poses)
-    alike = [places == one for one in np.unique(places)]  # poses of one place are left out together
-    steps = np.array([steps[one].sum(axis=0) for one in alike])  # to first order
-    left = np.array([whole - (whole - left[one]).sum(axis=0) for one in alike])
-    spreads = np.array([inverse_scaled(one) for one in left])
-    scatter = weighed_jackknife(steps, spreads, inverse_scaled(whole), WEIGHT_POWER)[:12, :12]
-    for one in chosen.rivals:
-        both = solution.camera.before(one.camera), solution.target.before(one.target)
+    # poses of one place are left out together
+    alike = [places == place for place in np.unique(places)]
+    steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # correct to first order
+    left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
+    spreads = np.array([inverse_scaled(information_left) for information_left in left])
+    full = inverse_scaled(information)
+    scatter = weighed_jackknife(steps, spreads, full, WEIGHT_POWER)[:12, :12]
+    for rival in chosen.rivals:
+        both = solution.camera.before(rival.camera), solution.target.before(rival.target)
         scatter += np.outer(step := np.concatenate(both), step)
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
@@ -642,20 +654,20 @@ def _covariance(chosen: Candidate) -> Array:
     return joint
 
 
-def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
+def _size_remark(problem: Problem, request: _Asked) -> Iterator[Remark]:
     """Return a remark if the target has another size, and that was not to be adjusted."""
-    if asked.method not in LINEAR and any(0 in one for one in asked.free.values()):
+    if request.method not in LINEAR and any(0 in freed for freed in request.free.values()):
         return
     numbers = np.arange(problem.count)
-    found = scale_of(problem.robot, problem.poses)
+    scale = scale_of(problem.robot, problem.poses)
     parts = [problem.taken(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
-    others = [scale_of(one.robot, one.poses) for one in parts]
-    if found is None or not others or None in others:
+    others = [scale_of(part.robot, part.poses) for part in parts]
+    if scale is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
-    if abs(found - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
+    if abs(scale - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
-            f"expected the target as large as it was said, got {found:.4f} times that by the "
+            f"expected the target as large as it was said, got {scale:.4f} times that by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "
             "lens' focal length is off by as much"
         )
@@ -675,7 +687,7 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{places}{alike}"
         )
-    # a remark that one pose more or less would change helps nobody
+    # a remark that depends on a single pose is of no use
     turn = float(second_turns(problem.robot).max())
     if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(

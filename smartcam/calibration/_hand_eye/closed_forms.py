@@ -119,10 +119,10 @@ def of_one_place(poses: Rigid) -> NDArray[np.intp]:
     for index in numbers[1:]:
         turned = log_rotation(poses.rotation[:index].swapaxes(1, 2) @ poses.rotation[index])
         moved = poses.translation[:index] - poses.translation[index]
-        near = np.linalg.norm(turned, axis=1) < SAME_TURN_RADIANS
-        near &= np.linalg.norm(moved, axis=1) < SAME_PLACE_M
-        if near.any():
-            numbers[index] = numbers[int(np.argmax(near))]
+        is_near = np.linalg.norm(turned, axis=1) < SAME_TURN_RADIANS
+        is_near &= np.linalg.norm(moved, axis=1) < SAME_PLACE_M
+        if is_near.any():
+            numbers[index] = numbers[int(np.argmax(is_near))]
     return numbers
 
 
@@ -131,8 +131,8 @@ def _some_turns(robot: RobotPoses) -> Array:
     turns, count = robot.poses.rotation, robot.poses.size
     if count <= MAX_POSES_COMPARED:
         return turns
-    some: Array = turns[np.linspace(0, count - 1, MAX_POSES_COMPARED).round().astype(np.intp)]
-    return some
+    sampled: Array = turns[np.linspace(0, count - 1, MAX_POSES_COMPARED).round().astype(np.intp)]
+    return sampled
 
 
 def second_turn(robot: RobotPoses) -> float:
@@ -144,10 +144,10 @@ def second_turn(robot: RobotPoses) -> float:
 def second_turns(robot: RobotPoses) -> Array:
     """Return the second turn without each pose (V,), or that of all poses if they are few."""
     products = _turns(robot)
-    whole, count = products.sum(axis=(0, 1)), len(products)
+    total, count = products.sum(axis=(0, 1)), len(products)
     if count <= MIN_POSES:
-        return np.full(count, _second(whole, count))
-    return _second(whole - 2.0 * products.sum(axis=1), count - 1)
+        return np.full(count, _second(total, count))
+    return _second(total - 2.0 * products.sum(axis=1), count - 1)
 
 
 def _turns(robot: RobotPoses) -> Array:
@@ -174,8 +174,8 @@ def solve_linear(
     a method that works with pairs gets a part of them, which is enough for a start.
     """
     if name in HAND_EYE and not exactly and seen.size > MAX_POSES_PAIRED:
-        some = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
-        robot, seen = robot.taken(some), seen.taken(some)
+        sampled = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
+        robot, seen = robot.taken(sampled), seen.taken(sampled)
     try:
         solution = LINEAR[name](name, robot, seen)
     except (load("cv2").error, np.linalg.LinAlgError):
@@ -246,11 +246,11 @@ def _lists(motions: Rigid) -> tuple[list[Array], list[Array]]:
     return list(np.ascontiguousarray(motions.rotation)), list(motions.translation)
 
 
-def _sound(found: tuple[Rigid, Rigid]) -> bool:
-    for motion in found:
+def _sound(motions: tuple[Rigid, Rigid]) -> bool:
+    for motion in motions:
         if not all(np.isfinite(part).all() for part in motion):
             return False
-        off = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
-        if off > 1e-6 or np.linalg.det(motion.rotation) < 0:
+        error = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
+        if error > 1e-6 or np.linalg.det(motion.rotation) < 0:
             return False
     return True

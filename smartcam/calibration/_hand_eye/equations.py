@@ -38,12 +38,12 @@ Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 """Place of the camera: on the robot's hand, or beside the robot, looking at it."""
 
 
-def is_in_hand(setup: object, what: str) -> bool:
+def is_in_hand(setup: object, label: str) -> bool:
     """Return True if the camera is on the hand, False if it looks at the robot.
 
-    ``what`` names the calibration. Raises SHAPE if there is no such setup.
+    ``label`` names the calibration. Raises SHAPE if there is no such setup.
     """
-    check_choice(setup, get_args(Setup), f"{what}: setup")
+    check_choice(setup, get_args(Setup), f"{label}: setup")
     return setup == "eye-in-hand"
 
 
@@ -240,17 +240,19 @@ class PixelObservations(Observations):
         # pose_changes has it, lenses move the pixel as the projection says, and a bend b moves m by
         # b h along the target's normal n: dp/db = s h R n.
         nominal = self._bent(full) @ np.swapaxes(seen.rotation, 1, 2)
-        near = self.scale(change) * nominal
-        there = linearize((near + seen.translation[:, None]).reshape(-1, 3), self.camera(change))
-        moved = pose_changes(there.by_point, near.reshape(-1, 3))
-        grown = there.by_point @ nominal.reshape(-1, 3, 1)
+        moved_points = self.scale(change) * nominal
+        linearized = linearize(
+            (moved_points + seen.translation[:, None]).reshape(-1, 3), self.camera(change)
+        )
+        moved = pose_changes(linearized.by_point, moved_points.reshape(-1, 3))
+        grown = linearized.by_point @ nominal.reshape(-1, 3, 1)
         risen = self.scale(change) * seen.rotation[:, None, :, 2:] * self.heights[:, :, None]
-        bent = there.by_point @ risen.reshape(views * count, 3, -1 if risen.size else 0)
-        beside = np.concatenate([grown, there.by_lens, bent], axis=2)[:, :, list(self.free)]
+        bent = linearized.by_point @ risen.reshape(views * count, 3, -1 if risen.size else 0)
+        beside = np.concatenate([grown, linearized.by_lens, bent], axis=2)[:, :, list(self.free)]
         slopes = np.concatenate([moved, beside], axis=2).reshape(views, count, 2, -1)
-        off = (there.pixels.reshape(views, count, 2) - self.pixels)[..., None]
-        off, slopes = self.whitening @ off, self.whitening @ slopes
-        return off.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
+        residuals = (linearized.pixels.reshape(views, count, 2) - self.pixels)[..., None]
+        residuals, slopes = self.whitening @ residuals, self.whitening @ slopes
+        return residuals.reshape(views, -1), slopes.reshape(views, 2 * count, -1)
 
     @property
     def _lens(self) -> int:
@@ -282,9 +284,9 @@ def bends(points: Array, given: Mask) -> Array:
     x, y = np.moveaxis((points[..., :2] - seen.mean(axis=0)) / np.ptp(seen, axis=0), 2, 0)
     known = [np.ones_like(x), x, y]
     for bend in (x * x, x * y, y * y):
-        before = np.stack([one[given] for one in known], axis=1)
-        rest = bend[given] - before @ np.linalg.lstsq(before, bend[given], rcond=None)[0]
-        if np.linalg.norm(rest) > MIN_OWN_SHARE_OF_BEND * np.linalg.norm(bend[given]):
+        before = np.stack([bend[given] for bend in known], axis=1)
+        unexplained = bend[given] - before @ np.linalg.lstsq(before, bend[given], rcond=None)[0]
+        if np.linalg.norm(unexplained) > MIN_OWN_SHARE_OF_BEND * np.linalg.norm(bend[given]):
             known.append(bend)
     heights = np.stack(known, axis=2)[:, :, 3:]
     return np.asarray(heights - heights[given].mean(axis=0), dtype=np.float64)
@@ -318,12 +320,12 @@ class PoseObservations(Observations):
         # The turn e = log(R_S R_m^T) becomes log(exp([w]x) exp([e]x)), to first order e +
         # J_l(e)^-1 w, and the left Jacobian is J_l(e) = J_r(-e).
         # Source: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537), appendix B.
-        off = self.poses.scaled(self.scale(change)).after(seen)
-        slopes = np.zeros((len(off), 6, 6 + self.extra))
-        slopes[:, :3, :3] = np.linalg.inv(right_jacobian(-off[:, :3]))
+        residuals = self.poses.scaled(self.scale(change)).after(seen)
+        slopes = np.zeros((len(residuals), 6, 6 + self.extra))
+        slopes[:, :3, :3] = np.linalg.inv(right_jacobian(-residuals[:, :3]))
         slopes[:, 3:, 3:6] = np.eye(3)
         slopes[:, 3:, 6:] = -self.poses.translation[..., None][..., : self.extra]
-        whitened = (self.whitening @ off[..., None])[..., 0]
+        whitened = (self.whitening @ residuals[..., None])[..., 0]
         return whitened, self.whitening @ slopes
 
 
@@ -359,19 +361,19 @@ def sums(
     pose of the view can change.
     """
     moved = dataclasses.replace(robot, poses=robot.poses.turned_before(at.corrections))
-    off, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
+    residuals, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
     outer, inner = _chain(at.camera, moved, at.target)
     # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
     # it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J v.
     inner[:, :, :3] = inner[:, :, :3] @ right_jacobian(at.corrections[:, :3])
-    own = slopes[:, :, :6] @ inner
-    before = off[..., None] - own @ at.corrections[..., None]
-    rows = np.concatenate([own, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
+    corrections = slopes[:, :, :6] @ inner
+    before = residuals[..., None] - corrections @ at.corrections[..., None]
+    rows = np.concatenate([corrections, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
     # Of residuals r = J w + e only the part in the columns of J depends on the pose: Q^T r, J = Q
     # R.
     if poses_only:
         rows = np.swapaxes(np.linalg.qr(slopes[:, :, :6])[0], 1, 2) @ rows
-    return np.swapaxes(rows, 1, 2) @ rows, float((off**2).sum())
+    return np.swapaxes(rows, 1, 2) @ rows, float((residuals**2).sum())
 
 
 def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float, Array, Array]:
@@ -398,14 +400,14 @@ def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float
 def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
     """Return the equations of a step; ``X``, ``Z`` and the other parameters are shared."""
     cost, matrix, right = _by_view(robot, seen, at)
-    own, rest = slice(0, 6 if at.noise else 0), slice(6, None)
+    correction, motion = slice(0, 6 if at.noise else 0), slice(6, None)
     return Normal(
         cost,
-        matrix[:, rest, rest].sum(axis=0),
-        right[:, rest].sum(axis=0),
-        matrix[:, own, own],
-        right[:, own],
-        matrix[:, own, rest],
+        matrix[:, motion, motion].sum(axis=0),
+        right[:, motion].sum(axis=0),
+        matrix[:, correction, correction],
+        right[:, correction],
+        matrix[:, correction, motion],
     )
 
 
@@ -454,27 +456,30 @@ def _stepped(at: Solution, step: Array, corrections: Array) -> Solution:
     )
 
 
-def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solution:
-    """Return the solutions without each view, stacked (V, ...); ``whole`` is that of all views.
+def without_each(robot: RobotPoses, seen: Observations, solution: Solution) -> Solution:
+    """Return the solutions without each view, stacked (V, ...); ``solution`` is that of all views.
 
     The noise is the one estimated from all views.
     """
     # One Gauss-Newton step from the whole solution, with the view's own part taken out of the sums:
     # its normal equations are a sum over views, and only steps of second order are lost.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 5.2.
-    spread = seen if whole.noise is None else seen.spread(whole.noise.shared)
-    _, matrix, right = _by_view(robot, spread, whole)
-    own, rest = slice(0, 6 if whole.noise else 0), slice(6, None)
-    mixed = np.swapaxes(matrix[:, own, rest], 1, 2)
-    both = np.concatenate([matrix[:, own, rest], right[:, own, None]], axis=2)
-    solved = mixed @ np.linalg.solve(matrix[:, own, own], both)
-    matrices, rights = matrix[:, rest, rest] - solved[..., :-1], right[:, rest] - solved[..., -1]
+    spread = seen if solution.noise is None else seen.spread(solution.noise.shared)
+    _, matrix, right = _by_view(robot, spread, solution)
+    correction, motion = slice(0, 6 if solution.noise else 0), slice(6, None)
+    mixed = np.swapaxes(matrix[:, correction, motion], 1, 2)
+    both = np.concatenate([matrix[:, correction, motion], right[:, correction, None]], axis=2)
+    solved = mixed @ np.linalg.solve(matrix[:, correction, correction], both)
+    matrices, rights = (
+        matrix[:, motion, motion] - solved[..., :-1],
+        right[:, motion] - solved[..., -1],
+    )
     left, rights = matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights
-    steps = np.stack([solve_scaled(*one) for one in zip(left, rights, strict=True)])
+    steps = np.stack([solve_scaled(*system) for system in zip(left, rights, strict=True)])
     return Solution(
-        whole.camera.turned_before(steps[:, :6]),
-        whole.target.turned_before(steps[:, 6:12]),
-        whole.change + steps[:, 12:],
+        solution.camera.turned_before(steps[:, :6]),
+        solution.target.turned_before(steps[:, 6:12]),
+        solution.change + steps[:, 12:],
         information=left,
     )
 
@@ -488,9 +493,9 @@ def pull(robot: RobotPoses, seen: Observations, at: Solution, numbers: tuple[int
     change[: seen.extra] = at.change
     spread = freed if at.noise is None else freed.spread(at.noise.shared)
     corrections = at.corrections if at.corrections.size else none
-    there = dataclasses.replace(at, change=change, corrections=corrections)
-    whole, fitted = _normal(robot, spread, there).reduced()[0], 12 + seen.extra
-    slopes: Array = -solve_scaled(whole[:fitted, :fitted], whole[:fitted, fitted:])[:12]
+    point = dataclasses.replace(at, change=change, corrections=corrections)
+    normal, fitted = _normal(robot, spread, point).reduced()[0], 12 + seen.extra
+    slopes: Array = -solve_scaled(normal[:fitted, :fitted], normal[:fitted, fitted:])[:12]
     return slopes
 
 

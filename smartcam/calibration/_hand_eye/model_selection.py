@@ -121,8 +121,8 @@ class Problem:
         The error of a point in a view is the distance, in the target's plane, between its ray and
         the point. Without views it is the distance of the target's origin.
         """
-        off = np.linalg.norm(self.off(solution), axis=2)
-        return [one[mask] for one, mask in zip(off, self.mask, strict=True)]
+        errors = np.linalg.norm(self.off(solution), axis=2)
+        return [view_errors[mask] for view_errors, mask in zip(errors, self.mask, strict=True)]
 
     def off(self, solution: Solution) -> Array:
         """Return the errors as vectors, (V, N, 3), metres; 0 for points that do not exist.
@@ -132,23 +132,28 @@ class Problem:
         expected = carried(solution.camera, self.robot, solution.target)
         change = solution.change
         each = change.ndim > 1
-        scales = [self.seen.scale(one) for one in (change if each else change[None])]
+        scales = [self.seen.scale(step) for step in (change if each else change[None])]
         if self.given is None or not isinstance(self.seen, PixelObservations):
             away = expected.translation - np.reshape(scales, (-1, 1)) * self.poses.translation
             return np.asarray(away[:, None], dtype=np.float64)
         points = np.reshape(scales, (-1, 1, 1)) * self.seen.points
         if each and any(self.seen.free):
             one_each = zip(change, self.seen.pixels, strict=True)
-            rays = np.stack([self.seen.camera(one).directions(seen) for one, seen in one_each])
+            rays = np.stack(
+                [
+                    self.seen.camera(change_and_seen).directions(seen)
+                    for change_and_seen, seen in one_each
+                ]
+            )
         else:
             camera = self.seen.camera(change[0] if each else change)
             rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(
                 self.seen.pixels.shape
             )
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
-        off: Array = on_plane(rays, *expected) - points
-        off[~self.given] = 0.0
-        return off
+        residuals: Array = on_plane(rays, *expected) - points
+        residuals[~self.given] = 0.0
+        return residuals
 
 
 def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array) -> Array:
@@ -159,8 +164,8 @@ def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array)
     metres.
     """
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
-    off: Array = np.linalg.norm(on_plane(rays, *seen) - points, axis=1)
-    return off
+    errors: Array = np.linalg.norm(on_plane(rays, *seen) - points, axis=1)
+    return errors
 
 
 def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
@@ -175,9 +180,9 @@ def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
     along = (rays @ normal[..., None])[..., 0]
     with np.errstate(all="ignore"):
         reach = (shift * normal).sum(axis=-1)[..., None] / along
-        found: Array = (rays * reach[..., None] - shift[..., None, :]) @ turn
-    found[~(np.isfinite(reach) & (reach > 0))] = np.inf
-    return found
+        points: Array = (rays * reach[..., None] - shift[..., None, :]) @ turn
+    points[~(np.isfinite(reach) & (reach > 0))] = np.inf
+    return points
 
 
 @dataclass(slots=True)
@@ -220,21 +225,25 @@ class Candidate:
 
         ``beside``: how many of them, the last ones, are adjusted in any case.
         """
-        change, whole = self.solution.change, self.solution.information
+        change, information = self.solution.change, self.solution.information
         count = len(change) - beside
-        if whole is None or count <= 0:
+        if information is None or count <= 0:
             return 1.0
         # Wald's test: without an error beside noise, x^T C^-1 x of the K parameters x is chi-square
         # with K degrees of freedom; C^-1 is Schur's complement of the part of X and Z in the
         # information. If noise was estimated from few equations, it follows an F distribution (over
         # K). Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
         # Number of Observations is Large (1943).
-        mixed = whole[:12, 12:]
-        own = whole[12:, 12:] - mixed.T @ solve_scaled(whole[:12, :12], mixed)
+        mixed = information[:12, 12:]
+        information_of_extra = information[12:, 12:] - mixed.T @ solve_scaled(
+            information[:12, :12], mixed
+        )
         if beside:
-            across = own[:count, count:]
-            own = own[:count, :count] - across @ solve_scaled(own[count:, count:], across.T)
-        squares = float(change[:count] @ own @ change[:count])
+            across = information_of_extra[:count, count:]
+            information_of_extra = information_of_extra[:count, :count] - across @ solve_scaled(
+                information_of_extra[count:, count:], across.T
+            )
+        squares = float(change[:count] @ information_of_extra @ change[:count])
         if not math.isfinite(squares):
             return 1.0
         # half of the equations each determine one of the robot's two sigmas
@@ -261,7 +270,7 @@ def candidates(
         plain = _reprojection(besides, _freed(problem, numbers), begin)
         return plain, [plain] if plain else []
     judges = _robots(problem, free, begin)
-    judge = _asked(judges)
+    judge = _best_candidate(judges)
     if judge is None or method == ROBOT:
         return judge, judges
     plain = _reprojection_beside(judge)
@@ -284,33 +293,38 @@ def _reprojection_beside(robot: Candidate) -> Candidate | None:
     change, freed = robot.solution.change, robot.problem
     known = dataclasses.replace(freed, seen=freed.seen.settled(change))
     start = dataclasses.replace(robot.solution, change=np.zeros(0))
-    found = _reprojection(robot.besides, known, start)
-    if found is None or not len(change):
-        return found
-    slopes = pull(known.robot, known.seen, found.solution, freed.seen.free)
-    found.problem, found.solution = freed, dataclasses.replace(found.solution, change=change)
-    if found.others is not None and robot.others is not None:
+    reprojection = _reprojection(robot.besides, known, start)
+    if reprojection is None or not len(change):
+        return reprojection
+    slopes = pull(known.robot, known.seen, reprojection.solution, freed.seen.free)
+    reprojection.problem, reprojection.solution = (
+        freed,
+        dataclasses.replace(reprojection.solution, change=change),
+    )
+    if reprojection.others is not None and robot.others is not None:
         # without a view these values differ, too, and pull camera and target with them
         steps = (robot.others.change - change) @ slopes.T
-        found.others = dataclasses.replace(
-            found.others,
-            camera=found.others.camera.turned_before(steps[:, :6]),
-            target=found.others.target.turned_before(steps[:, 6:]),
+        reprojection.others = dataclasses.replace(
+            reprojection.others,
+            camera=reprojection.others.camera.turned_before(steps[:, :6]),
+            target=reprojection.others.target.turned_before(steps[:, 6:]),
             change=robot.others.change,
         )
-        found.off = freed.off(found.others)
-    return found
+        reprojection.off = freed.off(reprojection.others)
+    return reprojection
 
 
 def _robots(
     problem: Problem, free: Mapping[str, tuple[int, ...]], begin: Solution
 ) -> list[Candidate]:
     """Return candidates that correct the robot's poses, one for each choice of free values."""
-    found: list[Candidate] = []
-    elsewhere = _begin_of_another_size(problem) if any(0 in one for one in free.values()) else None
+    tried: list[Candidate] = []
+    elsewhere = (
+        _begin_of_another_size(problem) if any(0 in freed for freed in free.values()) else None
+    )
     for besides, numbers in free.items():
         freed = _freed(problem, numbers)
-        start = found[0].solution if found and found[0].besides == NOTHING else begin
+        start = tried[0].solution if tried and tried[0].besides == NOTHING else begin
         if elsewhere is not None and 0 in numbers:
             change = np.concatenate([elsewhere.change, np.zeros(len(numbers) - 1)])
             start = dataclasses.replace(elsewhere, change=change)
@@ -318,12 +332,12 @@ def _robots(
             solution = adjust_noisy(freed.robot, freed.seen, start)
         else:
             solution = adjust(freed.robot, freed.seen, start, RobotNoise(problem.sigmas))
-        if (one := _candidate(ROBOT, besides, freed, solution)) is not None:
-            found.append(one)
-    return found
+        if (candidate := _candidate(ROBOT, besides, freed, solution)) is not None:
+            tried.append(candidate)
+    return tried
 
 
-def _asked(judges: Sequence[Candidate]) -> Candidate | None:
+def _best_candidate(judges: Sequence[Candidate]) -> Candidate | None:
     """Return the candidate with the right choice of adjusted values.
 
     Values that cannot be right by chance, but predict no better, or hardly, leave the choice open:
@@ -334,8 +348,8 @@ def _asked(judges: Sequence[Candidate]) -> Candidate | None:
         return None
     plain, *others = judges
     beside, by_error = len(plain.solution.change), operator.attrgetter("held_out")
-    asked = [one for one in others if one.chance(beside) < SIGNIFICANCE_LEVEL]
-    best, *rest = sorted([plain, *asked], key=by_error)
+    significant = [judge for judge in others if judge.chance(beside) < SIGNIFICANCE_LEVEL]
+    best, *rest = sorted([plain, *significant], key=by_error)
     if rest and (best is plain or _gain(best, plain) < SURE_GAIN):
         best.rivals = [rest[0].solution if best is plain else plain.solution]
     return best
@@ -374,19 +388,19 @@ def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
 
 
 def _closed(problem: Problem, name: str, *, exactly: bool = True) -> Solution | None:
-    found = solve_linear(name, problem.robot, problem.poses, exactly=exactly)
-    return None if found is None else Solution(*found, np.zeros(problem.seen.extra))
+    solution = solve_linear(name, problem.robot, problem.poses, exactly=exactly)
+    return None if solution is None else Solution(*solution, np.zeros(problem.seen.extra))
 
 
 def _begin(problem: Problem) -> Solution | None:
     """Return the closed form that fits best."""
     ranked = []
     for number, name in enumerate(LINEAR):
-        one = _closed(problem, name, exactly=False)
-        if one is not None:
-            errors = np.concatenate(problem.errors(one))
-            ranked.append((float(np.median(errors)), number, one))
-    ranked = [one for one in ranked if math.isfinite(one[0])]
+        candidate = _closed(problem, name, exactly=False)
+        if candidate is not None:
+            errors = np.concatenate(problem.errors(candidate))
+            ranked.append((float(np.median(errors)), number, candidate))
+    ranked = [cost_and_start for cost_and_start in ranked if math.isfinite(cost_and_start[0])]
     return min(ranked)[2] if ranked else None
 
 
@@ -409,30 +423,33 @@ def _candidate(method: str, besides: str, problem: Problem, solution: Solution) 
     """Return a candidate with its held-out errors; None if it does not fit."""
     if not math.isfinite(solution.cost):
         return None
-    found = Candidate(method, besides, problem, solution)
+    candidate = Candidate(method, besides, problem, solution)
     if problem.count > MIN_POSES:
-        found.others = without_each(problem.robot, problem.seen, solution)
+        candidate.others = without_each(problem.robot, problem.seen, solution)
         try:
-            found.off = problem.off(found.others)
+            candidate.off = problem.off(candidate.others)
         except CalibrationError:  # without one of the views no lens is left
             return None
-    return found
+    return candidate
 
 
-def _by_closed_form(problem: Problem, name: str, whole: Solution) -> Candidate:
+def _by_closed_form(problem: Problem, name: str, solution: Solution) -> Candidate:
     """Return a closed form with its held-out errors."""
-    found, count = Candidate(name, NOTHING, problem, whole), problem.count
+    candidate, count = Candidate(name, NOTHING, problem, solution), problem.count
     if count <= MIN_POSES:
-        return found
+        return candidate
     numbers = np.arange(count)
-    part, others = numbers % MAX_FOLDS, [whole] * count
+    part, others = numbers % MAX_FOLDS, [solution] * count
     for fold in range(min(count, MAX_FOLDS)):
         other = _closed(problem.taken(numbers[part != fold]), name)
         if other is None:
-            return found
-        others = [other if part[i] == fold else one for i, one in enumerate(others)]
-    found.others = Solution(
-        Rigid.stacked(one.camera for one in others), Rigid.stacked(one.target for one in others)
+            return candidate
+        others = [
+            other if part[i] == fold else other_solution for i, other_solution in enumerate(others)
+        ]
+    candidate.others = Solution(
+        Rigid.stacked(solution_left.camera for solution_left in others),
+        Rigid.stacked(solution_left.target for solution_left in others),
     )
-    found.off = problem.off(found.others)
-    return found
+    candidate.off = problem.off(candidate.others)
+    return candidate

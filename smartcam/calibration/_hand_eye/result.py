@@ -103,10 +103,16 @@ class HandEyeCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = KIND
     _called: ClassVar[str] = "hand-eye calibration"
     _others: ClassVar[storage.Others] = {
-        "frames": (FRAMES, lambda one: (one.robot_poses[0].target, one.robot_poses[0].source)),
+        "frames": (
+            FRAMES,
+            lambda calibration: (
+                calibration.robot_poses[0].target,
+                calibration.robot_poses[0].source,
+            ),
+        ),
         "target": (
             storage.StoredTarget | None,
-            lambda one: one.views[0].target if one.views else None,
+            lambda calibration: calibration.views[0].target if calibration.views else None,
         ),
     }
     _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
@@ -136,17 +142,17 @@ class HandEyeCalibration(storage.SavedCalibration):
         for array in (self.errors, self.leave_one_out, self.covariance):
             array.flags.writeable = False
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = len(self.robot_poses)
         names = ("errors", "leave_one_out", "used", "target_poses")
-        storage.check_counts(found, names, count, called)
-        if self.views and (found["target"] is None or len(self.views) != count):
+        storage.check_counts(fields, names, count, called)
+        if self.views and (fields["target"] is None or len(self.views) != count):
             raise storage.refused(
                 called, f"views: expected {count}, and their target", len(self.views)
             )
         if self.covariance.shape != (12, 12):
-            got = len(self.covariance)
-            raise storage.refused(called, "covariance: expected 12 rows of 12", got)
+            size = len(self.covariance)
+            raise storage.refused(called, "covariance: expected 12 rows of 12", size)
 
     @property
     def target(self) -> Target | None:
@@ -161,17 +167,21 @@ class HandEyeCalibration(storage.SavedCalibration):
     @property
     def allowed(self) -> Allowed:
         """Largest allowed error, as the user gave it or from the target's distance."""
-        distances = [float(np.linalg.norm(one.translation)) for one in self.target_poses]
+        distances = [float(np.linalg.norm(pose.translation)) for pose in self.target_poses]
         return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
 
     def judged(self) -> Judgement:
         """Return the verdict and the advice; with few poses the error says nothing."""
-        held_out, codes = self.held_out_error, {one.code for one in self.warnings}
+        held_out, codes = self.held_out_error, {warning.code for warning in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
         several = "s" * (len(left_out) > 1)
         judgement = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
-            [one for one in self.warnings if not (left_out and one.code == Code.BAD_VIEW)],
+            [
+                warning
+                for warning in self.warnings
+                if not (left_out and warning.code == Code.BAD_VIEW)
+            ],
             worst=1 + self.worst,
             allowed=self.allowed,
             cures=VIEW_CURES,
@@ -246,8 +256,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 the plane in front of the camera; NO_CALIBRATION: the calibration has no lens.
         """
         lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
-        found = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
-        places = plane.apply(found)
+        mapped = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
+        places = plane.apply(mapped)
         check_finite(places, "to_plane: points")
         return places
 
@@ -284,8 +294,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 len(views),
             )
         return tuple(
-            self._errors(as_transform(pose, self._flange).undated(), one)
-            for pose, one in zip(robot_poses, views, strict=True)
+            self._errors(as_transform(pose, self._flange).undated(), view)
+            for pose, view in zip(robot_poses, views, strict=True)
         )
 
     def _errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:
@@ -293,8 +303,8 @@ class HandEyeCalibration(storage.SavedCalibration):
         between = robot_pose.inverse() if in_hand else robot_pose
         seen = self.camera_pose.inverse() @ between @ self.target_pose
         if isinstance(view, Transform):
-            off = seen.translation - self.target_scale * view.translation
-            return np.array([float(np.linalg.norm(off))])
+            distances = seen.translation - self.target_scale * view.translation
+            return np.array([float(np.linalg.norm(distances))])
         lens = self._lens("point_errors")
         check_view(view, lens.size)
         if self.views and view.target != self.views[0].target:
@@ -303,12 +313,12 @@ class HandEyeCalibration(storage.SavedCalibration):
                 self.views[0].target,
                 view.target,
             )
-        found = [
-            point_errors(lens, seen.rigid, one.points, self.target_scale * one.object_points)
-            for one in (view, *([half_turned(view)] if view.target.half_turn_symmetric else []))
+        errors_of_views = [
+            point_errors(lens, seen.rigid, turned.points, self.target_scale * turned.object_points)
+            for turned in (view, *([half_turned(view)] if view.target.half_turn_symmetric else []))
         ]
-        errors = min(found, key=lambda off: float(np.median(off)))
-        return errors if errors is found[0] else errors[::-1]
+        errors = min(errors_of_views, key=lambda view_errors: float(np.median(view_errors)))
+        return errors if errors is errors_of_views[0] else errors[::-1]
 
     @property
     def _flange(self) -> str:
@@ -353,10 +363,10 @@ class HandEyeCalibration(storage.SavedCalibration):
         error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
         return error
 
-    def _lens(self, what: str) -> CameraModel:
+    def _lens(self, label: str) -> CameraModel:
         if self.camera is None:
             raise Code.NO_CALIBRATION.refusal(
-                f"{what}: expected a calibration with the camera's lens, got one from poses of "
+                f"{label}: expected a calibration with the camera's lens, got one from poses of "
                 "the target",
                 "camera",
             )

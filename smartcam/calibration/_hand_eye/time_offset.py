@@ -93,20 +93,20 @@ def estimate_time_offset(
         )
     fit = _Moving(history, views, setup, most)
     everything = np.arange(len(views))
-    found = fit.best(everything)
+    offset = fit.best(everything)
     part = everything % LEFT_OUT_PARTS
     folds = np.unique(part)
-    others = [fit.refined(everything[part != fold], found) for fold in folds]
+    others = [fit.refined(everything[part != fold], offset) for fold in folds]
     scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
-    sigma = max(scatter, fit.least_sigma(found, everything))
-    if abs(found) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
+    sigma = max(scatter, fit.least_sigma(offset, everything))
+    if abs(offset) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
         raise Code.BAD_TIME.refusal(
-            f"time offset: expected views that tell one within {most:g} s, got {found:.3g} s with "
+            f"time offset: expected views that tell one within {most:g} s, got {offset:.3g} s with "
             f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",
             most,
-            found,
+            offset,
         )
-    return TimeOffset(found, sigma, fit.error(0.0, everything), fit.error(found, everything))
+    return TimeOffset(offset, sigma, fit.error(0.0, everything), fit.error(offset, everything))
 
 
 class _Moving:
@@ -117,14 +117,14 @@ class _Moving:
     ) -> None:
         self._history, self._most = history, most
         self._in_hand = is_in_hand(setup, "time offset")
-        self._seen = Rigid.stacked(one.rigid for one in views)
-        for number, one in enumerate(views):
-            if one.at is None:
+        self._views = Rigid.stacked(view.rigid for view in views)
+        for number, view in enumerate(views):
+            if view.at is None:
                 raise Code.BAD_TIME.refusal(
                     f"time offset: expected view {number} with a time, got none", got=None
                 )
-        self._times = [one.at for one in views if one.at is not None]
-        self._arm = float(np.median(np.linalg.norm(self._seen.translation, axis=1)))
+        self._times = [view.at for view in views if view.at is not None]
+        self._arm = float(np.median(np.linalg.norm(self._views.translation, axis=1)))
         check_motion(self._robot(0.0, np.arange(len(views))))
 
     def _robot(self, offset: float, index: NDArray[np.intp]) -> RobotPoses:
@@ -134,7 +134,7 @@ class _Moving:
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
-        robot, seen = self._robot(offset, index), self._seen.taken(index)
+        robot, seen = self._robot(offset, index), self._views.taken(index)
         solution = solve_linear("shah", robot, seen)
         if solution is None:
             return math.inf
@@ -142,23 +142,23 @@ class _Moving:
         squares = (shift**2).sum(axis=1) + self._arm**2 * (turn**2).sum(axis=1)
         return math.sqrt(float(squares.mean()))
 
-    def least_sigma(self, found: float, index: NDArray[np.intp]) -> float:
+    def least_sigma(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the sigma of an offset if all errors were noise; infinite if none is better."""
         # The minimum x of a mean square m + c x^2 of n values with noise m has the variance m/cn.
-        step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -found)
-        least, beside = (self.error(one, index) ** 2 for one in (found, found + step))
+        step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -offset)
+        least, beside = (self.error(time, index) ** 2 for time in (offset, offset + step))
         rise = (beside - least) / step**2
         return math.sqrt(least / (rise * 6 * len(index))) if rise > 0 else math.inf
 
     def best(self, index: NDArray[np.intp]) -> float:
         """Return the best offset of the whole range."""
         tried = np.linspace(-self._most, self._most, COARSE_STEPS)
-        return self.refined(index, min(tried.tolist(), key=lambda one: self.error(one, index)))
+        return self.refined(index, min(tried.tolist(), key=lambda time: self.error(time, index)))
 
-    def refined(self, index: NDArray[np.intp], near: float) -> float:
+    def refined(self, index: NDArray[np.intp], start: float) -> float:
         """Return the best offset near a given one."""
         step = 2.0 * self._most / (COARSE_STEPS - 1)
-        low, high = max(near - step, -self._most), min(near + step, self._most)
+        low, high = max(start - step, -self._most), min(start + step, self._most)
         search = load("scipy.optimize").minimize_scalar
-        minimum = search(lambda one: self.error(one, index), bounds=(low, high), method="bounded")
+        minimum = search(lambda time: self.error(time, index), bounds=(low, high), method="bounded")
         return float(minimum.x)

@@ -87,16 +87,16 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
 
     Raises SHAPE if these are no poses; WRONG_FRAME if they are in several frames, or inverted.
     """
-    what = "pose of the target"
+    label = "pose of the target"
     poses_seen = [
-        as_motion(one, f"{what} {number}", CAMERA, TARGET)
-        for number, one in enumerate(as_list(target_poses, object, what))
+        as_motion(pose, f"{label} {number}", CAMERA, TARGET)
+        for number, pose in enumerate(as_list(target_poses, object, label))
     ]
-    for number, one in enumerate(poses_seen):
-        if one.label != poses_seen[0].label or (one.target, one.source) == (TARGET, CAMERA):
+    for number, pose in enumerate(poses_seen):
+        if pose.label != poses_seen[0].label or (pose.target, pose.source) == (TARGET, CAMERA):
             wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else poses_seen[0].label
             raise Code.WRONG_FRAME.unexpected(
-                f"{what} {number}: expected {wanted}", wanted, one.label
+                f"{label} {number}: expected {wanted}", wanted, pose.label
             )
     return poses_seen
 
@@ -134,8 +134,8 @@ def agreement(problem: Problem) -> Agreed | None:
     for numbers in _parts(problem.count):
         best = _better(problem, numbers, arm, best)
     if best is not None:
-        near = np.flatnonzero(best.off <= 3.0 * best.median)
-        best = _better(problem, near, arm, best)
+        agreeing = np.flatnonzero(best.off <= 3.0 * best.median)
+        best = _better(problem, agreeing, arm, best)
     return best
 
 
@@ -178,11 +178,11 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
     """
     least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
     for numbers, name in itertools.product(_parts(poses.size), CLOSED_FORMS):
-        found = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
-        if found is None:
+        renumbered = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
+        if renumbered is None:
             continue
-        expected = carried(found[0], robot, found[1])
-        as_is, turned = (_apart(one, expected, arm) for one in (poses, poses @ turn))
+        expected = carried(renumbered[0], robot, renumbered[1])
+        as_is, turned = (_apart(turned, expected, arm) for turned in (poses, poses @ turn))
         middle = float(np.median(np.minimum(as_is, turned)))
         if middle < least:
             least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
@@ -216,16 +216,16 @@ def check_poses(problem: Problem) -> Agreed:
     Raises ``WRONG_FRAME`` or ``MIRRORED`` if the poses fit far better when they are read otherwise,
     and ``POOR_FIT`` if they do not fit at all.
     """
-    found = agreement(problem)
-    off = math.inf if found is None else _on_target(problem, found)
+    agreement_found = agreement(problem)
+    error = math.inf if agreement_found is None else _on_target(problem, agreement_found)
     for robot, clear, code, how in _readings(problem.robot):
         other = dataclasses.replace(problem, robot=robot)
         agreed = agreement(other)
         if agreed is None:
             continue
         less = _on_target(other, agreed)
-        if less < most_error(other) and off > clear * less:
-            so = f"{1e3 * off:.3g} mm off" if math.isfinite(off) else "nowhere near"
+        if less < most_error(other) and error > clear * less:
+            so = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
             raise code.refusal(
                 "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
                 f"poses that are {so} so, but {1e3 * less:.3g} mm when read {how}",
@@ -233,23 +233,23 @@ def check_poses(problem: Problem) -> Agreed:
                 less,
             )
     most = most_error(problem)
-    if found is None or off > most:
-        so = f"one {1e3 * off:.3g} mm off" if math.isfinite(off) else "nothing near"
-        raise poor_fit(f"{so}, {1e3 * most:.3g} mm at most expected", off)
-    return found
+    if agreement_found is None or error > most:
+        so = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
+        raise poor_fit(f"{so}, {1e3 * most:.3g} mm at most expected", error)
+    return agreement_found
 
 
-def poor_fit(what: str, off: float | None) -> CalibrationError:
+def poor_fit(label: str, error: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
-    ``what``: description of what came instead. ``off``: error of the target, metres; None if it is
-    not known.
+    ``label``: description of what came instead. ``error``: error of the target, metres; None if
+    it is not known.
     """
     return Code.POOR_FIT.refusal(
-        f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
+        f"hand-eye: expected a camera that sees the target where it is, got {label}: are the poses "
         "those of the views, in their order and in metres, are their angles in the convention that "
         "was read, is the setup right, and is the target numbered from the same end in all views?",
-        got=off,
+        got=error,
     )
 
 

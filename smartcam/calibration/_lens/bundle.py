@@ -98,19 +98,19 @@ class Bundle:
 
     def known(self) -> Bundle:
         """Return the bundle with only the poses to adjust."""
-        lenses = tuple(known_lens(one) for one in self.cameras)
+        lenses = tuple(known_lens(camera) for camera in self.cameras)
         return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
 
     @property
     def lens_columns(self) -> list[slice]:
         """Slices of each camera's unknowns among the shared ones."""
-        ends = np.cumsum([0, *(one.shape[1] for one in self.basis)]).tolist()
+        ends = np.cumsum([0, *(basis.shape[1] for basis in self.basis)]).tolist()
         return [slice(first, last) for first, last in itertools.pairwise(ends)]
 
     @property
     def of_cameras(self) -> int:
         """Number of unknowns of the cameras: the lenses', then 6 of each further camera."""
-        lenses = sum(int(one.shape[1]) for one in self.basis)
+        lenses = sum(int(basis.shape[1]) for basis in self.basis)
         return lenses + (0 if self.rigid else 6 * (len(self.cameras) - 1))
 
     @property
@@ -127,8 +127,10 @@ class Bundle:
         """Return the bundle after steps of the shared unknowns (S,) and of the poses (P, 6)."""
         columns = self.lens_columns
         cameras = tuple(
-            with_lens(camera, lens_values(camera) + basis @ shared[some]) if basis.size else camera
-            for camera, basis, some in zip(self.cameras, self.basis, columns, strict=True)
+            with_lens(camera, lens_values(camera) + basis @ shared[values])
+            if basis.size
+            else camera
+            for camera, basis, values in zip(self.cameras, self.basis, columns, strict=True)
         )
         rig, points = self.rig, self.points
         if not self.rigid and rig.size:
@@ -200,7 +202,7 @@ class AdjustedBundle:
     @property
     def rms(self) -> float:
         """Standard deviation of a coordinate of the residuals, pixels."""
-        squares = sum(float((one**2).sum()) for one in self.residuals)
+        squares = sum(float((residual**2).sum()) for residual in self.residuals)
         return math.sqrt(squares / max(self.freedom, 1))
 
 
@@ -216,10 +218,10 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
     covariance = np.concatenate([sight.view.covariance for sight in sights])
     for _ in range(3):
         adjusted = adjust(bundle, sights, more)
-        found = excess(np.concatenate(adjusted.residuals), covariance, adjusted.freedom)
-        if abs(found - more) <= 0.01 * more:
+        covariance_excess = excess(np.concatenate(adjusted.residuals), covariance, adjusted.freedom)
+        if abs(covariance_excess - more) <= 0.01 * more:
             return adjusted
-        bundle, more = adjusted.bundle, found
+        bundle, more = adjusted.bundle, covariance_excess
     return adjust(bundle, sights, more)
 
 
@@ -264,37 +266,39 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
     # without the pose. The rest is of second order in the pull of the pose on the others.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
     matrix, right, _, _ = adjusted.normal.reduced()
-    count, found = adjusted.bundle.of_cameras, []
-    poses = sorted({one.pose for one in sights})
+    count, left_out = adjusted.bundle.of_cameras, []
+    poses = sorted({sight.pose for sight in sights})
     for pose in poses:
-        own = [one._replace(pose=0) for one in sights if one.pose == pose]
-        whole = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
-        equations = BundleEquations(whole, own, adjusted.more, prior=False)
-        at = equations.normal(whole)
+        sights_of_pose = [sight._replace(pose=0) for sight in sights if sight.pose == pose]
+        bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
+        equations = BundleEquations(bundle, sights_of_pose, adjusted.more, prior=False)
+        at = equations.normal(bundle)
         part = at.reduced()
         wanted = np.column_stack([right - part[1], np.eye(len(right), count)])
         step, by_noise = np.split(solve_scaled(matrix - part[0], wanted), [1], axis=1)
         shared = step[:, 0]
-        without = whole.moved(shared, part[3] - part[2] @ shared)
+        without = bundle.moved(shared, part[3] - part[2] @ shared)
         squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
         squares += float(shared @ part[0] @ shared)
         if (
             len(poses) <= MAX_FEW_POSES
             or not equations.normal(without).cost <= MAX_ONE_STEP_COST_RATIO * squares
         ):
-            without = _fitted_without(adjusted, sights, pose, own)
-        found.append(LeftOut(pose, without, residuals(without, own), by_noise[:count]))
-    return found
+            without = _fitted_without(adjusted, sights, pose, sights_of_pose)
+        left_out.append(
+            LeftOut(pose, without, residuals(without, sights_of_pose), by_noise[:count])
+        )
+    return left_out
 
 
 def _fitted_without(
-    adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, own: Sequence[Sight]
+    adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, sights_of_pose: Sequence[Sight]
 ) -> Bundle:
     """Fit the cameras to all views but those of one pose, then this pose to its views."""
-    others = [one for one in sights if one.pose != pose]
+    others = [sight for sight in sights if sight.pose != pose]
     anew = adjust(adjusted.bundle, others, adjusted.more, SETTLED_REFIT_RATIO).bundle
     without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
-    at = adjust(without.known(), own, adjusted.more).bundle.poses
+    at = adjust(without.known(), sights_of_pose, adjusted.more).bundle.poses
     return dataclasses.replace(without, poses=at)
 
 
@@ -303,14 +307,14 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
 
     ``left_out``: all poses, each once.
     """
-    changes = [adjusted.bundle.camera_changes(one.bundle) for one in left_out]
-    spreads = np.array([one.by_noise for one in left_out])
+    changes = [adjusted.bundle.camera_changes(pose.bundle) for pose in left_out]
+    spreads = np.array([pose.by_noise for pose in left_out])
     return weighed_jackknife(np.array(changes), spreads, adjusted.by_noise, WEIGHT_POWER)
 
 
 def free_points(sights: Sequence[Sight]) -> int:
     """Return the number of unknowns of the visible points, less 7 for their pose and size."""
-    return 3 * len(np.unique(np.concatenate([one.view.ids for one in sights]))) - 7
+    return 3 * len(np.unique(np.concatenate([sight.view.ids for sight in sights]))) - 7
 
 
 class _Group(NamedTuple):
@@ -326,16 +330,16 @@ class _Group(NamedTuple):
 
 
 def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
-    views, poses = [one.view for one in sights], [one.pose for one in sights]
-    ends = np.cumsum([0, *(len(one.ids) for one in views)])
+    views, poses = [sight.view for sight in sights], [sight.pose for sight in sights]
+    ends = np.cumsum([0, *(len(view.ids) for view in views)])
     return _Group(
         camera,
         poses,
         bounds=[slice(first, last) for first, last in itertools.pairwise(ends.tolist())],
         pose=np.repeat(poses, np.diff(ends)),
-        ids=np.concatenate([one.ids for one in views]),
-        pixels=np.concatenate([one.points for one in views]),
-        white=whitening(np.concatenate([one.covariance for one in views]), more),
+        ids=np.concatenate([view.ids for view in views]),
+        pixels=np.concatenate([view.points for view in views]),
+        white=whitening(np.concatenate([view.covariance for view in views]), more),
     )
 
 
@@ -354,48 +358,53 @@ class BundleEquations:
         *,
         prior: bool = True,
     ) -> None:
-        sides = ([one for one in sights if one.camera == k] for k in range(len(bundle.cameras)))
-        self._groups = [_group(k, some, more) for k, some in enumerate(sides) if some]
-        self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
+        sides = (
+            [sight for sight in sights if sight.camera == k] for k in range(len(bundle.cameras))
+        )
+        self._groups = [_group(k, side, more) for k, side in enumerate(sides) if side]
+        self._unseen = ~np.isin(np.arange(bundle.poses.size), [sight.pose for sight in sights])
         self._meant = sights[0].view.target.points
         self._prior = _prior(self._meant) if prior and bundle.free else None
 
     def normal(self, bundle: Bundle) -> Normal:
         """Return the normal equations."""
-        found, cost = Normal.nothing(bundle.shared, bundle.poses.size, 6), 0.0
-        found.own[self._unseen] = np.eye(6)  # poses without an observation stay as they are
-        matrix, right = found.shared, found.shared_right
+        normal, cost = Normal.nothing(bundle.shared, bundle.poses.size, 6), 0.0
+        normal.own[self._unseen] = np.eye(6)  # poses without an observation stay as they are
+        matrix, right = normal.shared, normal.shared_right
         for group in self._groups:
-            own, jacobian, by_points = self._columns(bundle, group)
-            for pose, some in zip(group.poses, group.bounds, strict=True):
-                rows = jacobian[some]
+            columns, jacobian, by_points = self._columns(bundle, group)
+            for pose, rows_of_pose in zip(group.poses, group.bounds, strict=True):
+                rows = jacobian[rows_of_pose]
                 flat = rows.reshape(-1, rows.shape[2])
                 # derivatives by the pose, by the shared unknowns, and the residuals
                 product = flat.T @ flat
-                found.own[pose] += product[:6, :6]
-                found.own_right[pose] += product[:6, -1]
-                found.mixed[pose][:, own] += product[:6, 6:-1]
-                matrix[np.ix_(own, own)] += product[6:-1, 6:-1]
-                right[own] += product[6:-1, -1]
+                normal.own[pose] += product[:6, :6]
+                normal.own_right[pose] += product[:6, -1]
+                normal.mixed[pose][:, columns] += product[:6, 6:-1]
+                matrix[np.ix_(columns, columns)] += product[6:-1, 6:-1]
+                right[columns] += product[6:-1, -1]
                 cost += float(product[-1, -1])
                 if not bundle.free:
                     continue
-                turned = by_points[some].swapaxes(1, 2)
-                places = bundle.of_cameras + 3 * group.ids[some, None] + np.arange(3)
+                turned = by_points[rows_of_pose].swapaxes(1, 2)
+                places = bundle.of_cameras + 3 * group.ids[rows_of_pose, None] + np.arange(3)
                 between = (turned @ rows).reshape(places.size, -1)
-                matrix[places[:, :, None], places[:, None, :]] += turned @ by_points[some]
-                matrix[np.ix_(places.ravel(), own)] += between[:, 6:-1]
-                matrix[np.ix_(own, places.ravel())] += between[:, 6:-1].T
+                matrix[places[:, :, None], places[:, None, :]] += turned @ by_points[rows_of_pose]
+                matrix[np.ix_(places.ravel(), columns)] += between[:, 6:-1]
+                matrix[np.ix_(columns, places.ravel())] += between[:, 6:-1].T
                 right[places.ravel()] += between[:, -1]
-                found.mixed[pose][:, places.ravel()] += between[:, :6].T
+                normal.mixed[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and self._prior is not None:
             # minimise also |p - nominal|^2 / loose^2, and the same of the whole sheet: see _prior
-            some, off = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
-            pull = self._prior @ off.ravel()
-            matrix[some, some] += self._prior
-            right[some] -= pull
-            cost += float(off.ravel() @ pull)
-        return found._replace(cost=cost if math.isfinite(cost) else math.inf)
+            rows_of_pose, misses = (
+                slice(bundle.of_cameras, bundle.shared),
+                bundle.points - self._meant,
+            )
+            pull = self._prior @ misses.ravel()
+            matrix[rows_of_pose, rows_of_pose] += self._prior
+            right[rows_of_pose] -= pull
+            cost += float(misses.ravel() @ pull)
+        return normal._replace(cost=cost if math.isfinite(cost) else math.inf)
 
     def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
         """Return the indices of a camera's shared unknowns, and the derivatives of its pixels.
@@ -411,24 +420,24 @@ class BundleEquations:
         rotated = (turned + pose.translation[group.pose]) @ rig.rotation.T
         seen = linearize(rotated + rig.translation, bundle.cameras[number])
         by_near = seen.by_point @ rig.rotation
-        own = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
+        places = [np.arange(bundle.shared)[bundle.lens_columns[number]]]
         parts = [pose_changes(by_near, turned), seen.by_lens @ bundle.basis[number]]
         if number and not bundle.rigid:
-            own.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
+            places.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
             parts.append(pose_changes(seen.by_point, rotated))
         parts.append((group.pixels - seen.pixels)[..., None])
         by_point = group.white @ (by_near @ rotation[group.pose]) if bundle.free else by_near
-        return np.concatenate(own), group.white @ np.concatenate(parts, axis=2), by_point
+        return np.concatenate(places), group.white @ np.concatenate(parts, axis=2), by_point
 
 
 def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     """Return the residuals of each view (N, 2), seen minus projected, pixels."""
-    found = []
+    residual_parts = []
     for number, pose, view in sights:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]
-        near = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
-        found.append(view.points - bundle.cameras[number].project(near))
-    return found
+        points_seen = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
+        residual_parts.append(view.points - bundle.cameras[number].project(points_seen))
+    return residual_parts
 
 
 def _prior(nominal: Array) -> Array:
@@ -437,8 +446,12 @@ def _prior(nominal: Array) -> Array:
     Single points are held loosely; their common shift, turn and scale, which move no pixel, firmly.
     """
     spacing = float(np.linalg.norm(nominal[1:] - nominal[0], axis=1).min())
-    near, axes = nominal - nominal.mean(axis=0), np.eye(3)
-    moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
-    whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
-    weights: Array = whole @ whole.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
+    centred, axes = nominal - nominal.mean(axis=0), np.eye(3)
+    moves = [
+        *(np.cross(axis, centred) for axis in axes),
+        *(0.0 * centred + axis for axis in axes),
+        centred,
+    ]
+    motions = np.linalg.qr(np.column_stack([move.ravel() for move in moves]))[0]
+    weights: Array = motions @ motions.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
     return weights + np.eye(3 * len(nominal)) / (LOOSE_SIGMA_RATIO * spacing) ** 2

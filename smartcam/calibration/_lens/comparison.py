@@ -66,17 +66,17 @@ class Lens(NamedTuple):
     views: int = 1
 
     @classmethod
-    def of(cls, one: IntrinsicCalibration | CameraModel) -> Lens:
+    def of(cls, calibration: IntrinsicCalibration | CameraModel) -> Lens:
         """Return the lens of a calibration, or a bare lens; raise ``SHAPE`` for anything else."""
-        if isinstance(one, IntrinsicCalibration):
-            views = sum(fit.used for fit in one.views)
-            return cls(one.camera, one.covariance, one.target_points, views)
-        if isinstance(one, CameraModel):
-            return cls(one)
+        if isinstance(calibration, IntrinsicCalibration):
+            views = sum(fit.used for fit in calibration.views)
+            return cls(calibration.camera, calibration.covariance, calibration.target_points, views)
+        if isinstance(calibration, CameraModel):
+            return cls(calibration)
         raise Code.SHAPE.unexpected(
             "compare: expected calibrations of lenses, or camera models",
             "IntrinsicCalibration or CameraModel",
-            type(one).__name__,
+            type(calibration).__name__,
         )
 
 
@@ -176,7 +176,7 @@ def compare_lenses(
 ) -> LensComparison:
     """Compare two lenses, as :func:`compare` does."""
     check_distance(distance)
-    first, second, far = a.camera, b.camera, distance is None
+    first, second, at_infinity = a.camera, b.camera, distance is None
     if tuple(first.size) != tuple(second.size):
         raise Code.WRONG_SIZE.refusal(
             f"compare: expected lenses of images of one size, got {first.size[0]} x "
@@ -186,15 +186,17 @@ def compare_lenses(
         )
     pixels = places(first.size, shape)
     gauge, bare = _gauge(a, b, distance)
-    motion = _align(first, second, gauge, far=far and bare)
+    motion = _align(first, second, gauge, at_infinity=at_infinity and bare)
     points = points_at(first, pixels.reshape(-1, 2), distance)
-    moved = points @ motion.rotation.T + (0.0 if far else motion.translation)
+    moved = points @ motion.rotation.T + (0.0 if at_infinity else motion.translation)
     difference = _project(second, moved) - pixels.reshape(-1, 2)
     expected, ratio, chance = None, None, None
     if a.covariance is not None and b.covariance is not None:
         aligned = gauge @ motion.rotation.T + motion.translation
-        of_a = sensitivity(first, points, far=far).freed(sensitivity(first, gauge))
-        of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, aligned))
+        of_a = sensitivity(first, points, at_infinity=at_infinity).freed(sensitivity(first, gauge))
+        of_b = sensitivity(second, moved, at_infinity=at_infinity).freed(
+            sensitivity(second, aligned)
+        )
         spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
         difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
         ratio, chance = _judged(difference, spread, a.views + b.views - 2)
@@ -239,7 +241,11 @@ def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     image's centre: in corners without any view, lenses may project so differently that the camera
     would seem turned.
     """
-    finite = [(one.camera, one.points) for one in (a, b) if one.points is not None]
+    finite = [
+        (calibration.camera, calibration.points)
+        for calibration in (a, b)
+        if calibration.points is not None
+    ]
     if not finite:
         size = np.array(a.camera.size, dtype=np.float64)
         pixels = places(a.camera.size, SHAPE).reshape(-1, 2)
@@ -260,21 +266,21 @@ def _cells(camera: CameraModel, points: Array) -> list[int]:
     return cells
 
 
-def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) -> Rigid:
+def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity: bool) -> Rigid:
     """Return the motion after which the second lens projects the gauge's points as the first does.
 
-    ``far``: the points are directions, so the motion is a turn. The method is Gauss-Newton.
+    ``at_infinity``: the points are directions, so the motion is a turn. The method is Gauss-Newton.
     """
     seen, motion = first.project(gauge), IDENTITY
     for _ in range(MAX_STEPS):
         moved = gauge @ motion.rotation.T + motion.translation
-        by_motion = sensitivity(second, moved, far=far).by_motion.reshape(-1, 6)
-        off = (seen - _project(second, moved)).reshape(-1)
-        finite = np.isfinite(off)
+        by_motion = sensitivity(second, moved, at_infinity=at_infinity).by_motion.reshape(-1, 6)
+        residuals = (seen - _project(second, moved)).reshape(-1)
+        finite = np.isfinite(residuals)
         if np.count_nonzero(finite) < len(finite) / 2:
             break
         step = np.asarray(
-            np.linalg.lstsq(by_motion[finite], off[finite], rcond=None)[0], dtype=np.float64
+            np.linalg.lstsq(by_motion[finite], residuals[finite], rcond=None)[0], dtype=np.float64
         )
         motion = motion.turned_after(step)
         if np.abs(by_motion[finite] @ step).max() < SETTLED_PX:
@@ -316,9 +322,9 @@ def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]
         raise Code.OUT_OF_FIELD.refusal(
             "compare: expected lenses that reach the same places of the image, got none", got=0
         )
-    off, moves = difference[finite], spread[finite]
+    residuals, moves = difference[finite], spread[finite]
     back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + MIN_DIFFERENCE_PX**2 * np.eye(2))
-    squares = float(np.einsum("ni,nij,nj->", off, back, off)) / (2 * len(off))
+    squares = float(np.einsum("ni,nij,nj->", residuals, back, residuals)) / (2 * len(residuals))
     gram = np.einsum("nip,nij,njq->pq", moves, back, moves)
     total, power = float(np.trace(gram)), float((gram**2).sum())
     if power <= 0.0:  # nothing of either lens was fitted

@@ -73,7 +73,7 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
 
     Raises ``SHAPE`` if there are fewer than 2 rows or columns, or more than 500.
     """
-    if len(shape) != 2 or not all(2 <= one <= MAX_MAP_SIDE for one in shape):
+    if len(shape) != 2 or not all(2 <= side <= MAX_MAP_SIDE for side in shape):
         raise Code.SHAPE.unexpected(
             f"shape of a map: expected rows and columns, each from 2 to {MAX_MAP_SIDE}",
             (2, MAX_MAP_SIDE),
@@ -93,22 +93,22 @@ def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Arr
     """
     ahead = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
     ahead[~np.isfinite(ahead).all(axis=1)] = [0.0, 0.0, 1.0]
-    off = np.linalg.norm(camera.project(ahead) - pixels, axis=1)
+    distances = np.linalg.norm(camera.project(ahead) - pixels, axis=1)
     points: Array = ahead / np.linalg.norm(ahead, axis=1, keepdims=True) * (distance or 1.0)
-    points[~(off < MAX_ROUND_TRIP_PX)] = np.nan
+    points[~(distances < MAX_ROUND_TRIP_PX)] = np.nan
     return points
 
 
-def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sensitivity:
+def sensitivity(camera: CameraModel, points: Array, *, at_infinity: bool = False) -> Sensitivity:
     """Return the derivatives of the pixels of points (N, 3); NaN where a point is NaN.
 
-    ``far``: the points, in the camera's frame, are directions to points at infinity.
+    ``at_infinity``: the points, in the camera's frame, are directions to points at infinity.
     """
     finite = np.isfinite(points).all(axis=1, keepdims=True)
     safe = np.where(finite, points, [0.0, 0.0, 1.0])
     at = linearize(safe, camera)
     motion = pose_changes(at.by_point, safe)
-    if far:
+    if at_infinity:
         motion[:, :, 3:] = 0.0
     missing = np.where(finite, 0.0, np.nan)[:, :, None]
     return Sensitivity(at.by_lens + missing, motion + missing, at.by_point + missing)

@@ -124,20 +124,20 @@ def suggest_views(
     check_distance(distance)
     camera = calibration.camera
     shown = target or calibration.views[0].view.target
-    found = candidates(camera, shown, roll)
+    suggestions = candidates(camera, shown, roll)
     basis = _fitted(calibration.covariance)
     start, times = _mixed_covariance(calibration, basis)
     weight = basis.T @ _criterion(calibration, distance) @ basis
-    added = _informations(camera, found.poses, shown.points, basis)
+    added = _informations(camera, suggestions.poses, shown.points, basis)
     added = added / (_variance(calibration) * times)
     after = np.linalg.inv(np.linalg.inv(start) + added)
     means = np.sqrt(np.maximum(np.einsum("cij,ji->c", after, weight), 0.0) / 2)
     present = math.sqrt(max(float(np.einsum("ij,ji->", start, weight)), 0.0) / 2)
     return [
         NextView(
-            found.texts[number],
-            Transform(CAMERA, TARGET, *found.poses.taken(number)),
-            found.outlines[number],
+            suggestions.texts[number],
+            Transform(CAMERA, TARGET, *suggestions.poses.taken(number)),
+            suggestions.outlines[number],
             float(means[number]),
             present,
         )
@@ -147,7 +147,7 @@ def suggest_views(
 
 def _variance(calibration: IntrinsicCalibration) -> float:
     """Return the variance of a coordinate in the views so far, pixels^2."""
-    sigmas = np.concatenate([one.view.sigmas for one in calibration.views if one.used])
+    sigmas = np.concatenate([view.view.sigmas for view in calibration.views if view.used])
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
@@ -167,13 +167,13 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it
     comes from the views' scatter, the rest from the noise of the points times that ratio.
     """
-    used = [one for one in calibration.views if one.used]
+    used = [view for view in calibration.views if view.used]
     points = None
     if calibration.sheet is not None:
         points = used[0].view.target.points + calibration.sheet
-    poses = Rigid.stacked(one.transform.rigid for one in used)
+    poses = Rigid.stacked(fit.transform.rigid for fit in used)
     bundle = Bundle.single(calibration.camera, poses, basis, points)
-    sights = [Sight(0, number, one.view) for number, one in enumerate(used)]
+    sights = [Sight(0, number, fit.view) for number, fit in enumerate(used)]
     equations = BundleEquations(bundle, sights, calibration.sigma**2)
     information = equations.normal(bundle).reduced()[0]
     back = np.linalg.pinv(basis)
@@ -188,7 +188,7 @@ def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Arr
     """Return M such that ``trace(C M)`` is the mean variance of a coordinate for a covariance C."""
     camera = calibration.camera
     points = points_at(camera, places(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
-    field = sensitivity(camera, known_points(points), far=distance is None)
+    field = sensitivity(camera, known_points(points), at_infinity=distance is None)
     freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
     criterion: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
     return criterion
@@ -226,7 +226,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
     turned = around @ rotations.swapaxes(1, 2)
-    fills, parts = np.array([way[0] for way in ways]), np.array([way[2:0:-1] for way in ways])
+    fills, parts = np.array([tilt[0] for tilt in ways]), np.array([tilt[2:0:-1] for tilt in ways])
     shifts = _placed(camera, turned, fills, parts)
     poses = Rigid(rotations, shifts - rotations @ centre)
     good = _visible(camera, turned + shifts[:, None])
@@ -273,8 +273,8 @@ def _visible(camera: CameraModel, points: Array) -> Mask:
     inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)
     back = points_at(camera, np.where(inside, seen, 0.0), None)
     ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
-    off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
-    good: Mask = off.max(axis=1) < MAX_SAME_RAY_RADIANS
+    error = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
+    good: Mask = error.max(axis=1) < MAX_SAME_RAY_RADIANS
     return good
 
 

@@ -133,7 +133,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = "camera"
     _called: ClassVar[str] = "calibration of cameras"
     _others: ClassVar[storage.Others] = {
-        "target": (storage.StoredTarget, lambda one: one.views[0].view.target)
+        "target": (storage.StoredTarget, lambda calibration: calibration.views[0].view.target)
     }
 
     camera: CameraModel
@@ -162,7 +162,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(one.view, number) for number, one in enumerate(self.views) if not one.used
+            label(view.view, number) for number, view in enumerate(self.views) if not view.used
         )
 
     def uncertainty(
@@ -192,7 +192,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def target_points(self) -> Array:
         """Places of the target's points in the camera's frame, all used views, (N, 3), metres."""
         return np.concatenate(
-            [one.transform.apply(one.view.object_points) for one in self.views if one.used]
+            [view.transform.apply(view.view.object_points) for view in self.views if view.used]
         )
 
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
@@ -211,7 +211,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
             CalibrationError: ``DIFFERENT_TARGETS``; and those of
                 :func:`~smartcam.calibration.locate`.
         """
-        return tuple(self._errors(one) for one in views)
+        return tuple(self._errors(view) for view in views)
 
     def _errors(self, view: TargetView) -> Array:
         first = self.views[0].view.target
@@ -222,18 +222,18 @@ class IntrinsicCalibration(storage.SavedCalibration):
                 first,
                 view.target,
             )
-        near = Rigid.stacked([locate(view, self.camera).transform.rigid])
+        pose = Rigid.stacked([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else first.points + self.sheet
-        bundle = Bundle.single(self.camera, near, points=points)
+        bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
         storage.check_shape(self.covariance, (count, count), called, "covariance")
-        for one in self.views:
-            storage.check_shape(one.residuals, one.view.points.shape, called, "residuals")
+        for view in self.views:
+            storage.check_shape(view.residuals, view.view.points.shape, called, "residuals")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
 @takes(
@@ -300,13 +300,13 @@ def calibrate_intrinsics(
         del used[worst]
     check_tilts(adjusted, "intrinsics")
     bad = [used[worst]] if ratio > BAD_VIEW_RATIO else []
-    found = _summary(
+    calibration = _summary(
         given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
     )
     turned = list[str]()
     target = given[0].target
     if target.half_turn_symmetric and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
-        found, turned = _numbered_alike(found, distortion_model, fixed_names, sheet)
+        calibration, turned = _numbered_alike(calibration, distortion_model, fixed_names, sheet)
     again = functools.partial(
         calibrate_intrinsics,
         distortion_model=distortion_model,
@@ -314,67 +314,69 @@ def calibrate_intrinsics(
         sheet=sheet,
         drop_bad=drop_bad,
     )
-    found = examined(found, again, drop=drop_bad)
+    calibration = examined(calibration, again, drop=drop_bad)
     if not turned:
-        return found
+        return calibration
     remark = Code.SHEET_NOT_EXACT.remark(
         f"the target looks the same after half a turn, and its shape shows that {', '.join(turned)}"
         " numbered it from its other end than the rest; they are numbered as the rest here"
     )
-    return dataclasses.replace(found, warnings=(*found.warnings, remark))
+    return dataclasses.replace(calibration, warnings=(*calibration.warnings, remark))
 
 
 def _numbered_alike(
-    found: IntrinsicCalibration, model: DistortionModel, held: tuple[str, ...], sheet: Sheet
+    calibration: IntrinsicCalibration, model: DistortionModel, held: tuple[str, ...], sheet: Sheet
 ) -> tuple[IntrinsicCalibration, list[str]]:
     """Return the calibration from views numbered from one end, and the names of turned views.
 
     Without turned views, and if the shape of the sheet does not explain far more then, the
-    calibration is ``found``.
+    calibration is ``calibration``.
     """
     # Shape and numbers are fitted in turn, which only lowers the squares: Lloyd, as for flips.
-    views = [one.view for one in found.views]
-    used = [number for number, one in enumerate(found.views) if one.used]
+    views = [view.view for view in calibration.views]
+    used = [number for number, view in enumerate(calibration.views) if view.used]
     bad = sorted(set(range(len(views))) - set(used))
     numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
-    shaped = found
+    shaped = calibration
     for _ in range(MAX_ROUNDS):
         lens = fit_lens([numbered[i] for i in used], model, held)
         shaped = _summary(numbered, used, lens, bad, "free")
         wrong = np.zeros(len(views), dtype=np.bool_)
         for number in used:
             both = numbered[number], half_turned(numbered[number])
-            as_is, other = (float((off**2).sum()) for off in shaped.point_errors(both))
+            as_is, other = (float((errors**2).sum()) for errors in shaped.point_errors(both))
             wrong[number] = other < as_is
         if not wrong.any():
             break
         turned ^= wrong
-        numbered = [half_turned(one) if turned[i] else one for i, one in enumerate(views)]
-    if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * found.rms:
-        return found, []
+        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
+    if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * calibration.rms:
+        return calibration, []
     if 2 * turned.sum() > len(turned):
         turned = ~turned
-        numbered = [half_turned(one) if turned[i] else one for i, one in enumerate(views)]
+        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
     lens = fit_lens([numbered[i] for i in used], model, held)
     better = _summary(numbered, used, lens, bad, sheet)
-    names = [label(one, i) for i, one in enumerate(views) if turned[i]]
-    return (found, []) if better.sheet is None else (better, names)
+    names = [label(view, i) for i, view in enumerate(views) if turned[i]]
+    return (calibration, []) if better.sheet is None else (better, names)
 
 
 def check_views(
-    views: Sequence[TargetView], what: str, least: int, size: tuple[int, int] | None = None
+    views: Sequence[TargetView], called: str, least: int, size: tuple[int, int] | None = None
 ) -> None:
-    """Refuse views that do not belong together, and unusable ones; ``what`` is for messages.
+    """Refuse views that do not belong together, and unusable ones; ``called``: name for errors.
 
     ``least``: least number of views. ``size``: size of the images, pixels; None: that of the first.
     Raises ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
     if len(views) < least:
-        raise Code.TOO_FEW.unexpected(f"{what}: expected {least} views or more", least, len(views))
+        raise Code.TOO_FEW.unexpected(
+            f"{called}: expected {least} views or more", least, len(views)
+        )
     for number, view in enumerate(views):
         if view.target != views[0].target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"{what}: expected views of one target, {views[0].target}, got {view.target} in "
+                f"{called}: expected views of one target, {views[0].target}, got {view.target} in "
                 f"{label(view, number)}",
                 views[0].target,
                 view.target,
@@ -385,12 +387,12 @@ def check_views(
 def _check_motion(views: Sequence[TargetView]) -> None:
     """Refuse views that are all nearly the same."""
     least, largest = MIN_MOTION_SHARE * max(views[0].size), 0.0
-    for one in views[1:]:
-        common, first, second = np.intersect1d(views[0].ids, one.ids, return_indices=True)
+    for view in views[1:]:
+        common, first, second = np.intersect1d(views[0].ids, view.ids, return_indices=True)
         if not len(common):
             return
-        off = views[0].points[first] - one.points[second]
-        largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
+        distances = views[0].points[first] - view.points[second]
+        largest = max(largest, float(np.linalg.norm(distances, axis=1).max()))
     if largest < least:
         raise Code.POSES_TOO_SIMILAR.refusal(
             f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "
@@ -400,17 +402,17 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         )
 
 
-def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
+def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
     """Refuse views of parallel planes, and a focal length that is not determined.
 
-    Raises ``INSUFFICIENT_ROTATION``; ``what`` is for messages.
+    Raises ``INSUFFICIENT_ROTATION``; ``label`` is for messages.
     """
     normals = adjusted.bundle.poses.rotation[:, :, 2]
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
     tilt = math.asin(min(1.0, float(sines.max())))
     if tilt < MIN_TILT_RADIANS:
         raise Code.INSUFFICIENT_ROTATION.refusal(
-            f"{what}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
+            f"{label}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
             f"or more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
             "focal length open",
             MIN_TILT_RADIANS,
@@ -422,7 +424,7 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
     relative = math.sqrt(max(float(spread[0, 0]), 0.0)) / length
     if relative > MAX_FOCAL_SIGMA_RATIO:
         raise Code.INSUFFICIENT_ROTATION.refusal(
-            f"{what}: expected views that tell the focal length to "
+            f"{label}: expected views that tell the focal length to "
             f"{MAX_FOCAL_SIGMA_RATIO:.0%}, got {length:.5g} pixels with a standard deviation of "
             f"{relative:.2g} of it: tilt the "
             "target more, and show it nearer",
@@ -433,13 +435,13 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
 
 def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[int, float]:
     """Return the worst view, and its weighted RMS over the median of the others."""
-    found = [
+    errors = [
         weighted_rms(view, residuals, adjusted.more)
         for view, residuals in zip(views, adjusted.residuals, strict=True)
     ]
-    worst = int(np.argmax(found))
-    others = float(np.median(np.delete(found, worst)))
-    return worst, found[worst] / others if others > 0 else 1.0
+    worst = int(np.argmax(errors))
+    others = float(np.median(np.delete(errors, worst)))
+    return worst, errors[worst] / others if others > 0 else 1.0
 
 
 def weighted_rms(view: TargetView, residuals: Array, more: float) -> float:
@@ -464,7 +466,8 @@ def _summary(
     sights = [Sight(0, number, view) for number, view in enumerate(of_used)]
     shape = choose_shape(adjusted, sights, sheet)
     errors = [
-        view_rms(one.residuals[0]) if len(used) > MIN_VIEWS else math.nan for one in shape.left_out
+        view_rms(left.residuals[0]) if len(used) > MIN_VIEWS else math.nan
+        for left in shape.left_out
     ]
     adjusted, bundle = shape.adjusted, shape.adjusted.bundle
     camera, basis = bundle.cameras[0], bundle.basis[0]
@@ -561,6 +564,6 @@ def _remarks(
         )
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{sum(one.used for one in calibration.views)} views are no more than a lens has need "
-            "of: none can be left out to see how good it is"
+            f"{sum(view.used for view in calibration.views)} views are no more than a lens "
+            "has need of: none can be left out to see how good it is"
         )

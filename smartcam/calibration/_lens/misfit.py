@@ -147,13 +147,17 @@ class Reduced(NamedTuple):
     def of(cls, equations: Sequence[Equations]) -> Reduced:
         """Return the equations of views after eliminating the pose of each."""
         parts = []
-        for one in equations:
-            rows = one.by_pose.reshape(-1, 6)
-            rest = np.column_stack([one.by_shared.reshape(len(rows), -1), one.residuals.ravel()])
-            rest = rest - rows @ solve_scaled(rows.T @ rows, rows.T @ rest)
-            parts.append(rest.T @ rest)
-        found = np.array(parts)
-        return cls(found[:, :-1, :-1], found[:, :-1, -1], found[:, -1, -1])
+        for equation in equations:
+            rows = equation.by_pose.reshape(-1, 6)
+            rows_of_shared = np.column_stack(
+                [equation.by_shared.reshape(len(rows), -1), equation.residuals.ravel()]
+            )
+            rows_of_shared = rows_of_shared - rows @ solve_scaled(
+                rows.T @ rows, rows.T @ rows_of_shared
+            )
+            parts.append(rows_of_shared.T @ rows_of_shared)
+        sums = np.array(parts)
+        return cls(sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1])
 
     def misfits(self, change: Array) -> Array:
         """Return the weighted squares of each view (V,) if the values change by (L,)."""
@@ -167,11 +171,11 @@ class Reduced(NamedTuple):
         """
         # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
-        for whole, side in zip(self.matrix, self.right, strict=True) if places else ():
-            own = whole[np.ix_(places, places)]
-            both = solve_scaled(own, np.column_stack([whole[places], side[places]]))
-            matrix = matrix - whole[:, places] @ both[:, :-1]
-            right = right - whole[:, places] @ both[:, -1]
+        for sums_matrix, side in zip(self.matrix, self.right, strict=True) if places else ():
+            reduced = sums_matrix[np.ix_(places, places)]
+            both = solve_scaled(reduced, np.column_stack([sums_matrix[places], side[places]]))
+            matrix = matrix - sums_matrix[:, places] @ both[:, :-1]
+            right = right - sums_matrix[:, places] @ both[:, -1]
             squares = squares - side[places] @ both[:, -1]
         basis = np.eye(len(right))[:, free]
         change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
@@ -204,7 +208,7 @@ class _FlippedLens(NamedTuple):
         basis = np.eye(len(self.mirror))[:, free]
         as_is = mirrored = reduced.squares
         for _ in range(MAX_ROUNDS):
-            plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
+            plain, other = (reduced.matrix[mask].sum(axis=0) for mask in (~flipped, flipped))
             back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
             matrix = plain + self.mirror[:, None] * other * self.mirror
             right = reduced.right[~flipped].sum(axis=0) + back
@@ -224,9 +228,9 @@ class _Misfit:
     def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
         """``free`` (COUNT,): mask of the values that were fitted."""
         self.reduced = Reduced.of(equations)
-        self._count, views = sum(one.residuals.size for one in equations), len(equations)
-        there = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
-        self.usual, bends = free & there, there.copy()
+        self._count, views = sum(equation.residuals.size for equation in equations), len(equations)
+        adjusted = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
+        self.usual, bends = free & adjusted, adjusted.copy()
         self.usual[SHEET], bends[: IMAGE.start] = True, False
         best = self.reduced.best
         explained = {
@@ -235,10 +239,13 @@ class _Misfit:
             "a lens of another model": (best(self.usual | bends)[1], float(bends.sum())),
         }
         self._before = best(self.usual)[1]
-        self._best = min(self.score(*one) for one in [(self._before, 0), *explained.values()])
+        self._best = min(
+            self.score(*score_and_count)
+            for score_and_count in [(self._before, 0), *explained.values()]
+        )
         self._others = ", ".join(
-            f"{what} {self._before / max(after, 1e-300):.3g}"
-            for what, (after, _) in explained.items()
+            f"{name} {self._before / max(after, 1e-300):.3g}"
+            for name, (after, _) in explained.items()
         )
 
     def score(self, squares: float, unknowns: float) -> float:
@@ -276,17 +283,19 @@ class _Misfit:
         for first in range(2, len(names) - 1):
             parts = [slice(None, first), slice(first, None)]
             sums = Reduced(
-                *(np.array([part[some].sum(axis=0) for some in parts]) for part in self.reduced)
+                *(np.array([part[mask].sum(axis=0) for mask in parts]) for part in self.reduced)
             )
-            tried += [(sums.best(self.usual, some)[1], first, how) for how, some in changes.items()]
+            tried += [
+                (sums.best(self.usual, places)[1], first, how) for how, places in changes.items()
+            ]
         after, first, best = min(tried)
         least = self.score(after, len(changes[best]) + 1) + MIN_CHANGE_EVIDENCE
         if not self.offer(after, len(changes[best]) + 1, evidence=MIN_CHANGE_EVIDENCE):
             return
         alike = [
             how
-            for some, one, how in sorted(tried)
-            if one == first and self.score(some, len(changes[how]) + 1) < least
+            for changed, moment, how in sorted(tried)
+            if moment == first and self.score(changed, len(changes[how]) + 1) < least
         ]
         code = Code.POOR_FIT if alike == [MOVED] else Code.WRONG_LENS
         yield code.remark(
@@ -307,7 +316,7 @@ def misfit_remarks(
     Blunders are a change of the camera from one view on and flipped pictures; of a pair also
     cameras that move against each other, and views of different moments. In a flipped picture a
     board is found as well if it looks the same in a mirror; its points are then those of a camera
-    with a mirrored lens. But such a large misfit may have other causes: each cause is fitted, and
+    with a mirrored lens. But a large misfit may have other causes: each cause is fitted, and
     the best one counts.
 
     ``fitted``: the view, or the left and the right one of a pair, at each moment. ``more``:
@@ -316,18 +325,24 @@ def misfit_remarks(
     """
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
-    equations = [[one.equations(more) for one in views] for views in fitted]
-    joined = [Equations(*map(np.concatenate, zip(*one, strict=True))) for one in equations]
+    equations = [[view.equations(more) for view in views] for views in fitted]
+    joined = [
+        Equations(*map(np.concatenate, zip(*equation, strict=True))) for equation in equations
+    ]
     misfit, apart = _Misfit(joined, free), False
     reduced, usual, changes = misfit.reduced, misfit.usual, {ZOOMED: LENS[:4]}
     if len(fitted[0]) > 1:
         sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
-        changes = {f"{one} camera: {ZOOMED}": some for one, some in sides.items() if usual[some[0]]}
+        changes = {
+            f"{side} camera: {ZOOMED}": score_and_count
+            for side, score_and_count in sides.items()
+            if usual[score_and_count[0]]
+        }
         changes[MOVED] = RIG
         after = reduced.best(usual, RIG)[1]
         apart = misfit.offer(after, len(RIG) * len(fitted), APART_COST_RATIO)
-    if found := list(misfit.changed(changes, names)):
-        yield from found
+    if remarks := list(misfit.changed(changes, names)):
+        yield from remarks
     elif apart:
         yield Code.NOT_SIMULTANEOUS.remark(
             "the views of each pair do not belong together: did the target move between the two, "
@@ -363,19 +378,19 @@ def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
         yield np.abs(wish) > 3 * np.median(np.abs(wish))
 
 
-def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[Remark]:
+def lens_remarks(fitted: Sequence[Fitted], label: str, more: float) -> Iterator[Remark]:
     """Yield a remark if a known lens is not the camera's (``WRONG_LENS``).
 
-    ``fitted``: views through that lens; ``what``: name of the lens, for messages; ``more``:
+    ``fitted``: views through that lens; ``label``: name of the lens, for messages; ``more``:
     variance in addition to the points' own, pixels^2.
     """
     if len(fitted) < MIN_VIEWS_FOR_LENS:
         return
-    equations = [one.equations(more) for one in fitted]
+    equations = [view.equations(more) for view in fitted]
     reduced = Reduced.of(equations)
     before, after = float(reduced.squares.sum()), reduced.best(LENSES)[1]
     if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(
-            f"the {what} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
+            f"the {label} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
             "the residuals of one that is fitted to its views: is it this camera's, at this focus?"
         )

@@ -101,24 +101,29 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     checked(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
     sights = [Sight(0, 0, view)]
-    found = [
+    adjusted = [
         adjust(Bundle.single(camera, start), sights, 0.0) for start in plane_poses(view, camera)
     ]
-    found = sorted(
-        (one for one in found if math.isfinite(one.weighted)), key=lambda one: one.weighted
+    adjusted = sorted(
+        (bundle for bundle in adjusted if math.isfinite(bundle.weighted)),
+        key=lambda bundle: bundle.weighted,
     )
-    if not found:
+    if not adjusted:
         raise Code.POOR_FIT.refusal(
             f"pose of the target{_of(view)}: expected one in front of the camera that shows its "
             f"{len(view.ids)} points where they are, got none",
             "a pose in front of the camera",
         )
-    more = excess(found[0].residuals[0], view.covariance, found[0].freedom)
+    more = excess(adjusted[0].residuals[0], view.covariance, adjusted[0].freedom)
     if more:
-        found = [adjust(one.bundle, sights, more) for one in found]
-    best, pose = found[0], found[0].bundle.poses
+        adjusted = [adjust(bundle.bundle, sights, more) for bundle in adjusted]
+    best, pose = adjusted[0], adjusted[0].bundle.poses
     other = next(
-        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
+        (
+            bundle
+            for bundle in adjusted[1:]
+            if pose.angle_to(bundle.bundle.poses)[0] > MAX_SAME_TURN_RADIANS
+        ),
         None,
     )
     rms = view_rms(best.residuals[0])
@@ -132,8 +137,8 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     )
 
 
-def _transform(one: AdjustedBundle) -> Transform:
-    return Transform(CAMERA, TARGET, *one.bundle.poses.taken(0))
+def _transform(bundle: AdjustedBundle) -> Transform:
+    return Transform(CAMERA, TARGET, *bundle.bundle.poses.taken(0))
 
 
 def view_rms(residuals: Array) -> float:
@@ -174,15 +179,15 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
 def _check_inside(view: TargetView, called: str) -> None:
     """Raise ``WRONG_SIZE`` for points that are far outside of the image."""
     sides = np.array(view.size)
-    off = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
-    row = int(np.argmax(off))
-    if off[row] > MAX_OUTSIDE_RATIO:
-        got = view.points[row].tolist()
+    outside = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
+    row = int(np.argmax(outside))
+    if outside[row] > MAX_OUTSIDE_RATIO:
+        point = view.points[row].tolist()
         raise Code.WRONG_SIZE.refusal(
-            f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, got {got} "
-            f"in row {row}",
+            f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, "
+            f"got {point} in row {row}",
             view.size,
-            got,
+            point,
         )
 
 
@@ -230,12 +235,12 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     Source: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation (2014).
     """
     rays = camera.directions(view.points)
-    found = _ippe(view.object_points, rays)
-    if not found:  # with exact rays OpenCV would take the root of a negative rounding error
-        found = _ippe(
+    poses = _ippe(view.object_points, rays)
+    if not poses:  # OpenCV takes the root of a difference, which may be negative for exact rays
+        poses = _ippe(
             view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
         )
-    return found
+    return poses
 
 
 def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
@@ -247,12 +252,12 @@ def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
 
 
 def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
-    found = [one.taken(0) for one in plane_poses(view, camera)]
-    off = (camera.project(one.apply(view.object_points)) - view.points for one in found)
-    squares = [float(np.nan_to_num((one**2).sum(), nan=math.inf)) for one in off]
+    poses = [pose.taken(0) for pose in plane_poses(view, camera)]
+    residuals = (camera.project(pose.apply(view.object_points)) - view.points for pose in poses)
+    squares = [float(np.nan_to_num((squares**2).sum(), nan=math.inf)) for squares in residuals]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]
     if math.isfinite(best) and second > MAX_UNSURE_RATIO * best:
-        return found[squares.index(best)]
+        return poses[squares.index(best)]
     return locate(view, camera).transform.rigid
 
 

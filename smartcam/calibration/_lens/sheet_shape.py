@@ -64,7 +64,10 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
     free = adjust_shape(adjusted.bundle, sights, adjusted.more)
-    left_out, off = leave_out(free, sights), _off(free.bundle, sights[0].view.target.points)
+    left_out, distances = (
+        leave_out(free, sights),
+        _adjustment(free.bundle, sights[0].view.target.points),
+    )
     # the simpler one, unless the other is better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
     gains = _squares(exact.left_out) - _squares(left_out)
@@ -72,26 +75,28 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
         ddof=1
     )
     if sheet == "free" or (sheet == "auto" and better):
-        remarks = [_remark(off, "the print or the board is not exact")] if better else []
-        return Shape(free, left_out, off, remarks)
+        remarks = [_remark(distances, "the print or the board is not exact")] if better else []
+        return Shape(free, left_out, distances, remarks)
     done = "it is taken as exact all the same, which sheet='auto' does not"
-    return exact._replace(remarks=[_remark(off, done)] if better else [])
+    return exact._replace(remarks=[_remark(distances, done)] if better else [])
 
 
-def _off(bundle: Bundle, nominal: Array) -> Array:
+def _adjustment(bundle: Bundle, nominal: Array) -> Array:
     return np.zeros(nominal.shape) if bundle.points is None else bundle.points - nominal
 
 
 def _squares(left_out: Sequence[LeftOut]) -> Array:
-    return np.array([sum(float((some**2).sum()) for some in one.residuals) for one in left_out])
+    return np.array(
+        [sum(float((residuals**2).sum()) for residuals in left.residuals) for left in left_out]
+    )
 
 
-def _remark(off: Array, what: str) -> Remark:
-    rms = 1e3 * math.sqrt(float((off**2).sum(axis=1).mean()))
-    most = 1e3 * float(np.linalg.norm(off, axis=1).max())
+def _remark(distances: Array, label: str) -> Remark:
+    rms = 1e3 * math.sqrt(float((distances**2).sum(axis=1).mean()))
+    most = 1e3 * float(np.linalg.norm(distances, axis=1).max())
     return Code.SHEET_NOT_EXACT.remark(
         f"the sheet's points are {rms:.2g} mm rms from their nominal places, {most:.2g} mm "
-        f"at most: {what}"
+        f"at most: {label}"
     )
 
 
@@ -136,8 +141,8 @@ def best_similarity(points: Array, nominal: Array) -> tuple[float, Array, Array]
     # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
     # Patterns (1991).
     middle = points.mean(axis=0)
-    near, far = points - middle, nominal - nominal.mean(axis=0)
-    left, _, right = np.linalg.svd(far.T @ near)
+    centred, nominal_centred = points - middle, nominal - nominal.mean(axis=0)
+    left, _, right = np.linalg.svd(nominal_centred.T @ centred)
     turn = left @ np.diag([1.0, 1.0, math.copysign(1.0, np.linalg.det(left @ right))]) @ right
-    size = float(((near @ turn.T) * far).sum() / (near**2).sum())
+    size = float(((centred @ turn.T) * nominal_centred).sum() / (centred**2).sum())
     return size, turn, nominal.mean(axis=0) - size * turn @ middle

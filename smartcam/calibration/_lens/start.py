@@ -51,21 +51,21 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
     ``fixed``: names of coefficients that stay 0; ``aspect``: fx and fy are one unknown. Raises
     ``SHAPE`` if there is no such model, or if it has no coefficient of that name.
     """
-    names, own, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
-    unknown = sorted(fixed_names.difference(own, {"aspect"}))
+    names, own_names, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
+    unknown = sorted(fixed_names.difference(own_names, {"aspect"}))
     if unknown:
         raise Code.SHAPE.refusal(
-            f"fixed: expected coefficients of {model} ({', '.join(own)}) or aspect, got "
+            f"fixed: expected coefficients of {model} ({', '.join(own_names)}) or aspect, got "
             f"{', '.join(unknown)}",
-            [*own, "aspect"],
+            [*own_names, "aspect"],
             unknown,
         )
     columns = np.eye(len(names))
     if "aspect" in fixed_names:
         columns[:, 0] += columns[:, 1]
         fixed_names.add("fy")
-    kept: Array = columns[:, [name not in fixed_names for name in names]]
-    return kept
+    basis: Array = columns[:, [name not in fixed_names for name in names]]
+    return basis
 
 
 def fit_lens(
@@ -92,7 +92,7 @@ def fit_lens(
             f"from focal lengths of {min(FOCAL_LENGTHS[1:])} to {max(FOCAL_LENGTHS[1:])} image "
             "widths"
         )
-    return min(fits, key=lambda one: one.rms)
+    return min(fits, key=lambda candidate: candidate.rms)
 
 
 def _fit(
@@ -131,12 +131,12 @@ def _first(
         getattr(space, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
     )
     start = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
-    _, found, bends, *_ = calibrate(
+    _, matrix_found, bends, *_ = calibrate(
         points, pixels, (width, height), matrix, start, flags=flags, criteria=stop
     )
     distortion = np.zeros(COEFFICIENTS[model])
     distortion[: bends.size] = bends.ravel()
-    found[0, 1] = 0.0
+    matrix_found[0, 1] = 0.0
     return CameraModel(
-        size=(width, height), matrix=found, distortion=distortion, distortion_model=model
+        size=(width, height), matrix=matrix_found, distortion=distortion, distortion_model=model
     )

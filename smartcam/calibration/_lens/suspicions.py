@@ -73,7 +73,7 @@ DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
 image."""
 
 DOUBTED_CENTRE_SIGMAS: Final = 5.0
-"""Such a principal point is doubted only if it is this many standard deviations off the centre."""
+"""Least distance of a doubted principal point from the centre, in standard deviations."""
 
 
 class Stray(NamedTuple):
@@ -95,31 +95,32 @@ def strays(
     the lens was fitted to the views; if not, a point is no stray when a lens that fits the other
     points predicts its place.
     """
-    equations = [one.equations(more) for one in fitted]
-    off = _stray_squares(equations, used)
-    if not lens and any(one.any() for one in off):
-        equations = _with_their_lens(equations, [one == 0 for one in off])
-        off = _stray_squares(equations, used)
-    found = []
-    for number, (one, squares) in enumerate(zip(equations, off, strict=True)):
+    equations = [view.equations(more) for view in fitted]
+    squares_of_views = _stray_squares(equations, used)
+    if not lens and any(squares.any() for squares in squares_of_views):
+        equations = _with_their_lens(equations, [squares == 0 for squares in squares_of_views])
+        squares_of_views = _stray_squares(equations, used)
+    outliers = []
+    for number, (equation, squares) in enumerate(zip(equations, squares_of_views, strict=True)):
         for row in np.flatnonzero(squares).tolist():
-            pixels = float(one.deviations[row]) * math.sqrt(squares[row])
-            found.append(Stray(number, row, int(fitted[number].view.ids[row]), pixels))
-    return found
+            pixels = float(equation.deviations[row]) * math.sqrt(squares[row])
+            outliers.append(Stray(number, row, int(fitted[number].view.ids[row]), pixels))
+    return outliers
 
 
-def _with_their_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> list[Equations]:
+def _with_their_lens(equations: Sequence[Equations], masks: Sequence[Mask]) -> list[Equations]:
     """Return the equations after fitting the lens to the kept points."""
-    some = [
-        Equations(*(part[rows] for part in one)) for one, rows in zip(equations, kept, strict=True)
+    masked = [
+        Equations(*(part[rows] for part in equation))
+        for equation, rows in zip(equations, masks, strict=True)
     ]
-    change = Reduced.of(some).best(LENSES)[0]
+    change = Reduced.of(masked).best(LENSES)[0]
     left = []
-    for one, rows in zip(equations, kept, strict=True):
-        residuals = one.residuals - one.by_shared @ change
-        by_pose, right = one.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
+    for equation, rows in zip(equations, masks, strict=True):
+        residuals = equation.residuals - equation.by_shared @ change
+        by_pose, right = equation.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
         step = solve_scaled(by_pose.T @ by_pose, by_pose.T @ right)
-        left.append(one._replace(residuals=residuals - one.by_pose @ step))
+        left.append(equation._replace(residuals=residuals - equation.by_pose @ step))
     return left
 
 
@@ -129,63 +130,74 @@ def squares_off(equations: Equations, scale: float) -> Array:
     The other points of the view predict the places. ``scale``: squared length of one standard
     deviation along each axis.
     """
-    kept = np.full(len(equations.residuals), np.isfinite(equations.residuals).all())
-    least = max(MIN_POINTS_KEPT, (1.0 - MAX_STRAY_SHARE) * len(kept))
-    while kept.sum() >= least:
-        rows, right = equations.by_pose[kept].reshape(-1, 6), equations.residuals[kept].ravel()
+    inliers = np.full(len(equations.residuals), np.isfinite(equations.residuals).all())
+    least = max(MIN_POINTS_KEPT, (1.0 - MAX_STRAY_SHARE) * len(inliers))
+    while inliers.sum() >= least:
+        rows, right = (
+            equations.by_pose[inliers].reshape(-1, 6),
+            equations.residuals[inliers].ravel(),
+        )
         step = solve_scaled(rows.T @ rows, rows.T @ right)
-        off = ((equations.residuals - equations.by_pose @ step) ** 2).sum(axis=1)
-        far = _far(equations, off, scale)
-        if not (kept & far).any():
-            return np.where(~kept & far, off, 0.0)
-        kept[int(np.argmax(np.where(kept & far, off, 0.0)))] = False
+        squares = ((equations.residuals - equations.by_pose @ step) ** 2).sum(axis=1)
+        outlying = _outlying(equations, squares, scale)
+        if not (inliers & outlying).any():
+            return np.where(~inliers & outlying, squares, 0.0)
+        inliers[int(np.argmax(np.where(inliers & outlying, squares, 0.0)))] = False
     return np.zeros(len(equations.residuals))
 
 
-def _far(equations: Equations, squares: Array, scale: float) -> Mask:
+def _outlying(equations: Equations, squares: Array, scale: float) -> Mask:
     pixels = equations.deviations * np.sqrt(squares)
     times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
-    far: Mask = np.any([(times > most) & (pixels > least) for most, least in STRAY_LIMITS], axis=0)
-    return far
+    outlying: Mask = np.any(
+        [(times > most) & (pixels > least) for most, least in STRAY_LIMITS], axis=0
+    )
+    return outlying
 
 
 def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list[Array]:
     """Return the squared distances (N,) from their predicted places in each view, 0 for most."""
     of_used = itertools.compress(equations, used)
     # unlike the variance of all points, the median is hardly changed by a few strays
-    middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
-    return [squares_off(one, float(middle) / MEDIAN_SQUARED_LENGTH) for one in equations]
+    middle = np.median(
+        np.concatenate([(equation.residuals**2).sum(axis=1) for equation in of_used])
+    )
+    return [squares_off(equation, float(middle) / MEDIAN_SQUARED_LENGTH) for equation in equations]
 
 
-def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
+def without(views: Sequence[TargetView], outliers: Sequence[Stray]) -> list[TargetView]:
     """Return views without some of their points."""
     fewer = list(views)
-    for number, group in itertools.groupby(found, key=lambda one: one.number):
+    for number, group in itertools.groupby(outliers, key=lambda outlier: outlier.number):
         view = views[number]
-        kept = np.setdiff1d(np.arange(len(view.ids)), [one.row for one in group])
+        rows = np.setdiff1d(np.arange(len(view.ids)), [outlier.row for outlier in group])
         fewer[number] = dataclasses.replace(
             view,
-            ids=view.ids[kept],
-            points=view.points[kept],
-            covariance=view.covariance[kept],
+            ids=view.ids[rows],
+            points=view.points[rows],
+            covariance=view.covariance[rows],
         )
     return fewer
 
 
-def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> Iterator[Remark]:
+def stray_remarks(outliers: Sequence[Stray], names: Sequence[str], done: str) -> Iterator[Remark]:
     """Yield the remarks on strays; ``names`` are those of the views."""
-    counts = collections.Counter(one.ident for one in found)
+    counts = collections.Counter(outlier.ident for outlier in outliers)
     often = {ident for ident, count in counts.items() if count >= max(3, len(names) / 2)}
     for ident in sorted(often):
-        off = [one.off for one in found if one.ident == ident]
+        distances = [outlier.off for outlier in outliers if outlier.ident == ident]
         yield Code.OUTLIER.remark(
-            f"point {ident} of the target is {np.median(off):.3g} pixels off in {len(off)} of "
-            f"{len(names)} views: it is not at its nominal place, or something is taken for "
+            f"point {ident} of the target is {np.median(distances):.3g} pixels off in "
+            f"{len(distances)} of {len(names)} views: it is not at its nominal place, "
+            "or something is taken for "
             f"it; it {done} there"
         )
-    rest = [one for one in found if one.ident not in often]
+    rest = [outlier for outlier in outliers if outlier.ident not in often]
     if rest:
-        each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
+        each = [
+            f"{outlier.ident} in {names[outlier.number]} ({outlier.off:.3g} pixels)"
+            for outlier in rest
+        ]
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
             f"{_listed(each, ', ')}: each {done}"
@@ -205,24 +217,24 @@ def without_strays(
 
     ``given``: the user gave the lens, so it may be another camera's; else these views gave it.
     """
-    off = np.concatenate([one.residuals for one in poses])
-    noise = np.concatenate([one.covariance for one in views])
-    more = excess(off, noise, off.size - 6 * len(views))
+    residuals = np.concatenate([pose.residuals for pose in poses])
+    noise = np.concatenate([view.covariance for view in views])
+    more = excess(residuals, noise, residuals.size - 6 * len(views))
     fitted = [
         Fitted(view, camera, pose.transform.rigid, view.target.points)
         for view, pose in zip(views, poses, strict=True)
     ]
-    found = strays(fitted, more, [True] * len(fitted), lens=False)
+    outliers = strays(fitted, more, [True] * len(fitted), lens=False)
     names = [label(view, number) for number, view in enumerate(views)]
-    left = without(views, found)
-    kept = [one._replace(view=view) for one, view in zip(fitted, left, strict=True)]
-    remarks = stray_remarks(found, names, "was not used"), view_remarks(views, names)
-    of_lens = lens_remarks(kept, "lens", more) if given else ()
+    left = without(views, outliers)
+    cleaned = [fit._replace(view=view) for fit, view in zip(fitted, left, strict=True)]
+    remarks = stray_remarks(outliers, names, "was not used"), view_remarks(views, names)
+    of_lens = lens_remarks(cleaned, "lens", more) if given else ()
     return left, [*itertools.chain(*remarks), *of_lens]
 
 
 def examined(
-    found: IntrinsicCalibration,
+    calibration: IntrinsicCalibration,
     again: Callable[[list[TargetView]], IntrinsicCalibration],
     *,
     drop: bool,
@@ -232,22 +244,28 @@ def examined(
     ``again`` calibrates from other views. ``drop``: whether stray points are left out. Raises
     ``POOR_FIT``: the points are not the target's.
     """
-    views, used = [one.view for one in found.views], [one.used for one in found.views]
-    points = views[0].target.points + (0.0 if found.sheet is None else found.sheet)
-    fitted = [Fitted(one.view, found.camera, one.transform.rigid, points) for one in found.views]
+    views, used = (
+        [view.view for view in calibration.views],
+        [view.used for view in calibration.views],
+    )
+    points = views[0].target.points + (0.0 if calibration.sheet is None else calibration.sheet)
+    fitted = [
+        Fitted(view.view, calibration.camera, view.transform.rigid, points)
+        for view in calibration.views
+    ]
     names = [label(view, number) for number, view in enumerate(views)]
-    check_rms("intrinsics", found.rms, views)
-    of_fit = [*view_remarks(views, names), *_remarks_on_middle(found)]
+    check_rms("intrinsics", calibration.rms, views)
+    of_fit = [*view_remarks(views, names), *_remarks_on_middle(calibration)]
     free = np.zeros(COUNT, dtype=np.bool_)
-    free[: len(found.covariance)] = np.diag(found.covariance) > 0
-    of_used = [[one] for one in itertools.compress(fitted, used)], found.sigma**2, free
+    free[: len(calibration.covariance)] = np.diag(calibration.covariance) > 0
+    of_used = [[fit] for fit in itertools.compress(fitted, used)], calibration.sigma**2, free
     of_fit += misfit_remarks(*of_used, list(itertools.compress(names, used)))
-    off = strays(fitted, found.sigma**2, used)
-    if off and drop:
-        found, of_fit = again(without(views, off)), []  # remarked on by check_rms
+    outliers = strays(fitted, calibration.sigma**2, used)
+    if outliers and drop:
+        calibration, of_fit = again(without(views, outliers)), []  # remarked on by check_rms
     done = "was not used" if drop else "is used all the same"
-    remarks = stray_remarks(off, names, done)
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))
+    remarks = stray_remarks(outliers, names, done)
+    return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings, *of_fit))
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
@@ -255,7 +273,7 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
     groups = collections.defaultdict[tuple[bytes, bytes], list[str]](list)
     for view, name in zip(views, names, strict=True):
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
-    copies = [", ".join(one) for one in groups.values() if len(one) > 1]
+    copies = [", ".join(group) for group in groups.values() if len(group) > 1]
     if copies:
         yield Code.COINCIDENT.remark(
             "views that are the same to the last digit: "
@@ -264,11 +282,14 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         )
 
 
-def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
-    size = np.array(found.camera.size)
-    middle, sigmas = found.camera.matrix[:2, 2], np.sqrt(np.diag(found.covariance)[2:4])
-    off = np.abs(middle - (size - 1) / 2)
-    if ((off > DOUBTED_CENTRE_OFFSET_SHARE * size) & (off > DOUBTED_CENTRE_SIGMAS * sigmas)).any():
+def _remarks_on_middle(calibration: IntrinsicCalibration) -> Iterator[Remark]:
+    size = np.array(calibration.camera.size)
+    middle, sigmas = calibration.camera.matrix[:2, 2], np.sqrt(np.diag(calibration.covariance)[2:4])
+    distances = np.abs(middle - (size - 1) / 2)
+    if (
+        (distances > DOUBTED_CENTRE_OFFSET_SHARE * size)
+        & (distances > DOUBTED_CENTRE_SIGMAS * sigmas)
+    ).any():
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
             f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "
@@ -276,12 +297,12 @@ def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
         )
 
 
-def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
+def check_rms(label: str, rms: float, views: Sequence[TargetView]) -> None:
     """Raise ``POOR_FIT`` if the residuals are so large that the points cannot be the target's."""
     most = most_rms(views)
     if rms > most:
         raise Code.POOR_FIT.refusal(
-            f"{what}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
+            f"{label}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
             f"{most:.3g} at most expected: are columns and rows those of the sheet, and are the "
             "points those that their numbers say?",
             most,
@@ -293,6 +314,6 @@ def most_rms(
     views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
 ) -> float:
     """Return the RMS of a coordinate, pixels, above which views are impossible."""
-    noise = float(np.median(np.concatenate([one.sigmas for one in views])))
-    longer = max(max(one.size) for one in views)
+    noise = float(np.median(np.concatenate([view.sigmas for view in views])))
+    longer = max(max(view.size) for view in views)
     return max(worst, part * longer, MAX_RMS_SIGMAS * noise)

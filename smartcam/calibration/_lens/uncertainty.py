@@ -118,7 +118,7 @@ def uncertainty(
     check_distance(distance)
     pixels = places(camera.size, shape)
     points = points_at(camera, pixels.reshape(-1, 2), distance)
-    field = sensitivity(camera, points, far=distance is None)
+    field = sensitivity(camera, points, at_infinity=distance is None)
     freed = field.freed(sensitivity(camera, known_points(gauge)))
     return ProjectionUncertainty(
         size=camera.size,

@@ -252,7 +252,7 @@ class PlaneCalibration(storage.SavedCalibration):
             more = f"two wrong ones of {points} points can look right: touch {least} or more"
         return judge(
             None if held_out is None else 1e3 * held_out,
-            [one for one in self.warnings if not (out and one.code == Code.OUTLIER)],
+            [warning for warning in self.warnings if not (out and warning.code == Code.OUTLIER)],
             worst=1 + self.worst,
             predicted=None if predicted is None else 1e3 * predicted,
             allowed=Allowed.of(self.allowed_error, extent(self.robot_points[counted])),
@@ -323,8 +323,10 @@ class PlaneCalibration(storage.SavedCalibration):
     def _poses(self, localizations: Iterable[Localization], flip: bool) -> list[Localization]:
         if not isinstance(localizations, list):
             localizations = [*localizations]
-        found = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
-        with_sigma = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
+        poses = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
+        with_sigma = [
+            n for n, localization in enumerate(localizations) if localization.pose.sigma is not None
+        ]
         if with_sigma and self.touch_sigma is not None:
             sigmas = robot_sigmas(
                 [localizations[n] for n in with_sigma],
@@ -336,8 +338,8 @@ class PlaneCalibration(storage.SavedCalibration):
                 flip=flip,
             )
             for n, sigma in zip(with_sigma, sigmas, strict=True):
-                found[n] = found[n]._replace(pose=found[n].pose.with_sigma(sigma))
-        return found
+                poses[n] = poses[n]._replace(pose=poses[n].pose.with_sigma(sigma))
+        return poses
 
     def covariance_at(self, points: ArrayLike) -> Array:
         """Return the covariance of mapped points that the touches' noise causes.
@@ -478,9 +480,9 @@ class PlaneCalibration(storage.SavedCalibration):
         )
         return dataclasses.replace(self, matrix=matrix, place=place, height=self.height + height)
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         names = ("robot_points", "weights", "residuals", "leave_one_out")
-        storage.check_counts(found, names, len(self.camera_points), called)
+        storage.check_counts(fields, names, len(self.camera_points), called)
         if np.count_nonzero(self.weights) < 3:
             raise storage.refused(
                 called, "weights: expected 3 that are not 0", self.weights.tolist()
@@ -567,21 +569,21 @@ def fit_plane(
     check_positive(allowed_error, "allowed_error", "metres")
     once = distinct(camera, robot, parts)
     marks, touched = once.camera, once.robot
-    kept = np.arange(len(marks))
+    inliers = np.arange(len(marks))
     least = MODELS["similarity" if model == "auto" else model].least
     # the message about equal points must name the points as given
     if len(marks) < len(camera):
         check_samples(camera, robot, least, touch_sigma, strays=robust)
     if robust:
-        kept = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
-    check_samples(marks[kept], touched[kept], least, touch_sigma)
-    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
+        inliers = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
+    check_samples(marks[inliers], touched[inliers], least, touch_sigma)
+    most = MAX_SIGMA.of(extent(touched[inliers])) if touch_sigma is None else touch_sigma
     # of all points: those in a wrong order agree with one another as well as those in the right one
     order = better_order(marks, touched, most)
-    if order is not None and set(order.moved).isdisjoint(kept):
+    if order is not None and set(order.moved).isdisjoint(inliers):
         order = None
     side = None if tool_z is None else mean_axis(tool_z, len(camera))
-    place, pairs = normalize(marks[kept], touched[kept], once.weights[kept])
+    place, pairs = normalize(marks[inliers], touched[inliers], once.weights[inliers])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
     unit = place.camera_size / place.robot_size
     nominal = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
@@ -604,26 +606,26 @@ def fit_plane(
         place=place,
         nominal_scale=nominal,
         side=None if side is None else check_side(plane.frame[:, 2], side),
-        numbers=1 + once.first[kept],
+        numbers=1 + once.first[inliers],
     )
     estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
     if robust and touch_sigma is None and estimate is not None:
-        check_lever(lever(touched[kept]), place.robot_size * estimate)
-    off = np.setdiff1d(np.arange(len(marks)), kept)
+        check_lever(lever(touched[inliers]), place.robot_size * estimate)
+    left_out = np.setdiff1d(np.arange(len(marks)), inliers)
     missed = np.zeros_like(touched)
-    missed[off] = touched[off] - plane.transform(marks[off])
+    missed[left_out] = touched[left_out] - plane.transform(marks[left_out])
     beside = robot - touched[once.number]
     compared: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
-    found = PlaneCalibration(
+    calibration = PlaneCalibration(
         model=fitted.model,
         camera_points=camera,
         robot_points=robot,
-        weights=np.where(np.isin(once.number, kept), parts, 0.0),
+        weights=np.where(np.isin(once.number, inliers), parts, 0.0),
         matrix=matrix,
         place=place,
         unit_covariance=fitted.unit_covariance / place.robot_size**2,
-        residuals=_put(missed, kept, place.robot_size * fitted.residuals)[once.number] + beside,
-        leave_one_out=_put(missed, kept, place.robot_size * held_out)[once.number] + beside,
+        residuals=_put(missed, inliers, place.robot_size * fitted.residuals)[once.number] + beside,
+        leave_one_out=_put(missed, inliers, place.robot_size * held_out)[once.number] + beside,
         freedom=fitted.freedom,
         touch_sigma=touch_sigma
         if estimate is None or touch_sigma is not None
@@ -643,20 +645,20 @@ def fit_plane(
     )
     remarks = [] if order is None else [order.remark(1 + once.first)]
     remarks += [
-        *_moved_remark(missed[off], 1 + once.first[off]),
-        *(_left_out(found, index, parts[index]) for index in found.outliers),
+        *_moved_remark(missed[left_out], 1 + once.first[left_out]),
+        *(_left_out(calibration, index, parts[index]) for index in calibration.outliers),
     ]
     distances = np.linalg.norm(beside, axis=1)
     if distances.max() > MAX_TOUCH_SIGMAS * most:
         number, worst = 1 + int(distances.argmax()), 1e3 * float(distances.max())
         text = f"point {number} was touched {worst:.3g} mm from"
         remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
+    return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings))
 
 
-def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
-    """Return a copy of ``whole`` with ``values`` in some rows."""
-    result = whole.copy()
+def _put(array: Array, at: NDArray[np.intp], values: Array) -> Array:
+    """Return a copy of ``array`` with ``values`` in some rows."""
+    result = array.copy()
     result[at] = values
     return result
 
@@ -675,11 +677,13 @@ def _moved_remark(missed: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
         )
 
 
-def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
+def _left_out(calibration: PlaneCalibration, index: int, weight: float) -> Remark:
     """Return the remark on a point left out: its distance, and the part that touching explains."""
-    distance = float(np.linalg.norm(found.residuals[index]))
-    variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
-    variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
+    distance = float(np.linalg.norm(calibration.residuals[index]))
+    variance = 3.0 / weight * (calibration.touch_sigma or 0.0) ** 2
+    variance += (
+        float(calibration.predicted_error(calibration.camera_points[index : index + 1])[0]) ** 2
+    )
     return Code.OUTLIER.remark(
         f"point {1 + index} is left out: it lies {1e3 * distance:.3g} mm from where the others "
         f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms"

@@ -83,7 +83,7 @@ class Evidence(NamedTuple):
     asked: bool  # whether the user named the model
     held_out: Array  # (N, 3), residuals of the chosen fit
     sigma: float | None  # standard deviation of a touch's coordinate; None if it was not given
-    most: float  # the same if it was given, else the largest plausible one
+    most: float  # the error that the user gave, else the largest plausible one
     place: Normalization  # centre and size of the points
     nominal_scale: float | None  # metres per unit of the camera's points; None if it was not given
     # cosine between tool and normal; None if the tool's axis was not given
@@ -127,13 +127,13 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
     or at all if it must be ``exact``.
     """
-    off = measured / nominal - 1.0
-    if abs(off) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
+    error = measured / nominal - 1.0
+    if abs(error) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
         return None
-    percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
+    percent = f"{100 * error:+.2g}" if abs(error) < 0.1 else f"{100 * error:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
-    if exact or abs(off) > MAX_SCALE_ERROR:
+    if exact or abs(error) > MAX_SCALE_ERROR:
         raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 
@@ -196,7 +196,7 @@ def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
     ):
         return
     noise = touch_noise(evidence.sigma, squares(fitted.residuals, pairs.weights), fitted.freedom)
-    found: list[tuple[float, tuple[int, ...]]] = []
+    better: list[tuple[float, tuple[int, ...]]] = []
     for few in (1, 2):
         for out in itertools.combinations(
             range(count), few if count - few > MIN_POINTS_LEFT else 0
@@ -206,8 +206,8 @@ def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
             except CalibrationError:  # the others lie in a line
                 continue
             squared = squares(simple.residuals, np.delete(pairs.weights, out))
-            found.append((0.0 if noise is None else noise.chance(squared, simple.freedom), out))
-    chance, out = max(found, default=(0.0, ()))
+            better.append((0.0 if noise is None else noise.chance(squared, simple.freedom), out))
+    chance, out = max(better, default=(0.0, ()))
     if out and chance > SIGNIFICANCE_LEVEL:
         points = " and ".join(str(evidence.numbers[i]) for i in out)
         yield Code.OUTLIER.remark(

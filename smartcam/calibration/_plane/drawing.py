@@ -109,8 +109,8 @@ def draw(
     places = np.array([part.pose.position[:2] for part in elements]).reshape(-1, 2)
     both = np.concatenate([points, places])
     low, high = both.min(axis=0), both.max(axis=0)
-    near = (np.abs(left_out - (low + high) / 2) < high - low).all(axis=1)
-    field = _DrawnPlane(np.concatenate([both, left_out[near]]))
+    is_near = (np.abs(left_out - (low + high) / 2) < high - low).all(axis=1)
+    field = _DrawnPlane(np.concatenate([both, left_out[is_near]]))
     residuals = calibration.inverse(calibration.robot_points[counted]) - points
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
@@ -125,8 +125,8 @@ def draw(
         *_heat(calibration, field),
         *_axes(calibration, field),
         *(
-            polygon(field.pixels(one), "ellipse")
-            for one in both[: len(outlines), None] + enlargement * outlines
+            polygon(field.pixels(outline), "ellipse")
+            for outline in both[: len(outlines), None] + enlargement * outlines
         ),
         *_touches(calibration, field, points + enlargement * residuals),
         *(_part(part, place) for part, place in zip(elements, field.pixels(places), strict=True)),

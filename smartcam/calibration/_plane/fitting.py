@@ -198,11 +198,11 @@ def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
 def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
     # Without point i the residual there is (I - H_ii)^-1 e_i, exactly so in a linear fit.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    kept = fitted.blocks * pairs.weights[:, None, None]
-    least = np.linalg.eigvalsh(kept)[:, 0]
+    weighed = fitted.blocks * pairs.weights[:, None, None]
+    least = np.linalg.eigvalsh(weighed)[:, 0]
     result = np.full_like(pairs.robot, np.nan)
     good = least > MIN_CONDITION**2
-    result[good] = np.linalg.solve(kept[good], fitted.residuals[good][..., None])[..., 0]
+    result[good] = np.linalg.solve(weighed[good], fitted.residuals[good][..., None])[..., 0]
     return result
 
 

@@ -64,7 +64,7 @@ class PlaneMap:
         with np.errstate(all="ignore"):
             self._prepare(matrix, centre)
         known = [self.origin, self.frame, self._flat, self._back]
-        if not (all(np.isfinite(one).all() for one in known) and 0 < self.scale < math.inf):
+        if not (all(np.isfinite(array).all() for array in known) and 0 < self.scale < math.inf):
             raise not_finite("plane's matrix", matrix.tolist())
 
     def _prepare(self, matrix: Array, centre: Array) -> None:
@@ -121,8 +121,8 @@ class PlaneMap:
 
     def _least_depth(self, farthest: float) -> float:
         """Return the least ``w`` of points whose coordinates are at most ``farthest``."""
-        u, v, one = self._depth
-        return one - (abs(u) + abs(v)) * farthest
+        u, v, constant = self._depth
+        return constant - (abs(u) + abs(v)) * farthest
 
     def _fill(self, homogeneous: Array, result: Array) -> None:
         """Map contiguous points (n, 3) whose third component is 1."""
@@ -165,7 +165,7 @@ class PlaneMap:
     ) -> list[Localization]:
         """Return localizations in the robot's space; see ``PlaneCalibration.to_robot``."""
         new, atan2, sin, cos = _new_tuple, math.atan2, math.sin, math.cos
-        (a, b, c), (d, e, f), (p, q, one) = self._flat.tolist()
+        (a, b, c), (d, e, f), (p, q, constant) = self._flat.tolist()
         (xx, yx, _), (xy, yy, _), (xz, yz, _) = self.frame.tolist()
         ox, oy, oz = self.origin.tolist()
         tx, ty, tz, tw = self._turn
@@ -185,7 +185,7 @@ class PlaneMap:
             direction_u, direction_v = qw * qw - qz * qz, 2.0 * qz * qw
             along, across = a * direction_u + b * direction_v, d * direction_u + e * direction_v
             if projective:
-                w = p * u + q * v + one
+                w = p * u + q * v + constant
                 if w <= 0:
                     raise _behind_horizon([u, v])
                 x, y = x / w, y / w
@@ -217,8 +217,8 @@ class _Homogeneous:
 
     def __init__(self, points: Array) -> None:
         self._points = np.ascontiguousarray(points)
-        self._whole = points.shape[1] == 3
-        if not self._whole:
+        self._is_spatial = points.shape[1] == 3
+        if not self._is_spatial:
             self._pairs = self._points.view(np.complex128)[:, 0]
             self._buffer = np.ones((min(POINTS_PER_BLOCK, len(points)), 3))
             self._places: NDArray[np.complex128] = np.ndarray(
@@ -227,7 +227,7 @@ class _Homogeneous:
 
     def block(self, begin: int) -> Array:
         """Return the next points (n, 3), contiguous, valid until the next call."""
-        if self._whole:
+        if self._is_spatial:
             return self._points[begin : begin + POINTS_PER_BLOCK]
         pairs = self._pairs[begin : begin + POINTS_PER_BLOCK]
         self._places[: len(pairs)] = pairs

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class Moved:
     """A rigid motion of everything, in the frame that the poses are in."""
 
-    motion: Transform  # from the robot's frame into the robot's frame
+    motion: Transform  # motion from the robot's frame into the robot's frame
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses after the motion."""
@@ -155,9 +155,9 @@ class MovingCamera:
 
     def _check_plane(self, motion: Transform) -> None:
         """Raise if a motion moves the plane out of itself, or turns it upside down."""
-        off = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
+        distance = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
         cosine = float((motion.rotation @ self._normal) @ self._normal)
-        if off <= self._tolerance and cosine > 0:
+        if distance <= self._tolerance and cosine > 0:
             return
         rise = abs(float((motion.apply(self._centre) - self._centre) @ self._normal))
         sine = float(np.linalg.norm(np.cross(motion.rotation @ self._normal, self._normal)))
@@ -165,8 +165,9 @@ class MovingCamera:
         raise Code.PLANE_MOVED.refusal(
             f"moving camera: expected a motion that keeps the plane of the parts within "
             f"{1e3 * self._tolerance:g} mm, got one that shifts it by {1e3 * rise:.2f} mm along "
-            f"its normal and tilts it by {tilt:.2f} deg: {1e3 * off:.2f} mm at the worst point of "
-            "the field. A camera that is raised or tilted needs a calibration of its own there",
+            f"its normal and tilts it by {tilt:.2f} deg: {1e3 * distance:.2f} mm at the worst "
+            "point of the field. A camera that is raised or tilted needs a calibration of its own "
+            "there",
             self._tolerance,
-            off,
+            distance,
         )

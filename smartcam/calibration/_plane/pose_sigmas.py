@@ -40,8 +40,8 @@ def robot_sigmas(
         size: size of the touched field, in the camera's unit.
         flip: whether the poses are turned about their x axis.
     """
-    points = np.array([one.pose.position[:2] for one in seen])
-    angles = np.array([one.pose.orientation.theta for one in seen])
+    points = np.array([localization.pose.position[:2] for localization in seen])
+    angles = np.array([localization.pose.orientation.theta for localization in seen])
     step = STEP_SHARE * size
 
     def ahead(at: Array, turn: Array) -> Array:
@@ -60,8 +60,8 @@ def robot_sigmas(
         return np.column_stack([off_place, angle])
 
     columns = []
-    for way in np.eye(2):
-        ends = [points + sign * step * way for sign in (1, -1)]
+    for axis in np.eye(2):
+        ends = [points + sign * step * axis for sign in (1, -1)]
         place = (transform(ends[0]) - transform(ends[1])) / (2 * step)
         turned = (directions(ends[0], angles) - directions(ends[1], angles)) / (2 * step)
         columns.append(pose_change(place, turned))
@@ -70,12 +70,12 @@ def robot_sigmas(
     )
     columns.append(pose_change(np.zeros_like(turned), turned))
     slopes = np.stack(columns, axis=2)
-    own = np.array([_covariance(one.pose.sigma) for one in seen])
+    covariances = np.array([_covariance(localization.pose.sigma) for localization in seen])
     at, front = by_matrix(points), by_matrix(ahead(points, angles))
     turns = np.einsum("ni,nik->nk", left, front - at) / lengths[:, None]
     rows = np.concatenate([at, turns[:, None]], axis=1)
-    whole = slopes @ own @ slopes.swapaxes(1, 2) + rows @ covariance @ rows.swapaxes(1, 2)
-    return [_sigma(one, -1.0 if flip else 1.0) for one in whole]
+    totals = slopes @ covariances @ slopes.swapaxes(1, 2) + rows @ covariance @ rows.swapaxes(1, 2)
+    return [_sigma(total, -1.0 if flip else 1.0) for total in totals]
 
 
 def _covariance(sigma: PoseSigma | None) -> Array:

@@ -123,16 +123,16 @@ def agreeing(
     order = np.lexsort((weights, *robot.T, *camera.T))
     pairs, size = _about_median(camera[order], robot[order], weights[order])
     sigma = None if touch_sigma is None else touch_sigma / size
-    found = _best(pairs, sigma)
-    if found is None:
+    agreement = _best(pairs, sigma)
+    if agreement is None:
         return np.ones(count, dtype=np.bool_)
-    least, agree = found.least, int(found.mask.sum())
+    least, agree = agreement.least, int(agreement.mask.sum())
     if agree < least:
         raise Code.OUTLIER.unexpected(
             f"expected at least {least} of {count} points that agree with one map", least, agree
         )
     mask = np.empty(count, dtype=np.bool_)
-    mask[order] = found.mask
+    mask[order] = agreement.mask
     return mask
 
 
@@ -152,11 +152,12 @@ def _best(pairs: Pairs, sigma: float | None) -> _Agreement | None:
     simple, general = _search("similarity", pairs, sigma), _search("homography", pairs, sigma)
     if simple is None or general is None or general.mask.sum() < general.least:
         return simple or general
-    noise = min(_noise(one, pairs, sigma) for one in (simple, general))
+    noise = min(_noise(agreement, pairs, sigma) for agreement in (simple, general))
     price = LEFT_OUT_COST_RATIO * noise.variance * _limit(len(pairs.camera), None)
     before, after = (
-        squares(one.fitted.residuals, pairs.weights[one.mask]) + price * float((~one.mask).sum())
-        for one in (simple, general)
+        squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
+        + price * float((~agreement.mask).sum())
+        for agreement in (simple, general)
     )
     more = MODELS["homography"].parameters - MODELS["similarity"].parameters
     if noise.chance(max(before - after, 0.0), more) < SIGNIFICANCE_LEVEL:
@@ -177,12 +178,12 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
     threshold = sigma_of_search**2 * _limit(len(pairs.camera), None)
     # MSAC: sum min(r^2, threshold). Source: Torr and Zisserman, MLESAC (2000).
     costs = np.minimum(squared, threshold).sum(axis=1)
-    found: dict[bytes, _Agreement] = {}
+    agreements: dict[bytes, _Agreement] = {}
     for index in np.argsort(costs, kind="stable")[:MAX_FITTED_PROPOSALS]:
-        one = _settle(name, pairs, squared[index] <= threshold, sigma, threshold)
-        if one is not None:
-            found.setdefault(one.mask.tobytes(), one)
-    return min(found.values(), key=lambda one: one.cost, default=None)
+        agreement = _settle(name, pairs, squared[index] <= threshold, sigma, threshold)
+        if agreement is not None:
+            agreements.setdefault(agreement.mask.tobytes(), agreement)
+    return min(agreements.values(), key=lambda agreement: agreement.cost, default=None)
 
 
 def _settle(
@@ -227,17 +228,17 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
     total, freedom = squares(fitted.residuals, pairs.weights[mask]), fitted.freedom
     limits = np.full(len(mask), math.inf)
-    for some, left in ((mask, freedom - 3), (~mask, freedom)):
+    for chosen, left in ((mask, freedom - 3), (~mask, freedom)):
         if left > 0:
-            others = np.maximum(total - np.where(some & mask, squared, 0.0), 0.0)[some] / left
-            limits[some] = np.maximum(others, ROUNDING_RATIO**2) * _limit(len(mask), left)
+            others = np.maximum(total - np.where(chosen & mask, squared, 0.0), 0.0)[chosen] / left
+            limits[chosen] = np.maximum(others, ROUNDING_RATIO**2) * _limit(len(mask), left)
     return np.asarray(squared <= limits)
 
 
-def _noise(found: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
+def _noise(agreement: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
     """Return the touches' noise as given, or estimated from the points that agree."""
-    squared = squares(found.fitted.residuals, pairs.weights[found.mask])
-    return touch_noise(sigma, squared, found.fitted.freedom) or Noise(ROUNDING_RATIO**2)
+    squared = squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
+    return touch_noise(sigma, squared, agreement.fitted.freedom) or Noise(ROUNDING_RATIO**2)
 
 
 def _limit(count: int, freedom: int | None) -> float:
@@ -287,7 +288,7 @@ def _shapely(points: Array) -> Mask:
     """Return a mask (S,) of the subsets in which no three points lie nearly in a line."""
     areas = []
     for triple in itertools.combinations(range(points.shape[1]), 3):
-        first, second = (points[:, one] - points[:, triple[0]] for one in triple[1:])
+        first, second = (points[:, corner] - points[:, triple[0]] for corner in triple[1:])
         inner = (first * second).sum(axis=1)
         lengths = (first**2).sum(axis=1) * (second**2).sum(axis=1)
         areas.append(np.sqrt(np.maximum(lengths - inner**2, 0.0)))

@@ -58,8 +58,8 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
             degrees.
     """
     flanges = [
-        as_motion(one, f"tool tip: pose {number}", "base", "flange")
-        for number, one in enumerate(as_list(flanges, object, "tool tip: pose"))
+        as_motion(pose, f"tool tip: pose {number}", "base", "flange")
+        for number, pose in enumerate(as_list(flanges, object, "tool tip: pose"))
     ]
     if len(flanges) < 2:
         raise Code.TOO_FEW.unexpected("tool tip: expected two touches or more", 2, len(flanges))

@@ -120,7 +120,7 @@ def fit_touches(
     touched = np.concatenate(groups)
     check_field(touched)
     ray = np.repeat([0, 1, 2], [len(group) for group in groups])
-    levers = [float(np.linalg.norm(one.mean(0) - groups[0].mean(0))) for one in groups[1:]]
+    levers = [float(np.linalg.norm(group.mean(0) - groups[0].mean(0))) for group in groups[1:]]
     sheet = _fit(touched, ray)
     for lever in levers if touch_sigma is not None else ():
         check_lever(lever, touch_sigma or 0.0)
@@ -178,12 +178,12 @@ def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
     # Gauss and Newton's steps of shift and turn: 3 to 6 of them, in 2.5 ms; SciPy's least_squares
     # takes 6 ms (measured).
     origin = touched[ray == 0].mean(axis=0)
-    frame = frame_from_axes(*(touched[ray == one].mean(axis=0) - origin for one in (1, 2)))
+    frame = frame_from_axes(*(touched[ray == side].mean(axis=0) - origin for side in (1, 2)))
     for _ in range(MAX_STEPS):
         along, residuals, jacobian = _linear(touched, ray, origin, frame)
         step = np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
         origin = origin + step[:3]
-        first, second = (frame[:, one] + np.cross(step[3:], frame[:, one]) for one in (0, 1))
+        first, second = (frame[:, axis] + np.cross(step[3:], frame[:, axis]) for axis in (0, 1))
         second = second - first * (first @ second) / (first @ first)
         frame = frame_from_axes(first, second)
         if np.abs(step).max() < ROUNDING_RATIO**1.5 * (1.0 + np.abs(origin).max()):
@@ -215,31 +215,31 @@ def _linear(
 def _remarks(
     sheet: _FittedRays, freedom: int, touch_sigma: float | None, scale: float, side: float | None
 ) -> tuple[Remark, ...]:
-    found: list[Remark] = []
+    remarks: list[Remark] = []
     squared = float((sheet.residuals**2).sum())
     if touch_sigma is None:
-        found.append(
+        remarks.append(
             Code.UNVERIFIED.remark(
                 f"the touches' sigma is estimated from {freedom} degrees of freedom only: "
                 "give touch_sigma"
             )
         )
     elif Noise(touch_sigma**2).chance(squared, freedom) < SIGNIFICANCE_LEVEL:
-        found.append(
+        remarks.append(
             Code.POOR_FIT.remark(
                 f"the touches lie {1e3 * math.sqrt(squared / len(sheet.along)):.3g} mm rms beside "
                 f"rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was given"
             )
         )
-    found.append(
+    remarks.append(
         Code.SCALE_ASSUMED.remark(
             f"{scale:.6g} m for each unit of the camera was taken as given: no touch measures it"
         )
     )
-    found.append(
+    remarks.append(
         Code.NOT_HELD_OUT.remark(
             "no touch can be left out to see how good the calibration is, "
             "and the residuals do not tell"
         )
     )
-    return (*found, *remark_side(side))
+    return (*remarks, *remark_side(side))

@@ -92,13 +92,13 @@ def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
     if len(camera) in {number.max(initial=-1) + 1, 0} and touch.max(initial=-1) + 1 == len(camera):
         each = np.arange(len(camera), dtype=np.intp)
         return Distinct(camera, robot, weights, each, each)
-    near = SAME_MARK_RATIO * float(np.linalg.norm(np.ptp(camera, axis=0)))
-    for one in np.flatnonzero(np.bincount(touch) > 1):
-        same = np.flatnonzero(touch == one)
-        if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < near:
+    tolerance = SAME_MARK_RATIO * float(np.linalg.norm(np.ptp(camera, axis=0)))
+    for mark in np.flatnonzero(np.bincount(touch) > 1):
+        same = np.flatnonzero(touch == mark)
+        if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < tolerance:
             number[np.isin(number, number[same])] = number[same[0]]
     first, number = np.unique(number, return_index=True, return_inverse=True)[1:]
-    order = np.argsort(first)  # in the order in which the points came
+    order = np.argsort(first)  # numbers in the order of the given points
     first, number = first[order], np.argsort(order)[number.ravel()]
     share = weights / np.bincount(number, weights)[number]
     means = [
@@ -143,9 +143,9 @@ def check_samples(
         raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
     if not strays:
         check_field(robot)
-    for points, what in ((camera, "camera points"), (robot, "robot points")):
-        _check_distinct(points, what, least)
-        _check_width(points, what)
+    for points, label in ((camera, "camera points"), (robot, "robot points")):
+        _check_distinct(points, label, least)
+        _check_width(points, label)
     extents = _extents(robot)
     if extents[2] > MAX_THICKNESS_RATIO * extents[1]:
         raise Code.NOT_PLANAR.refusal(
@@ -160,12 +160,12 @@ def check_samples(
 
 def check_field(robot: Array) -> None:
     """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than in any cell."""
-    if (found := extent(robot)) > MAX_UNASKED_M:
+    if (field_extent := extent(robot)) > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
-            f"of {found:.4g} m: are they millimetres? Multiply them by 0.001",
+            f"of {field_extent:.4g} m: are they millimetres? Multiply them by 0.001",
             MAX_UNASKED_M,
-            found,
+            field_extent,
         )
 
 
@@ -179,29 +179,29 @@ def extent(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(_turned(points)[:, :2], axis=0)))
 
 
-def check_lever(found: float, touch_sigma: float) -> None:
+def check_lever(extent_found: float, touch_sigma: float) -> None:
     """Raise SHORT_LEVER if points lie too close together for the error of the touches.
 
-    ``found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
+    ``extent_found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
     """
-    if found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
+    if extent_found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
         raise Code.SHORT_LEVER.refusal(
             f"robot points: expected at least {MIN_EXTENT_IN_SIGMAS:g} sigmas of a touch "
             f"({1e3 * MIN_EXTENT_IN_SIGMAS * touch_sigma:.3g} mm) in each direction, "
-            f"got {1e3 * found:.3g} mm: they lie too close together, or are in another unit",
+            f"got {1e3 * extent_found:.3g} mm: they lie too close together, or are in another unit",
             MIN_EXTENT_IN_SIGMAS * touch_sigma,
-            found,
+            extent_found,
         )
 
 
 def normalize(camera: Array, robot: Array, weights: Array) -> tuple[Normalization, Pairs]:
     """Return the points centred and scaled for the fit, and their centres and sizes."""
     camera_centre, robot_centre = camera.mean(axis=0), robot.mean(axis=0)
-    near, far = camera - camera_centre, robot - robot_centre
-    camera_size = math.sqrt(float((near**2).sum(axis=1).mean()))
-    robot_size = math.sqrt(float((far**2).sum(axis=1).mean()))
+    camera_centred, robot_centred = camera - camera_centre, robot - robot_centre
+    camera_size = math.sqrt(float((camera_centred**2).sum(axis=1).mean()))
+    robot_size = math.sqrt(float((robot_centred**2).sum(axis=1).mean()))
     frame = Normalization(camera_centre, camera_size, robot_centre, robot_size)
-    return frame, Pairs(near / camera_size, far / robot_size, weights)
+    return frame, Pairs(camera_centred / camera_size, robot_centred / robot_size, weights)
 
 
 def _turned(points: Array) -> Array:
@@ -218,22 +218,22 @@ def _extents(points: Array) -> Array:
     return singular / math.sqrt(len(points))
 
 
-def _check_distinct(points: Array, what: str, least: int) -> None:
+def _check_distinct(points: Array, label: str, least: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
     grain = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
         raise Code.COINCIDENT.unexpected(
-            f"{what}: expected at least {least} different ones", least, distinct
+            f"{label}: expected at least {least} different ones", least, distinct
         )
 
 
-def _check_width(points: Array, what: str) -> None:
+def _check_width(points: Array, label: str) -> None:
     along, across = _extents(points)[:2]
     if across < MIN_WIDTH_RATIO * along:
         raise Code.COLLINEAR.refusal(
-            f"{what}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
+            f"{label}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
             f"got {across / along:.2g}: they lie nearly in a line",
             MIN_WIDTH_RATIO,
             float(across / along),

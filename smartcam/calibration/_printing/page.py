@@ -154,8 +154,8 @@ def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
     for shape in shapes:
         match shape:
             case Polygon(points):
-                first, *rest = (_pair(x, y) for x, y in points)
-                yield " ".join([f"{first} m", *(f"{one} l" for one in rest), "h"])
+                first, *others = (_pair(x, y) for x, y in points)
+                yield " ".join([f"{first} m", *(f"{point} l" for point in others), "h"])
             case Disc((x, y), radius):
                 yield _pdf_circle(x, y, radius)
             case Label():
@@ -177,10 +177,10 @@ def _pdf_circle(x: float, y: float, radius: float) -> str:
 
 def _pdf_texts(shapes: Iterable[Shape]) -> list[str]:
     return [
-        f"BT /F {_number(one.size)} Tf {'0 1 -1 0' if one.turned else '1 0 0 1'} "
-        f"{_pair(*one.place)} Tm {_literal(one.text)} Tj ET"
-        for one in shapes
-        if isinstance(one, Label)
+        f"BT /F {_number(shape.size)} Tf {'0 1 -1 0' if shape.turned else '1 0 0 1'} "
+        f"{_pair(*shape.place)} Tm {_literal(shape.text)} Tj ET"
+        for shape in shapes
+        if isinstance(shape, Label)
     ]
 
 

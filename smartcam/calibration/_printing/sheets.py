@@ -185,7 +185,7 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
         )
         for wide, high in turns
     ]
-    layout = min(layouts, key=lambda one: one.excess)
+    layout = min(layouts, key=lambda sheet: sheet.excess)
     if layout.excess > 0:
         raise _too_small(target, page, layout)
     moved = (_moved(shape, *layout.origin) for shape in pattern)
@@ -202,9 +202,9 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
     needed = (layout.needed_width, layout.needed_height)
     size = (layout.width, layout.height)
     over = [
-        f"{need - there:.1f} mm too {way}"
-        for need, there, way in zip(needed, size, ("wide", "high"), strict=True)
-        if need > there
+        f"{need - available:.1f} mm too {side}"
+        for need, available, side in zip(needed, size, ("wide", "high"), strict=True)
+        if need > available
     ]
     text = f"{size[0]:g} x {size[1]:g} mm"
     named = f"{page} ({text})" if page in PAGES_MM else text

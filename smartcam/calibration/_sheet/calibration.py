@@ -88,10 +88,13 @@ class SheetCalibration(storage.SavedCalibration):
     _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
     _later: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
     _others: ClassVar[storage.Others] = {
-        "target": (storage.StoredTarget, lambda one: one.view.target),
-        "camera": (CameraModel | None, lambda one: one.sheet.camera),
-        "matrix": (storage.Matrix3, lambda one: one.sheet.matrix),
-        "covariance": (Annotated[Array, storage.matrix(9)], lambda one: one.sheet.covariance),
+        "target": (storage.StoredTarget, lambda calibration: calibration.view.target),
+        "camera": (CameraModel | None, lambda calibration: calibration.sheet.camera),
+        "matrix": (storage.Matrix3, lambda calibration: calibration.sheet.matrix),
+        "covariance": (
+            Annotated[Array, storage.matrix(9)],
+            lambda calibration: calibration.sheet.covariance,
+        ),
     }
 
     view: TargetView
@@ -103,8 +106,8 @@ class SheetCalibration(storage.SavedCalibration):
     remarks: storage.Remarks = ()
 
     @classmethod
-    def _read(cls, found: dict[str, Any], context: storage.Context) -> SheetCalibration:
-        matrix, covariance = found["matrix"], found["covariance"]
+    def _read(cls, fields: dict[str, Any], context: storage.Context) -> SheetCalibration:
+        matrix, covariance = fields["matrix"], fields["covariance"]
         if covariance.shape != (9, 9):
             raise storage.refused(
                 context["called"], "covariance: expected 9 rows of 9", len(covariance)
@@ -112,10 +115,10 @@ class SheetCalibration(storage.SavedCalibration):
         if abs(np.linalg.det(matrix)) == 0.0:
             text = "matrix: expected one that can be inverted"
             raise storage.refused(context["called"], text, matrix.tolist())
-        found["sheet"] = SheetPlane(found["view"].size, matrix, covariance, found["camera"])
-        return super()._read(found, context)
+        fields["sheet"] = SheetPlane(fields["view"].size, matrix, covariance, fields["camera"])
+        return super()._read(fields, context)
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         if self.lens_covariance is not None:
             _check_lens(self.lens_covariance, self.camera, called)
 
@@ -146,7 +149,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     def judged(self) -> Judgement:
         """Return the verdict for the area that the target covers in the image, and the advice."""
-        if any(one.code == Code.POOR_FIT for one in self.remarks):
+        if any(remark.code == Code.POOR_FIT for remark in self.remarks):
             lens = "another lens" if self.camera else "a lens: --lens"
             text = f"Not good enough: the picture needs {lens}, or a flat sheet"
             return Judgement(CalibrationVerdict("poor", text), option="more")
@@ -178,7 +181,7 @@ class SheetCalibration(storage.SavedCalibration):
             return ()
         values, moves = lens_values(self.camera), independent_parts(self.lens_covariance)
         return tuple(
-            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane for one in moves
+            look_at_sheet(self.view, with_lens(self.camera, values + move)).plane for move in moves
         )
 
     def transform(self, pixels: ArrayLike) -> Array:
@@ -238,7 +241,7 @@ class SheetCalibration(storage.SavedCalibration):
     def _to_robot(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
         flat = self.sheet.solve(Poses.of(parts)).put(parts)
-        rows = [n for n, one in enumerate(parts) if one.pose.sigma is not None]
+        rows = [n for n, part in enumerate(parts) if part.pose.sigma is not None]
         if rows and self.plane.touch_sigma is not None:
             for n, sigma in zip(rows, self._sigmas([parts[n] for n in rows]), strict=True):
                 flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
@@ -257,8 +260,8 @@ class SheetCalibration(storage.SavedCalibration):
             flat = self.sheet.near_sheet(points * y_up)
             rows = np.zeros((len(flat), 3, 9 + len(lenses)))
             rows[:, :2, :9] = self.sheet.element_slopes(flat)
-            for number, one in enumerate(lenses, start=9):
-                rows[:, :2, number] = one.near_sheet(points * y_up) - flat
+            for number, lens in enumerate(lenses, start=9):
+                rows[:, :2, number] = lens.near_sheet(points * y_up) - flat
             return rows
 
         covariance = np.eye(9 + len(lenses))
@@ -284,8 +287,8 @@ class SheetCalibration(storage.SavedCalibration):
         # to first order: D C D^T with the map's derivative D
         slopes = derivatives(self.plane.matrix, flat)
         on_sheet = self.sheet.covariance_at(pixels)
-        for one in self.lens_planes:
-            deviation = one.on_sheet(pixels) - flat
+        for plane in self.lens_planes:
+            deviation = plane.on_sheet(pixels) - flat
             on_sheet = on_sheet + deviation[:, :, None] * deviation[:, None, :]
         seen = slopes @ on_sheet @ slopes.swapaxes(1, 2)
         covariance: Array = self.plane.covariance_at(flat) + seen
@@ -408,7 +411,7 @@ def fit_corners(
             is off by more than a tenth; and those of :func:`~smartcam.calibration.fit_plane`.
     """
     points = target.points[:, :2]
-    wrong = [one for one in ids if not 0 <= one < len(points)]
+    wrong = [ident for ident in ids if not 0 <= ident < len(points)]
     if wrong:
         raise Code.SHAPE.unexpected(
             f"touched points: expected numbers from 0 to {len(points) - 1}",

@@ -88,7 +88,7 @@ class SheetPlane:
             CalibrationError: SHAPE or NOT_FINITE; OUT_OF_FIELD: outside of the image, or behind the
                 sheet's horizon.
         """
-        given = self._seen(pixels)
+        given = self._rays_of(pixels)
         return self._mapped(self._straight(given), given)
 
     def in_image(self, points: ArrayLike) -> Array:
@@ -142,7 +142,7 @@ class SheetPlane:
                 "sheet: expected poses in the image, turned about its z only, got some with a "
                 "height or a tilt"
             )
-        pixels = self._seen(poses.points[:, :2] * [1.0, -1.0])
+        pixels = self._rays_of(poses.points[:, :2] * [1.0, -1.0])
         ahead = np.column_stack([w * w - z * z, -2.0 * z * w])
         middles, ends, starts = (
             self._mapped(self._straight(at), at)
@@ -152,13 +152,13 @@ class SheetPlane:
                 pixels - DIRECTION_STEP_PX * ahead,
             )
         )
-        way = ends - starts
+        directions = ends - starts
         return Poses(
             np.column_stack([middles, np.zeros(len(middles))]),
-            quaternion_about_z(np.arctan2(way[:, 1], way[:, 0])),
+            quaternion_about_z(np.arctan2(directions[:, 1], directions[:, 0])),
         )
 
-    def _seen(self, pixels: ArrayLike) -> Array:
+    def _rays_of(self, pixels: ArrayLike) -> Array:
         given = as_points(pixels, 2, "pixels")
         width, height = self.size
         outside = (
@@ -227,7 +227,7 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     first, second = rotation[:, 0], rotation[:, 1]
     # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn w by
     # w x r = -[r]x w, and with its shift by d.
-    by_pose = np.zeros((3, 3, 6))  # of rows, columns of the matrix, by turn and shift
+    by_pose = np.zeros((3, 3, 6))  # derivatives of rows, columns of the matrix, by turn and shift
     by_pose[:, 0, :3], by_pose[:, 1, :3] = -cross_matrix(first), -cross_matrix(second)
     by_pose[:, 2, 3:] = np.eye(3)
     moved = by_pose.reshape(9, 6)
@@ -270,10 +270,10 @@ def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[
     # points they take 1.8 ms, SciPy's least_squares 2.2 ms (measured), in no fewer lines.
     weights, normal = whitening(noise, 0.0), np.eye(8)
     for _ in range(MAX_STEPS):
-        off = weights @ (pixels - apply_homography(matrix, source))[..., None]
+        residuals = weights @ (pixels - apply_homography(matrix, source))[..., None]
         jacobian = (weights @ element_derivatives(matrix, source)[..., :8]).reshape(-1, 8)
         normal = jacobian.T @ jacobian
-        step = np.linalg.solve(normal, jacobian.T @ off.ravel())
+        step = np.linalg.solve(normal, jacobian.T @ residuals.ravel())
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
         if (np.abs(step) * unit_diagonal(normal)).max() < SETTLED_SIGMAS:
             break

@@ -117,7 +117,9 @@ class StereoCalibration(storage.SavedCalibration):
 
     kind: ClassVar[str] = "stereo"
     _called: ClassVar[str] = "calibration of cameras"
-    _others: ClassVar[storage.Others] = {"target": (storage.StoredTarget, lambda one: _target(one))}
+    _others: ClassVar[storage.Others] = {
+        "target": (storage.StoredTarget, lambda calibration: _target(calibration))
+    }
 
     left: CameraModel
     right: CameraModel
@@ -194,10 +196,12 @@ class StereoCalibration(storage.SavedCalibration):
         seen = self.left.project(given), self.right.project(self.transform.apply(given))
         known = np.isfinite(seen[0]).all(axis=1) & np.isfinite(seen[1]).all(axis=1)
         each = np.tile(sigma**2 * np.eye(2), (int(known.sum()), 1, 1))
-        found = np.full((len(given), 3, 3), np.nan)
+        covariances = np.full((len(given), 3, 3), np.nan)
         pixels = seen[0][known], seen[1][known]
-        found[known] = triangulation.triangulate(self._cameras, pixels, (each, each)).covariance
-        return found
+        covariances[known] = triangulation.triangulate(
+            self._cameras, pixels, (each, each)
+        ).covariance
+        return covariances
 
     def epipolar_distances(self, left_pixels: ArrayLike, right_pixels: ArrayLike) -> Array:
         """Return the distances of points from the epipolar lines of their partners.
@@ -250,8 +254,8 @@ class StereoCalibration(storage.SavedCalibration):
         ways = [right]
         if right.target.half_turn_symmetric:
             ways.append(half_turned(right))
-        found = [pair_errors(self._cameras, left, one) for one in ways]
-        return min(found, key=lambda one: _rms([one.epipolar]))
+        errors = [pair_errors(self._cameras, left, turned) for turned in ways]
+        return min(errors, key=lambda errors_of_pair: _rms([errors_of_pair.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
         """Return the maps that make the rows of both images show the same points.
@@ -280,15 +284,15 @@ class StereoCalibration(storage.SavedCalibration):
             )
         return first, second
 
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
+    def _check(self, fields: Mapping[str, Any], called: str) -> None:
         storage.check_shape(self.covariance, (6, 6), called, "covariance")
         if self.sheet is not None:
-            storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
+            storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
 def _target(calibration: StereoCalibration) -> Target:
     pairs = calibration.pairs
-    return next(view.target for one in pairs for view in (one.left, one.right) if view)
+    return next(view.target for pair in pairs for view in (pair.left, pair.right) if view)
 
 
 @takes(
@@ -346,7 +350,7 @@ def calibrate_stereo(
     check_pairs(moments, (left, right))
     check_choice(sheet, get_args(Sheet), "sheet")
     least = MIN_PAIRS if left and right else MIN_VIEWS
-    both = [number for number, one in enumerate(moments) if None not in one]
+    both = [number for number, moment in enumerate(moments) if None not in moment]
     if len(both) < least:
         raise Code.TOO_FEW.unexpected(
             f"stereo: expected {least} pairs or more in which both cameras see the target",
@@ -362,25 +366,25 @@ def calibrate_stereo(
         if view is not None
     ]
     most, bad = MAX_BAD_VIEW_SHARE * len(sights), list[Sight]()
-    bad += [one for one in sights if one.camera == 1 and one.pose in apart]
-    rest = [one for one in sights if one not in bad]
-    if drop_bad and len(bad) <= MAX_BAD_VIEW_SHARE * len(both) and len(_pairs(rest)) >= least:
-        sights = rest
+    bad += [sight for sight in sights if sight.camera == 1 and sight.pose in apart]
+    good = [sight for sight in sights if sight not in bad]
+    if drop_bad and len(bad) <= MAX_BAD_VIEW_SHARE * len(both) and len(_pairs(good)) >= least:
+        sights = good
     while True:
         adjusted = adjust_weighted(bundle, sights)
         if not math.isfinite(adjusted.weighted):
             raise Code.POOR_FIT.refusal(
                 "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
-        worst, ratio = worst_view([one.view for one in sights], adjusted)
+        worst, ratio = worst_view([sight.view for sight in sights], adjusted)
         if ratio <= BAD_VIEW_RATIO:
             break
         if sights[worst] not in bad:
             bad.append(sights[worst])
-        rest = sights[:worst] + sights[worst + 1 :]
-        if not drop_bad or len(bad) > most or len(_pairs(rest)) < least:
+        good = sights[:worst] + sights[worst + 1 :]
+        if not drop_bad or len(bad) > most or len(_pairs(good)) < least:
             break
-        sights, bundle = rest, adjusted.bundle
+        sights, bundle = good, adjusted.bundle
     again = functools.partial(
         calibrate_stereo,
         left=left,
@@ -390,13 +394,13 @@ def calibrate_stereo(
         sheet=sheet,
         drop_bad=drop_bad,
     )
-    found = _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
-    return examined(found, again, known=(left, right), drop=drop_bad)
+    calibration = _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
+    return examined(calibration, again, known=(left, right), drop=drop_bad)
 
 
 def _pairs(sights: Sequence[Sight]) -> list[int]:
     """Return the indices of the moments at which both cameras see the target."""
-    sides = [{one.pose for one in sights if one.camera == side} for side in range(2)]
+    sides = [{sight.pose for sight in sights if sight.camera == side} for side in range(2)]
     return sorted(sides[0] & sides[1])
 
 
@@ -418,15 +422,15 @@ class _Found(NamedTuple):
         return left, right
 
 
-def _held_out(found: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
+def _held_out(solution: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
     """Return the errors of each pair with cameras that were fitted without it."""
-    pairs = _pairs(found.sights)
-    if len(pairs) <= found.least:
+    pairs = _pairs(solution.sights)
+    if len(pairs) <= solution.least:
         return {}
     return {
-        one.pose: pair_errors(_cameras(one.bundle), *found.pair(one.pose))
-        for one in left_out
-        if one.pose in pairs
+        left.pose: pair_errors(_cameras(left.bundle), *solution.pair(left.pose))
+        for left in left_out
+        if left.pose in pairs
     }
 
 
@@ -435,42 +439,42 @@ def _cameras(bundle: Bundle) -> CameraPair:
     return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.taken(0)))
 
 
-def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
-    check_fit(found.adjusted.rms, found.sights, found.bad)
-    shape = choose_shape(found.adjusted, found.sights, sheet)
+def _summary(solution: _Found, sheet: Sheet) -> StereoCalibration:
+    check_fit(solution.adjusted.rms, solution.sights, solution.bad)
+    shape = choose_shape(solution.adjusted, solution.sights, sheet)
     adjusted = shape.adjusted
-    found, without = found._replace(adjusted=adjusted), _held_out(found, shape.left_out)
+    solution, without = solution._replace(adjusted=adjusted), _held_out(solution, shape.left_out)
     cameras = _cameras(adjusted.bundle)
-    epipolar = [pair_errors(cameras, *found.pair(n)).epipolar for n in _pairs(found.sights)]
+    epipolar = [pair_errors(cameras, *solution.pair(n)).epipolar for n in _pairs(solution.sights)]
     calibration = StereoCalibration(
         **cameras._asdict(),
         covariance=camera_covariance(adjusted, shape.left_out)[-6:, -6:],
-        pairs=tuple(_pair(found, number, without) for number in range(len(found.moments))),
+        pairs=tuple(_pair(solution, number, without) for number in range(len(solution.moments))),
         rms=adjusted.rms,
         sigma=math.sqrt(adjusted.more),
         epipolar=_rms(epipolar),
-        held_out=_rms([one.spacing for one in without.values()]),
-        held_out_epipolar=_rms([one.epipolar for one in without.values()]),
+        held_out=_rms([errors.spacing for errors in without.values()]),
+        held_out_epipolar=_rms([errors.epipolar for errors in without.values()]),
         sheet=shape.off,
         warnings=(),
     )
-    remarks = _remarks(calibration, found, shape.remarks)
+    remarks = _remarks(calibration, solution, shape.remarks)
     return dataclasses.replace(calibration, warnings=tuple(remarks))
 
 
 def _rms(parts: Sequence[Array]) -> float:
-    values = np.concatenate([one.ravel() for one in parts]) if parts else np.zeros(0)
+    values = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
-def _pair(found: _Found, number: int, without: Mapping[int, PairErrors]) -> PairFit:
+def _pair(solution: _Found, number: int, without: Mapping[int, PairErrors]) -> PairFit:
     rms = {
-        one.camera: _rms([residuals])
-        for one, residuals in zip(found.sights, found.adjusted.residuals, strict=True)
-        if one.pose == number
+        sight.camera: _rms([residuals])
+        for sight, residuals in zip(solution.sights, solution.adjusted.residuals, strict=True)
+        if sight.pose == number
     }
-    pose = Transform(LEFT, TARGET, *found.adjusted.bundle.poses.taken(number))
-    left, right = found.moments[number]
+    pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.taken(number))
+    left, right = solution.moments[number]
     errors = without.get(number)
     return PairFit(
         left=left,
@@ -484,21 +488,21 @@ def _pair(found: _Found, number: int, without: Mapping[int, PairErrors]) -> Pair
 
 
 def _remarks(
-    calibration: StereoCalibration, found: _Found, of_sheet: list[Remark]
+    calibration: StereoCalibration, solution: _Found, of_sheet: list[Remark]
 ) -> Iterator[Remark]:
-    for one in found.bad:
-        used = any(one is sight for sight in found.sights)
+    for bad_sight in solution.bad:
+        used = any(bad_sight is sight for sight in solution.sights)
         done = "is used all the same" if used else "was not used"
-        off = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
-        if one.camera == 1 and one.pose in found.apart:
-            pixels = found.apart[one.pose]
-            far = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
-            off = (
-                f"is {far} where the left view and the other pairs have it: the two are of "
+        reason = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
+        if bad_sight.camera == 1 and bad_sight.pose in solution.apart:
+            pixels = solution.apart[bad_sight.pose]
+            distance = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
+            reason = (
+                f"is {distance} where the left view and the other pairs have it: the two are of "
                 "different moments, or swapped"
             )
-        name = f"{label(one.view, one.pose)}, {SIDES[one.camera]}"
-        yield Code.BAD_VIEW.remark(f"{name}: {off}; it {done}")
+        name = f"{label(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
+        yield Code.BAD_VIEW.remark(f"{name}: {reason}; it {done}")
     if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
             f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR_FIT_RMS_PX:g} at most: "
@@ -509,7 +513,7 @@ def _remarks(
     yield from of_sheet
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(_pairs(found.sights))} pairs are no more than the cameras have need of: none "
+            f"{len(_pairs(solution.sights))} pairs are no more than the cameras have need of: none "
             "can be left out to see how good they are"
         )
 

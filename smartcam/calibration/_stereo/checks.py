@@ -88,7 +88,12 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         return
     views = [(left, right) for _, left, right in pairs if left.size == right.size == first.size]
     so, other = (
-        np.array([sum(_squares(*one) for one in zip(pair, lenses, strict=True)) for pair in views])
+        np.array(
+            [
+                sum(_squares(*view_and_lens) for view_and_lens in zip(pair, lenses, strict=True))
+                for pair in views
+            ]
+        )
         for lenses in ((first, second), (second, first))
     )
     ratio = math.sqrt(float(so.sum() / other.sum())) if other.sum() > 0 else 1.0
@@ -124,7 +129,7 @@ def check_apart(transform: Transform, covariance: Array) -> None:
 
 
 def examined(
-    found: StereoCalibration,
+    calibration: StereoCalibration,
     again: Callable[..., StereoCalibration],
     *,
     known: tuple[CameraModel | None, CameraModel | None],
@@ -135,35 +140,42 @@ def examined(
     ``again`` calibrates from other views of both sides. ``known`` are the known lenses. ``drop``
     says whether stray points are left out. Raises ``COINCIDENT`` if the cameras do not stand apart.
     """
-    check_apart(found.transform, found.covariance)
-    sides = [[one.left for one in found.pairs], [one.right for one in found.pairs]]
-    seen = list(_seen(found))
-    fitted, used = [one.fitted for one in seen], [one.used for one in seen]
-    names = [f"{label(one.fitted.view, one.pair)}, {SIDES[one.side]}" for one in seen]
-    of_fit = list(view_remarks([one.view for one in fitted], names))
+    check_apart(calibration.transform, calibration.covariance)
+    sides = [[pair.left for pair in calibration.pairs], [pair.right for pair in calibration.pairs]]
+    seen = list(_views_of(calibration))
+    fitted, used = [sight.fitted for sight in seen], [sight.used for sight in seen]
+    names = [f"{label(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in seen]
+    of_fit = list(view_remarks([fit.view for fit in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
-            own = [one.fitted for one in seen if one.used and one.side == side]
-            of_fit += lens_remarks(own, f"{name} lens", found.sigma**2)
-    pairs = [list(some) for _, some in itertools.groupby(seen, key=lambda one: one.pair)]
-    both = [some for some in pairs if len(some) == 2 and all(one.used for one in some)]
+            fits = [sight.fitted for sight in seen if sight.used and sight.side == side]
+            of_fit += lens_remarks(fits, f"{name} lens", calibration.sigma**2)
+    pairs = [list(group) for _, group in itertools.groupby(seen, key=lambda sight: sight.pair)]
+    both = [
+        sights_of_pair
+        for sights_of_pair in pairs
+        if len(sights_of_pair) == 2 and all(sight.used for sight in sights_of_pair)
+    ]
     free = np.zeros(COUNT, dtype=np.bool_)
     free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
     free[RIG] = True
     of_fit += misfit_remarks(
-        [(left.fitted, right.fitted._replace(rig=found.transform.rigid)) for left, right in both],
-        found.sigma**2,
+        [
+            (left.fitted, right.fitted._replace(rig=calibration.transform.rigid))
+            for left, right in both
+        ],
+        calibration.sigma**2,
         free,
-        [label(one.fitted.view, one.pair) for one, _ in both],
+        [label(left_view.fitted.view, left_view.pair) for left_view, _ in both],
     )
-    off = strays(fitted, found.sigma**2, used)
-    if off and drop:
-        for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
-            sides[one.side][one.pair] = view
-        found, of_fit = again(*sides), []  # remarked on by check_fit
+    outliers = strays(fitted, calibration.sigma**2, used)
+    if outliers and drop:
+        for sight, view in zip(seen, without([fit.view for fit in fitted], outliers), strict=True):
+            sides[sight.side][sight.pair] = view
+        calibration, of_fit = again(*sides), []  # remarked on by check_fit
     done = "was not used" if drop else "is used all the same"
-    remarks = stray_remarks(off, names, done)
-    return dataclasses.replace(found, warnings=(*remarks, *found.warnings, *of_fit))
+    remarks = stray_remarks(outliers, names, done)
+    return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings, *of_fit))
 
 
 class _SeenFrom(NamedTuple):
@@ -175,15 +187,17 @@ class _SeenFrom(NamedTuple):
     fitted: Fitted
 
 
-def _seen(found: StereoCalibration) -> Iterator[_SeenFrom]:
-    for number, pair in enumerate(found.pairs):
+def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
+    for number, pair in enumerate(calibration.pairs):
         if pair.transform is None:
             continue
-        poses = pair.transform, found.transform @ pair.transform
+        poses = pair.transform, calibration.transform @ pair.transform
         for side, view in enumerate((pair.left, pair.right)):
             if view is not None:
-                points = view.target.points + (0.0 if found.sheet is None else found.sheet)
-                camera = (found.left, found.right)[side]
+                points = view.target.points + (
+                    0.0 if calibration.sheet is None else calibration.sheet
+                )
+                camera = (calibration.left, calibration.right)[side]
                 yield _SeenFrom(
                     side, number, pair.used[side], Fitted(view, camera, poses[side].rigid, points)
                 )
@@ -195,10 +209,10 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
     views that fit worst.
     """
-    most = most_rms([one.view for one in sights], MAX_RMS_PX, MAX_RMS_SHARE)
+    most = most_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
-    named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)
+    named = ", ".join(f"{label(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad)
     raise Code.POOR_FIT.refusal(
         "stereo: expected cameras that show the pairs as they are, got residuals of "
         f"{rms:.3g} pixels rms, {most:.3g} at most expected: were the views of each pair taken at "

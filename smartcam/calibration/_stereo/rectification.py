@@ -118,8 +118,8 @@ def rectify(
             MIN_ACROSS_COSINE,
             across,
         )
-    kept = tuple(
-        _kept(camera, turn, projection, output)
+    rectified_maps = tuple(
+        _kept_part(camera, turn, projection, output)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
     return Rectification(
@@ -130,7 +130,7 @@ def rectify(
         depth=depth,
         maps=(maps[0], maps[1]),
         masks=(masks[0], masks[1]),
-        kept=(kept[0], kept[1]),
+        kept=(rectified_maps[0], rectified_maps[1]),
         invalid=(1.0 - float(masks[0].mean()), 1.0 - float(masks[1].mean())),
     )
 
@@ -156,8 +156,8 @@ def _checked(
     return int(width), int(height)
 
 
-def _shape(what: str, expected: str, got: object) -> CalibrationError:
-    return Code.SHAPE.unexpected(f"rectify: {what}: expected {expected}", expected, got)
+def _shape(label: str, expected: str, actual: object) -> CalibrationError:
+    return Code.SHAPE.unexpected(f"rectify: {label}: expected {expected}", expected, actual)
 
 
 def _parallel(
@@ -184,15 +184,17 @@ def _parallel(
         transform.translation,
     )
     if left.distortion_model == "equidistant":
-        found: Any = cv2.fisheye.stereoRectify(
+        rectified: Any = cv2.fisheye.stereoRectify(
             *given, cv2.CALIB_ZERO_DISPARITY, newImageSize=output, balance=alpha
         )
     else:
-        found = cv2.stereoRectify(
+        rectified = cv2.stereoRectify(
             *given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output
         )
-    first, second, one, two, depth = (np.array(each, dtype=np.float64) for each in found[:5])
-    return (first, second), (one, two), depth
+    first, second, first_projection, two, depth = (
+        np.array(each, dtype=np.float64) for each in rectified[:5]
+    )
+    return (first, second), (first_projection, two), depth
 
 
 def _map(
@@ -213,7 +215,9 @@ def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
         return np.asarray((u >= 0) & (v >= 0) & (u <= size[0] - 1) & (v <= size[1] - 1))
 
 
-def _kept(camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]) -> float:
+def _kept_part(
+    camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]
+) -> float:
     """Return the part of the source pixels that are in the output."""
     width, height = camera.size
     step = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))

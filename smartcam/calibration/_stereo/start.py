@@ -82,14 +82,14 @@ def as_moments(
             len(right_views),
         )
     for side, views in zip(SIDES, (left_views, right_views), strict=True):
-        check_views([one for one in views if one is not None], f"{side} camera", 1)
+        check_views([view for view in views if view is not None], f"{side} camera", 1)
     moments = list(zip(left_views, right_views, strict=True))
-    for one, two in moments:
-        if one is not None and two is not None and one.target != two.target:
+    for left, two in moments:
+        if left is not None and two is not None and left.target != two.target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"stereo: expected views of one target, {one.target}, got {two.target} on the "
+                f"stereo: expected views of one target, {left.target}, got {two.target} on the "
                 "right",
-                one.target,
+                left.target,
                 two.target,
             )
     return moments
@@ -122,7 +122,9 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
         (one, two), (first, second) = poses[number], moments[number]
         if two is not None and second is not None:
             moments[number], poses[number] = (first, half_turned(second)), (one, two @ turns[1])
-    firsts = Rigid.stacked(one or (rig.inverse() @ two if two else IDENTITY) for one, two in poses)
+    firsts = Rigid.stacked(
+        left or (rig.inverse() @ two if two else IDENTITY) for left, two in poses
+    )
     basis = lenses.basis(0), lenses.basis(1)
     return FirstGuess(moments, Bundle((left, right), Rigid.stacked([rig]), firsts, basis), apart)
 
@@ -136,18 +138,18 @@ def _side(
     """Return one side's lens, and the target's pose at each moment."""
     seen = [number for number, moment in enumerate(moments) if moment[side] is not None]
     views = [view for moment in moments if (view := moment[side]) is not None]
-    known, what = lenses.known[side], f"{SIDES[side]} camera"
+    known, label = lenses.known[side], f"{SIDES[side]} camera"
     if known is None:
-        found = fit_lens(views, lenses.model, lenses.fixed)
-        check_tilts(found, what)
+        calibration = fit_lens(views, lenses.model, lenses.fixed)
+        check_tilts(calibration, label)
     else:
-        check_views(views, what, 1, known.size)
+        check_views(views, label, 1, known.size)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
-        found = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
+        calibration = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
     poses: list[Rigid | None] = [None] * len(moments)
     for place, number in enumerate(seen):
-        poses[number] = found.bundle.poses.taken(place)
-    return found.bundle.cameras[0], poses
+        poses[number] = calibration.bundle.poses.taken(place)
+    return calibration.bundle.cameras[0], poses
 
 
 def _rig(
@@ -160,35 +162,47 @@ def _rig(
     upside down. Raises ``POOR_FIT``.
     """
     pairs = [
-        (number, one, two, moment[1])
-        for number, ((one, two), moment) in enumerate(zip(poses, moments, strict=True))
-        if one is not None and two is not None and moment[1] is not None
+        (number, left, two, moment[1])
+        for number, ((left, two), moment) in enumerate(zip(poses, moments, strict=True))
+        if left is not None and two is not None and moment[1] is not None
     ]
-    best, least, off = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
-    some = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
-    for turn, (_, one, two, _) in itertools.product(turns, some):
+    best, least, distances = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
+    sampled = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
+    for turn, (_, left, two, _) in itertools.product(turns, sampled):
         # T_right_left = T_right_target T_target_left; the one with the least median error is taken,
         # which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares Regression
         # (1984).
-        guess = two @ turn @ one.inverse()
-        tried = np.array([_off(guess @ pose, view, right, turns) for _, pose, _, view in pairs])
+        guess = two @ turn @ left.inverse()
+        tried = np.array(
+            [_mean_distances(guess @ pose, view, right, turns) for _, pose, _, view in pairs]
+        )
         middle = float(np.median(tried.min(axis=1)))
         if middle < least:
-            best, least, off = guess, middle, tried
+            best, least, distances = guess, middle, tried
     if not math.isfinite(least):
         raise Code.POOR_FIT.refusal(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
-    far = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
-    numbers, nearest = [number for number, *_ in pairs], off.min(axis=1).tolist()
-    apart = {number: one for number, one in zip(numbers, nearest, strict=True) if one > far}
-    turned = [number for number, one in zip(numbers, off, strict=True) if one[0] > one[-1]]
+    limit = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
+    numbers, nearest = [number for number, *_ in pairs], distances.min(axis=1).tolist()
+    apart = {
+        number: nearest_turn
+        for number, nearest_turn in zip(numbers, nearest, strict=True)
+        if nearest_turn > limit
+    }
+    turned = [
+        number
+        for number, distance in zip(numbers, distances, strict=True)
+        if distance[0] > distance[-1]
+    ]
     return best, apart, turned
 
 
-def _off(pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]) -> list[float]:
+def _mean_distances(
+    pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]
+) -> list[float]:
     """Return the mean distance, pixels, of a view's points from a pose's, for each turn."""
     seen = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
-    off = [np.linalg.norm(one - view.points, axis=1) for one in seen]
-    return [float(np.nan_to_num(one, nan=math.inf).mean()) for one in off]
+    distances = [np.linalg.norm(points - view.points, axis=1) for points in seen]
+    return [float(np.nan_to_num(distance, nan=math.inf).mean()) for distance in distances]

@@ -50,7 +50,7 @@ def triangulate(
     """
     points = _linear(pair, pixels)
     points[~(points[:, 2] > 0)] = np.nan
-    white = [whitening(one, 0.0) for one in covariance]
+    white = [whitening(matrix, 0.0) for matrix in covariance]
     normal = np.full((len(points), 3, 3), np.nan)
     for _ in range(MAX_STEPS):
         normal, step = _step(pair, pixels, white, points)
@@ -79,9 +79,9 @@ def _linear(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 12.2.
     first, second = pair.left.directions(pixels[0]), pair.right.directions(pixels[1])
     matrix = np.column_stack([pair.transform.rotation, pair.transform.translation])
-    found = load("cv2").triangulatePoints(np.eye(3, 4), matrix, first.T, second.T)
+    homogeneous = load("cv2").triangulatePoints(np.eye(3, 4), matrix, first.T, second.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        points: Array = np.asarray(found[:3] / found[3], dtype=np.float64).T
+        points: Array = np.asarray(homogeneous[:3] / homogeneous[3], dtype=np.float64).T
     points[~np.isfinite(points).all(axis=1)] = np.nan
     return points
 
@@ -93,14 +93,14 @@ def _step(
     # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
     # points are solved at once, which no solver of single problems does; a thousand take a few
     # milliseconds.
-    one = linearize(points, pair.left)
+    left_part = linearize(points, pair.left)
     two = linearize(pair.transform.apply(points), pair.right)
-    rows = [white[0] @ one.by_point, white[1] @ two.by_point @ pair.transform.rotation]
-    off = [
-        white[0] @ (pixels[0] - one.pixels)[..., None],
+    rows = [white[0] @ left_part.by_point, white[1] @ two.by_point @ pair.transform.rotation]
+    misses = [
+        white[0] @ (pixels[0] - left_part.pixels)[..., None],
         white[1] @ (pixels[1] - two.pixels)[..., None],
     ]
-    jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(off, axis=1)
+    jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(misses, axis=1)
     normal = jacobian.swapaxes(1, 2) @ jacobian
     right_side = jacobian.swapaxes(1, 2) @ residuals
     finite = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
@@ -124,11 +124,11 @@ def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     left, right, transform = pair
     essential = cross_matrix(transform.translation) @ transform.rotation
     seen = [
-        np.column_stack([camera.undistort(some), np.ones(len(some))])
-        for camera, some in zip((left, right), pixels, strict=True)
+        np.column_stack([camera.undistort(pixels_of_camera), np.ones(len(pixels_of_camera))])
+        for camera, pixels_of_camera in zip((left, right), pixels, strict=True)
     ]
     matrix = np.linalg.inv(right.matrix).T @ essential @ np.linalg.inv(left.matrix)
     lines = [seen[1] @ matrix, seen[0] @ matrix.T]
     products = np.abs((seen[1] * lines[1]).sum(axis=1))
-    distances = [products / np.linalg.norm(one[:, :2], axis=1) for one in lines]
+    distances = [products / np.linalg.norm(line[:, :2], axis=1) for line in lines]
     return np.column_stack(distances)

@@ -195,7 +195,7 @@ def read_transform(
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``MALFORMED``: the file does not have the format, or
-            is too large; ``UNIT_UNKNOWN``: nothing says the unit, or a distance of more than 20 m
+            is too large; ``UNIT_UNKNOWN``: nothing names the unit, or a distance of more than 20 m
             or an angle of more than a turn suggests another one; ``NOT_FINITE``, ``NOT_RIGID``,
             ``BAD_NAME``: its values are no pose.
         MissingExtraError: PyYAML is not installed.

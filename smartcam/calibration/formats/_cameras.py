@@ -335,8 +335,10 @@ def compose_opencv(chain: CameraChain) -> str:
         )
     if len(chain.cameras) > len(_MATRICES):
         raise _cannot("opencv", "one camera or two", f"{len(chain.cameras)}")
-    alike, *others = (f"{one.size} pixels and {one.distortion_model}" for one in chain.cameras)
-    if any(one != alike for one in others):
+    alike, *others = (
+        f"{camera.size} pixels and {camera.distortion_model}" for camera in chain.cameras
+    )
+    if any(name != alike for name in others):
         raise _cannot("opencv", f"cameras of {alike}", others[0])
     motion = chain.transforms[0]
     return (
@@ -370,8 +372,8 @@ def parse_opencv(
         data = {**_normal(load_storage(extrinsics)), **data}
     sides = next((ends for ends in _ENDS if _first(data, _MATRIX, ends[0])), None)
     stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
-    whole = _first(data, ("imagesize", "size"), "", [])
-    size = _size(stated or sequence(whole, "image_size"), size)
+    whole_image = _first(data, ("imagesize", "size"), "", [])
+    size = _size(stated or sequence(whole_image, "image_size"), size)
     if sides is None:
         camera = _opencv_camera(data, size, "")
         return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")
@@ -400,13 +402,13 @@ _ENDS: Final = (("1", "2"), ("left", "right"), ("l", "r"))
 
 def _normal(data: Plain) -> dict[str, Plain]:
     """Return a mapping with its names in lower case and without ``_``."""
-    found: dict[str, Plain] = {}
+    normal: dict[str, Plain] = {}
     for name, value in mapping(data, "file").items():
         key = name.lower().replace("_", "")
-        if key in found:
+        if key in normal:
             raise malformed("file", "each name once", name)
-        found[key] = value
-    return found
+        normal[key] = value
+    return normal
 
 
 def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain = None) -> Plain:
@@ -417,7 +419,7 @@ def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain 
 def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
     for names in (_MATRIX, _BENT):
         if _first(data, names, end) is None:
-            expected = f"{names[0]}{end} (or {', '.join(f'{one}{end}' for one in names[1:])})"
+            expected = f"{names[0]}{end} (or {', '.join(f'{name}{end}' for name in names[1:])})"
             raise malformed("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
     coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()
@@ -446,7 +448,7 @@ def _foreign(
     parse: Callable[[str], foreign.Found],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    """Return a format for a parser that returns lenses as the file has them."""
+    """Return a format for a parser that returns lenses in the units of the file."""
 
     def read(
         text: str, given: tuple[int, int] | None = None
@@ -481,9 +483,9 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
 """Formats of cameras by their names."""
 
 
-def _cannot(form: str, expected: str, got: str) -> CalibrationError:
+def _cannot(form: str, expected: str, actual: str) -> CalibrationError:
     return Code.SHAPE.unexpected(
-        f"{form}: expected {expected}, which is all it can hold", expected, got
+        f"{form}: expected {expected}, which is all it can hold", expected, actual
     )
 
 
@@ -497,7 +499,9 @@ def _size(stated: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, 
                 "size=(width, height)",
             )
         return int(given[0]), int(given[1])
-    width, height = (whole(one, "size of the images") for one in sequence([*stated], "size", 2))
+    width, height = (
+        whole(length, "size of the images") for length in sequence([*stated], "size", 2)
+    )
     if given is not None and (width, height) != tuple(given):
         raise Code.WRONG_SIZE.refusal(
             f"size: the file says {width} x {height}, got {given[0]} x {given[1]}",

@@ -38,7 +38,7 @@ class Measured(Generic[T]):
     """A value read from a file whose format does not fix the unit of lengths."""
 
     value: T
-    unit: str | None = None  # unit that the file itself says, or None
+    unit: str | None = None  # unit that the file names, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Format(Generic[T]):
     # any unit, else metres; errors are those of
     # :func:`~smartcam.calibration.formats.read_transform`
     parse: Callable[..., T | Measured[T]]
-    # function that makes a text, without ``head``, of a value; None for a format that is only read.
+    # function that returns a value as text without ``head``; None for a format that is only read.
     # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
     compose: Callable[[T], str] | None = None  # None: it is only read
     head: str = ""  # text at the beginning of each file
@@ -66,7 +66,7 @@ class Format(Generic[T]):
     ) -> T:
         """Read a file; errors are those of ``parse``, and UNIT_UNKNOWN.
 
-        ``unit``: unit of its lengths; None for the unit that the file or its format says.
+        ``unit``: unit of its lengths; None for the unit that the file or its format names.
         """
         with Path(path).open("rb") as stream:
             body = stream.read(self.most + 1)
@@ -83,10 +83,10 @@ class Format(Generic[T]):
                 f"{path}: {self.title}: {exc}", code=exc.code, expected=exc.expected, got=exc.got
             ) from exc
 
-    def _in_metres(self, found: T | Measured[T], unit: str | None) -> T:
-        by_file = isinstance(found, Measured)
-        stated = cast("Measured[T]", found).unit if by_file else "m"
-        value = cast("Measured[T]", found).value if by_file else cast("T", found)
+    def _in_metres(self, parsed: T | Measured[T], unit: str | None) -> T:
+        by_file = isinstance(parsed, Measured)
+        stated = cast("Measured[T]", parsed).unit if by_file else "m"
+        value = cast("Measured[T]", parsed).value if by_file else cast("T", parsed)
         motions = _motions(value)
         if not motions:
             return value
@@ -114,22 +114,22 @@ class Format(Generic[T]):
 
 
 def _motions(value: Any) -> list[Transform]:
-    """Return the motions in the value of a file: one, lists of them to any depth, or a chain's."""
+    """Return all motions in a file's value: a motion, nested lists of motions, or a chain."""
     if isinstance(value, Transform):
         return [value]
     if isinstance(value, (list, tuple)):
-        return [motion for one in value for motion in _motions(one)]
+        return [motion for item in value for motion in _motions(item)]
     return _motions(getattr(value, "transforms", ()))
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """Return the value that a file holds, with all translations multiplied by a factor."""
+    """Return a file's value with all translations multiplied by a factor."""
     if isinstance(value, Transform):
         return dataclasses.replace(value, translation=factor * value.translation)
     if isinstance(value, tuple) and hasattr(value, "_replace"):
-        return type(value)(*(_scaled(one, factor) for one in value))
+        return type(value)(*(_scaled(item, factor) for item in value))
     if isinstance(value, (list, tuple)):
-        return type(value)(_scaled(one, factor) for one in value)
+        return type(value)(_scaled(item, factor) for item in value)
     return dataclasses.replace(value, transforms=_scaled(value.transforms, factor))
 
 

@@ -182,7 +182,7 @@ def _pinhole(program: str, part: dict[str, Plain], where: str, coefficients: str
 
 def parse_colmap(text: str) -> Found:
     """Return the cameras of ``cameras.txt``; it has no poses, so there may be only one camera."""
-    found = []
+    cameras = []
     for line in text.splitlines():
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -192,8 +192,8 @@ def parse_colmap(text: str) -> Found:
         values = [number(word, f"camera {words[0]}") for word in words[4:]]
         lens = _lens("colmap", words[1], values, f"camera {words[0]}", words[2:4])
         fx, fy, cx, cy = lens.focal
-        found.append(lens._replace(focal=(fx, fy, cx - 0.5, cy - 0.5)))
-    return found, [], None
+        cameras.append(lens._replace(focal=(fx, fy, cx - 0.5, cy - 0.5)))
+    return cameras, [], None
 
 
 def parse_mrcal(text: str) -> Found:
@@ -213,7 +213,7 @@ def parse_mrcal(text: str) -> Found:
 def parse_ros_ini(text: str) -> Found:
     """Return the camera of ROS' ``.ini``: lines with titles, and lines with numbers below them."""
     section, title = "camera", ""
-    found: dict[str, list[Plain]] = {}
+    sections: dict[str, list[Plain]] = {}
     for line in map(str.strip, text.splitlines()):
         if not line or line.startswith(("#", ";")):
             continue
@@ -222,12 +222,12 @@ def parse_ros_ini(text: str) -> Found:
                 section = line.strip("[]").strip()
         elif re.fullmatch(r"[a-z ]+", line):
             title = line
-            if title in found:
+            if title in sections:
                 raise malformed("file", "one camera", f"{title!r} twice")
-            found[title] = []
+            sections[title] = []
         else:
-            found.setdefault(title, []).extend(line.split())
-    data = mapping(found, "file", ["width", "height", "camera matrix", "distortion"])
+            sections.setdefault(title, []).extend(line.split())
+    data = mapping(sections, "file", ["width", "height", "camera matrix", "distortion"])
     matrix = np.reshape(reals(data["camera matrix"], "camera matrix", 9), (3, 3))
     coefficients = reals(data["distortion"], "distortion")
     model: DistortionModel = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
@@ -256,9 +256,9 @@ def parse_basalt(text: str) -> Found:
     cameras = sequence(data["intrinsics"], "intrinsics")
     sizes = sequence(data["resolution"], "resolution", len(cameras)) if "resolution" in data else []
     lenses = []
-    for place, one in enumerate(cameras):
+    for place, camera in enumerate(cameras):
         where = f"cam{place}"
-        part = mapping(one, where, ["camera_type", "intrinsics"])
+        part = mapping(camera, where, ["camera_type", "intrinsics"])
         parameters = MODELS["basalt"].get(str(part["camera_type"]), _LensParameters(_FXFY))
         names = [*parameters.focal.split(), *parameters.coefficients.split()]
         given = mapping(part["intrinsics"], where, names)
@@ -280,8 +280,8 @@ def parse_multical(text: str) -> Found:
     data = mapping(load_json(text), "file", ["cameras"])
     cameras = mapping(data["cameras"], "cameras")
     lenses = []
-    for name, one in cameras.items():
-        part = mapping(one, name, ["model", "K", "dist"])
+    for name, stated in cameras.items():
+        part = mapping(stated, name, ["model", "K", "dist"])
         matrix = matrix_of(part["K"], f"{name}.K", (3, 3))
         flat = [value for row in sequence(part["dist"], f"{name}.dist") for value in _flat(row)]
         coefficients = reals(flat, f"{name}.dist")

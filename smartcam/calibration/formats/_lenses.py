@@ -77,9 +77,9 @@ def read_lenses(
         head = stream.read(HEAD_BYTES)
     for form, mark in FORMAT_PATTERNS.items():
         if mark.search(head):
-            found = read_cameras(path, form, size=size, unit=unit)
-            lenses = tuple(Lens(one) for one in found.cameras)
-            return StoredLenses(found.names, lenses, found.transforms)
+            cameras = read_cameras(path, form, size=size, unit=unit)
+            lenses = tuple(Lens(camera) for camera in cameras.cameras)
+            return StoredLenses(cameras.names, lenses, cameras.transforms)
     if head.lstrip().startswith(b"{"):
         return _ours(path)
     raise Code.UNKNOWN_FORMAT.refusal(
@@ -94,10 +94,10 @@ def _of_pair(pair: StereoCalibration) -> StoredLenses:
     sides = []
     for number, camera in enumerate((pair.left, pair.right)):
         seen = [
-            one.transform.apply(view.object_points)
-            for one in pair.pairs
-            for view in ((one.left, one.right)[number],)
-            if one.used[number] and one.transform is not None and view is not None
+            pair.transform.apply(view.object_points)
+            for pair in pair.pairs
+            for view in ((pair.left, pair.right)[number],)
+            if pair.used[number] and pair.transform is not None and view is not None
         ]
         points = np.concatenate(seen) if seen else None
         if points is not None and number:
@@ -128,9 +128,9 @@ def _ours(path: str | os.PathLike[str]) -> StoredLenses:
     if document.kind == StereoCalibration.kind:
         return _of_pair(StereoCalibration.from_data(document.data))
     if document.kind == HandEyeCalibration.kind:
-        found = _of_robot(HandEyeCalibration.from_data(document.data))
-        if found is not None:
-            return found
+        calibration = _of_robot(HandEyeCalibration.from_data(document.data))
+        if calibration is not None:
+            return calibration
     raise Code.WRONG_KIND.refusal(
         f"{path}: holds {document.kind!r}, expected a calibration that has a lens",
         "a calibration that has a lens",

@@ -130,8 +130,8 @@ def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
     data = mapping(load_storage(text), "file")
     names = [
         name
-        for name, one in data.items()
-        if isinstance(one, dict) and (one.get("rows"), one.get("cols")) == ("4", "4")
+        for name, entry in data.items()
+        if isinstance(entry, dict) and (entry.get("rows"), entry.get("cols")) == ("4", "4")
     ]
     if len(names) != 1:
         raise malformed("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")

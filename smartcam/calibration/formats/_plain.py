@@ -56,10 +56,10 @@ _MAX_EXACT_DEVIATION = 1e-6
 same bound."""
 
 
-def malformed(what: str, expected: str, got: object = None) -> CalibrationError:
-    """Return the error for a text that does not have its format; ``got`` is shortened."""
-    shown = None if got is None else _cut(got)
-    text = f"{what}: expected {expected}" + ("" if shown is None else f", got {shown}")
+def malformed(label: str, expected: str, actual: object = None) -> CalibrationError:
+    """Return the error for a text that does not have its format; ``actual`` is shortened."""
+    shown = None if actual is None else _cut(actual)
+    text = f"{label}: expected {expected}" + ("" if shown is None else f", got {shown}")
     return Code.MALFORMED.refusal(text, expected, shown)
 
 
@@ -70,11 +70,11 @@ def within(where: str, error: CalibrationError) -> CalibrationError:
     )
 
 
-def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
+def known(table: Mapping[str, T], name: str, label: str = "format") -> T:
     """Return a table's value for a name; raise ``UNKNOWN_FORMAT`` if there is none."""
     if not isinstance(name, str) or name not in table:
         raise Code.UNKNOWN_FORMAT.refusal(
-            f"no {what} is called {name!r}; expected one of {', '.join(table)}", list(table), name
+            f"no {label} is called {name!r}; expected one of {', '.join(table)}", list(table), name
         )
     return table[name]
 
@@ -108,7 +108,7 @@ def load_yaml(text: str) -> Plain:
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
         text = text.partition("\n")[2]
     try:
-        root = compose(text, what="reading YAML")
+        root = compose(text, label="reading YAML")
         return None if root is None else _plain(root, set(), 0)
     except BadYamlError as exc:
         raise malformed("file", f"YAML ({_cut(str(exc))})") from exc
@@ -122,33 +122,33 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
         raise malformed(line, f"no alias, and at most {MAX_DEPTH} lists in lists")
     seen.add(id(node))
     if node.id == "sequence":
-        return [_plain(one, seen, depth + 1) for one in node.value]
-    found: dict[str, Plain] = {}
+        return [_plain(item, seen, depth + 1) for item in node.value]
+    plain: dict[str, Plain] = {}
     for key, value in node.value:
         name = str(key.value) if key.id == "scalar" else ""
-        if not name or name in found:
+        if not name or name in plain:
             raise malformed(line, "keys that are texts, each once", name)
-        found[name] = _plain(value, seen, depth + 1)
-    return found
+        plain[name] = _plain(value, seen, depth + 1)
+    return plain
 
 
 def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
     """Return a value that must be a mapping with these keys; it may have others."""
     if not isinstance(value, dict):
         raise malformed(where, "a mapping", value)
-    found = cast("dict[str, Plain]", value)
-    missing = [key for key in keys if key not in found]
+    fields = cast("dict[str, Plain]", value)
+    missing = [key for key in keys if key not in fields]
     if missing:
-        raise malformed(where, f"the keys {', '.join(keys)}", ", ".join(found) or "none")
-    return found
+        raise malformed(where, f"the keys {', '.join(keys)}", ", ".join(fields) or "none")
+    return fields
 
 
 def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
     """Return a value that must be a list, of ``count`` items if that is given."""
-    found: list[Plain] | None = value if isinstance(value, list) else None
-    if found is None or count not in {None, len(found)}:
+    sequence_: list[Plain] | None = value if isinstance(value, list) else None
+    if sequence_ is None or count not in {None, len(sequence_)}:
         raise malformed(where, "a list" if count is None else f"a list of {count}", value)
-    return found
+    return sequence_
 
 
 def number(value: Plain, where: str) -> float:
@@ -173,13 +173,15 @@ def number(value: Plain, where: str) -> float:
 
 def reals(value: Plain, where: str, count: int | None = None) -> list[float]:
     """Return the numbers of a list, of ``count`` if that is given."""
-    return [number(one, where) for one in sequence(value, where, count)]
+    return [number(item, where) for item in sequence(value, where, count)]
 
 
 def matrix_of(value: Plain, where: str, shape: tuple[int, int]) -> Array:
     """Return a matrix that is stored as a list of rows."""
     rows = sequence(value, where, shape[0])
-    return np.array([reals(one, where, shape[1]) for one in rows]).reshape(shape)
+    return np.array([reals(numbers_of_row, where, shape[1]) for numbers_of_row in rows]).reshape(
+        shape
+    )
 
 
 def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
@@ -210,18 +212,18 @@ def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
 
     ``where``: name of the mapping, for the error.
     """
-    found = mapping(value, where, keys)
-    if len(found) != len(keys):
-        raise malformed(where, f"the keys {', '.join(keys)} alone", ", ".join(found))
-    return [number(found[key], f"{where}.{key}") for key in keys]
+    fields = mapping(value, where, keys)
+    if len(fields) != len(keys):
+        raise malformed(where, f"the keys {', '.join(keys)} alone", ", ".join(fields))
+    return [number(fields[key], f"{where}.{key}") for key in keys]
 
 
 def flag(value: Plain, where: str) -> bool:
     """Return a truth value."""
-    found = _FLAGS.get(value.lower()) if isinstance(value, str) else None
-    if found is None:
+    flag_ = _FLAGS.get(value.lower()) if isinstance(value, str) else None
+    if flag_ is None:
         raise malformed(where, "true or false", value)
-    return found
+    return flag_
 
 
 def frame_name(value: Plain, where: str) -> str:
@@ -250,8 +252,8 @@ def rigid(
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
         raise malformed(where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3]))
     rotation = matrix[:3, :3]
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if _MAX_EXACT_DEVIATION <= off < _MAX_PRINTED_DEVIATION:
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if _MAX_EXACT_DEVIATION <= error < _MAX_PRINTED_DEVIATION:
         rotation = _nearest_rotation(rotation)
     return Transform(target, source, rotation, matrix[:3, 3])
 

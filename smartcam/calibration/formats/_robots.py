@@ -106,11 +106,11 @@ def _angles(
     """
     return (
         lambda given: _turned(
-            rotation_zyx(*(math.radians(signs * one) for one in given.tolist()[order])), signs
+            rotation_zyx(*(math.radians(signs * angle) for angle in given.tolist()[order])), signs
         ),
         lambda pose: [
-            signs * math.degrees(one)
-            for one in list(angles_zyx(_turned(pose.rotation, signs)))[order]
+            signs * math.degrees(angle)
+            for angle in list(angles_zyx(_turned(pose.rotation, signs)))[order]
         ],
     )
 
@@ -126,7 +126,7 @@ class PoseConvention(NamedTuple):
     metre: float  # number of length units in a metre
     # function that converts the numbers after the position to a rotation (3, 3)
     rotation: Callable[[Array], Array]
-    orientation: Callable[[Transform], list[float]]  # its inverse, from a pose
+    orientation: Callable[[Transform], list[float]]  # inverse function, from a pose
     title: str  # form of the orientation, in words
 
 
@@ -191,19 +191,19 @@ def pose_from(
             farther than 20 m without a ``unit``, or a rotation vector has more than a turn.
     """
     convention = known(ROBOTS, robot, "robot's convention")
-    what = f"pose of {robot} ({', '.join(convention.numbers)})"
-    given = as_vector(values, len(convention.numbers), what)
+    label = f"pose of {robot} ({', '.join(convention.numbers)})"
+    given = as_vector(values, len(convention.numbers), label)
     if not np.abs(given).max() <= MAX_NUMBER:
         raise Code.NOT_FINITE.unexpected(
-            f"{what}: expected numbers of at most {MAX_NUMBER:g}", MAX_NUMBER, given.tolist()
+            f"{label}: expected numbers of at most {MAX_NUMBER:g}", MAX_NUMBER, given.tolist()
         )
     if unit is None:
         position = given[:3] / convention.metre
-        check_length(float(np.linalg.norm(position)), what)
+        check_length(float(np.linalg.norm(position)), label)
     else:
-        position = given[:3] * metres_of(unit, what)
+        position = given[:3] * metres_of(unit, label)
     if robot == "ur":
-        check_angles([float(np.linalg.norm(given[3:]))], what)
+        check_angles([float(np.linalg.norm(given[3:]))], label)
     return Transform(target, source, convention.rotation(given[3:]), position)
 
 

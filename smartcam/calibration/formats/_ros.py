@@ -81,15 +81,15 @@ def _from_words(words: list[str]) -> Transform:
 
 def _from_launch(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
-    nodes = [one.attrib for one in load_xml(text.strip()).iter("node")]
-    found = [
-        one["args"]
-        for one in nodes
-        if _COMMAND in (one.get("type"), one.get("exec")) and "args" in one
+    nodes = [node.attrib for node in load_xml(text.strip()).iter("node")]
+    arguments = [
+        node["args"]
+        for node in nodes
+        if _COMMAND in (node.get("type"), node.get("exec")) and "args" in node
     ]
-    if len(found) != 1:
-        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(found)))
-    return found[0]
+    if len(arguments) != 1:
+        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(arguments)))
+    return arguments[0]
 
 
 def _from_python(text: str) -> list[str]:
@@ -99,21 +99,21 @@ def _from_python(text: str) -> list[str]:
     except (SyntaxError, ValueError, MemoryError, RecursionError) as exc:
         raise malformed("launch file", f"Python ({exc})") from exc
     calls = [
-        {one.arg: one.value for one in node.keywords}
+        {keyword.arg: keyword.value for keyword in node.keywords}
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
     ]
-    found = [
-        one["arguments"]
-        for one in calls
-        if "arguments" in one
-        and isinstance(one.get("executable"), ast.Constant)
-        and getattr(one["executable"], "value", None) == _COMMAND
+    arguments = [
+        call["arguments"]
+        for call in calls
+        if "arguments" in call
+        and isinstance(call.get("executable"), ast.Constant)
+        and getattr(call["executable"], "value", None) == _COMMAND
     ]
-    if len(found) != 1:
-        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(found)))
+    if len(arguments) != 1:
+        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(arguments)))
     try:
-        words = ast.literal_eval(found[0])
+        words = ast.literal_eval(arguments[0])
     except (ValueError, TypeError, MemoryError, RecursionError) as exc:
         raise malformed("arguments", "texts and numbers, no variables or calls", "others") from exc
     return [str(word) for word in sequence(words, "arguments")]
@@ -126,16 +126,16 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
     """
     joints = {}
     for joint in load_xml(text.strip()).iter("joint"):
-        ends = [one.get("link", "") for kind in ("parent", "child") for one in joint.iter(kind)]
+        ends = [link.get("link", "") for kind in ("parent", "child") for link in joint.iter(kind)]
         if len(ends) == 2:
             joints[ends[0], ends[1]] = joint
     names = (target, source)
     if names not in joints and len(joints) == 1:
         (names,) = joints
     if names not in joints:
-        there = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
-        raise malformed("file", f"a joint of parent {target} and child {source}", there)
-    given = next((one.attrib for one in joints[names].iter("origin")), {})
+        joints_text = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
+        raise malformed("file", f"a joint of parent {target} and child {source}", joints_text)
+    given = next((origin.attrib for origin in joints[names].iter("origin")), {})
     place, turn = (
         reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
     )
@@ -149,7 +149,7 @@ def _from_options(words: Sequence[str]) -> Transform:
         if option not in options or option in given or value is None:
             raise malformed("arguments", f"options {', '.join(options)}, each once", option)
         given[option] = value
-    missing = [one for one in _FRAMES if one not in given]
+    missing = [frame for frame in _FRAMES if frame not in given]
     if missing or (given.keys() & _QUATERNION and given.keys() & _ANGLES):
         raise malformed(
             "arguments",
@@ -159,13 +159,14 @@ def _from_options(words: Sequence[str]) -> Transform:
     return _transform(
         _values(_POSITION, given),
         _values(_ANGLES if given.keys() & _ANGLES else _QUATERNION, given),
-        [given[one] for one in _FRAMES],
+        [given[frame] for frame in _FRAMES],
     )
 
 
 def _values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
     return [
-        number(given[one], one) if one in given else default for one, default in defaults.items()
+        number(given[field], field) if field in given else default
+        for field, default in defaults.items()
     ]
 
 
@@ -205,7 +206,7 @@ def _is_number(word: str) -> bool:
 def _transform(
     position: Sequence[float], turn: Sequence[float], frames: Sequence[str]
 ) -> Transform:
-    frame, child = (frame_name(one, "frame") for one in frames)
+    frame, child = (frame_name(frame, "frame") for frame in frames)
     if len(turn) == 4:
         return Transform.from_quaternion(frame, child, position, turn)
     check_angles(turn, "yaw, pitch and roll")

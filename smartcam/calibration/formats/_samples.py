@@ -53,15 +53,15 @@ def parse_json(text: str) -> list[HandEyeSample]:
     samples = sequence(load_json(text), "file")
     pairs = [sequence(pair, f"sample {index}", 2) for index, pair in enumerate(samples)]
     return [
-        _sample(index, *(matrix_of(one, f"sample {index}", (4, 4)) for one in pair))
+        _sample(index, *(matrix_of(matrix, f"sample {index}", (4, 4)) for matrix in pair))
         for index, pair in enumerate(pairs)
     ]
 
 
 def parse_yaml(text: str) -> list[HandEyeSample]:
     """Return the samples of a YAML file; frames are base, effector, camera and object."""
-    found, keys = sequence(load_yaml(text), "file"), (_HAND, _SEEN)
-    pairs = [mapping(pair, f"sample {index}", keys) for index, pair in enumerate(found)]
+    samples, keys = sequence(load_yaml(text), "file"), (_HAND, _SEEN)
+    pairs = [mapping(pair, f"sample {index}", keys) for index, pair in enumerate(samples)]
     return [
         _sample(index, *(np.reshape(reals(pair[key], key, 16), (4, 4)) for key in keys))
         for index, pair in enumerate(pairs)
@@ -78,7 +78,7 @@ def _sample(index: int, hand: Array, seen: Array) -> HandEyeSample:
 def compose_json(samples: Sequence[HandEyeSample]) -> str:
     """Return samples as JSON, which has no place for the frames' names."""
     _check(samples)
-    pairs = [[matrix_rows(one.hand), matrix_rows(one.seen)] for one in samples]
+    pairs = [[matrix_rows(sample.hand), matrix_rows(sample.seen)] for sample in samples]
     return f"[{','.join(chr(10) + json.dumps(pair) for pair in pairs)}\n]\n"
 
 
@@ -86,24 +86,25 @@ def compose_yaml(samples: Sequence[HandEyeSample]) -> str:
     """Return samples as YAML, which has no place for the frames' names."""
     _check(samples)
     text = "".join(
-        f"- {_HAND}: [{_listed(one.hand)}]\n  {_SEEN}: [{_listed(one.seen)}]\n" for one in samples
+        f"- {_HAND}: [{_listed(sample.hand)}]\n  {_SEEN}: [{_listed(sample.seen)}]\n"
+        for sample in samples
     )
     return text or "[]\n"
 
 
 def _check(samples: Sequence[HandEyeSample]) -> None:
-    same_frames([one.hand for one in samples])
-    same_frames([one.seen for one in samples])
+    same_frames([sample.hand for sample in samples])
+    same_frames([sample.seen for sample in samples])
 
 
 def same_frames(transforms: Sequence[Transform]) -> None:
     """Raise ``WRONG_FRAME`` unless all are between the same frames, which the file cannot name."""
-    for index, one in enumerate(transforms):
-        if (one.target, one.source) != (transforms[0].target, transforms[0].source):
+    for index, transform in enumerate(transforms):
+        if (transform.target, transform.source) != (transforms[0].target, transforms[0].source):
             raise Code.WRONG_FRAME.unexpected(
                 f"number {index}: expected {transforms[0].label} as the first is",
                 transforms[0].label,
-                one.label,
+                transform.label,
             )
 
 

@@ -109,10 +109,10 @@ def _header(line: str) -> _Columns | None:
             places = tuple(names.index(name) for name in columns)
             seconds = _SECONDS.get(units[places[0]] or unit)
             if seconds is not None:
-                found = {units[place] for place in places[1:4]}
-                if len(found) > 1:
+                units_found = {units[place] for place in places[1:4]}
+                if len(units_found) > 1:
                     raise malformed("header", "one unit of x, y and z", line)
-                return _Columns(places, len(cells), seconds, found.pop() or None)
+                return _Columns(places, len(cells), seconds, units_found.pop() or None)
     return None
 
 
@@ -148,14 +148,14 @@ def compose_asl(transforms: Sequence[Transform]) -> str:
     time, or before 1970.
     """
     return _ASL_HEAD + "".join(
-        f"{time // 1_000_000}.{time % 1_000_000:06d},{','.join(map(repr, row(one)))}\n"
-        for time, one in _timed(transforms)
+        f"{time // 1_000_000}.{time % 1_000_000:06d},{','.join(map(repr, row(transform)))}\n"
+        for time, transform in _timed(transforms)
     )
 
 
 def compose_euroc(transforms: Sequence[Transform]) -> str:
     """Return poses in EuRoC's columns: nanoseconds, the real part first."""
-    rows = [(time, *row(one)) for time, one in _timed(transforms)]
+    rows = [(time, *row(transform)) for time, transform in _timed(transforms)]
     return _EUROC_HEAD + "".join(
         f"{time}000,{x!r},{y!r},{z!r},{qw!r},{qx!r},{qy!r},{qz!r}\n"
         for time, x, y, z, qx, qy, qz, qw in rows
@@ -164,11 +164,11 @@ def compose_euroc(transforms: Sequence[Transform]) -> str:
 
 def _timed(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
     same_frames(transforms)
-    found: list[tuple[int, Transform]] = []
-    for index, one in enumerate(transforms):
-        if one.at is None or one.at < _EPOCH:
+    timed: list[tuple[int, Transform]] = []
+    for index, transform in enumerate(transforms):
+        if transform.at is None or transform.at < _EPOCH:
             raise Code.BAD_TIME.unexpected(
-                f"number {index}: expected a time since 1970", got=one.at
+                f"number {index}: expected a time since 1970", got=transform.at
             )
-        found.append(((one.at - _EPOCH) // timedelta(microseconds=1), one))
-    return found
+        timed.append(((transform.at - _EPOCH) // timedelta(microseconds=1), transform))
+    return timed

@@ -58,9 +58,9 @@ def storage_data(element: ElementTree.Element) -> Plain:
         return text.split() if listed and '"' not in text else text.strip('"')
     if all(child.tag == "_" for child in element):
         return [storage_data(child) for child in element]
-    found: dict[str, Plain] = {}
+    data: dict[str, Plain] = {}
     for child in element:
-        if child.tag in found:
+        if child.tag in data:
             raise malformed(element.tag, "each name once", child.tag)
-        found[child.tag] = storage_data(child)
-    return found
+        data[child.tag] = storage_data(child)
+    return data

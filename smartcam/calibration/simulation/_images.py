@@ -119,8 +119,8 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
             "its z away from the camera",
         )
     along = np.linspace(0.0, 1.0, 50)
-    zero, one = np.zeros(50), np.ones(50)
-    parts = np.column_stack([np.r_[along, one, along, zero], np.r_[zero, along, one, along]])
+    zero, ones = np.zeros(50), np.ones(50)
+    parts = np.column_stack([np.r_[along, ones, along, zero], np.r_[zero, along, ones, along]])
     rim = (paper[0] + parts * (paper[1] - paper[0])) @ pose.rotation[:, :2].T + pose.translation
     nearest = float(rim[:, 2].min())
     if not nearest > 0:
@@ -264,8 +264,8 @@ def _charuco(target: Charuco, sheet: _Samples) -> Floats:
     down = np.floor(modules / 2 - (y[cells] - row[cells] - 0.5) / part).astype(np.intp)
     marked = (number >= 0) & (across >= 0) & (across < modules) & (down >= 0) & (down < modules)
     patterns = np.zeros((number.max() + 1, modules, modules), dtype=np.bool_)
-    for one in np.unique(number[marked]):
-        patterns[one] = dictionary.generateImageMarker(int(one), modules) == 0
+    for marker in np.unique(number[marked]):
+        patterns[marker] = dictionary.generateImageMarker(int(marker), modules) == 0
     dark = np.zeros(len(number), dtype=np.bool_)
     dark[marked] = patterns[number[marked], down[marked], across[marked]]
     black[cells] = np.maximum(black[cells], dark)
@@ -275,7 +275,7 @@ def _charuco(target: Charuco, sheet: _Samples) -> Floats:
 def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
     """Return markers, and for Kalibr's grids the squares between their corners."""
     pitch, side, gap = (
-        np.float32(one) for one in (target.marker + target.gap, target.marker, target.gap)
+        np.float32(length) for length in (target.marker + target.gap, target.marker, target.gap)
     )
     places, parts, markers, between = [], [], [], []
     for at, grain, count in (
@@ -289,9 +289,9 @@ def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
         parts.append(part / side)
         markers.append(inside * _share(np.minimum(part, side - part), grain))
         # the nearer gap: before or after the marker
-        near = np.where(part < side / 2, part + gap, part - side)
-        whole = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
-        between.append(whole * _share(np.minimum(near, gap - near), grain))
+        distance = np.where(part < side / 2, part + gap, part - side)
+        is_inside = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
+        between.append(is_inside * _share(np.minimum(distance, gap - distance), grain))
     (column, row), (across, up) = places, parts
     numbers = column + target.columns * (row if target.kalibr else target.rows - 1 - row)
     patterns = marker_patterns(target)

@@ -121,8 +121,8 @@ def around(
         looking = np.column_stack([side, np.cross(-out, side), -out])
         roll = random.uniform(-math.pi / 2, math.pi / 2)
         rotation = looking @ exp_rotation(np.array([0.0, 0.0, roll]))
-        far = distance * random.uniform(0.8, 1.2)
-        poses.append(Transform("target", "camera", rotation, centre + far * out))
+        reach = distance * random.uniform(0.8, 1.2)
+        poses.append(Transform("target", "camera", rotation, centre + reach * out))
     return poses
 
 
@@ -203,7 +203,9 @@ class HandEyeScene:
         count = len(self.target.points)
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
         transforms = [self.seen(pose) for pose in self.robot_poses]
-        pixels = [self.camera.project(one.apply(self.target.points)) for one in transforms]
+        pixels = [
+            self.camera.project(transform.apply(self.target.points)) for transform in transforms
+        ]
         flat = np.zeros((len(points), count, 0))
         seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels), flat)
         poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)

@@ -59,13 +59,13 @@ ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
 
 MAX_VIEWS = 40
-"""A run takes at most this many views: far more than it needs."""
+"""Largest number of views of a run, far more than are needed."""
 
 ADVISED_VIEWS = 10
-"""From this number of views on, the wizard offers to calculate first."""
+"""Number of views from which on the calculation is the wizard's first choice."""
 
 CALCULATION_TIMEOUT = 120.0
-"""Seconds that the calculation may take; with 15 views it takes a few."""
+"""Timeout of the calculation, seconds; with 15 views it takes a few seconds."""
 
 _MOVES: Mapping[str, str] = {
     "eye-in-hand": "Bring the camera to where it looks at the sheet",
@@ -76,8 +76,7 @@ TOUCHES = 3
 """Number of touches that verify a calibration, at points of the sheet that are far apart."""
 
 SUGGESTIONS = tuple(look.text for look in LOOKS)
-"""Views to take, one after the other; then again from the beginning, a bit beside the earlier
-ones."""
+"""Suggested views in order; after the last one they are suggested again, slightly changed."""
 
 
 def hand_eye_wizard(
@@ -104,9 +103,9 @@ def hand_eye_wizard(
         take_picture: function that takes a picture while the robot stands still; or an open source
             of frames, of which the first frame exposed after the button is used.
         save_to: function that returns the file for a name.
-        target: target on the sheet, with its lengths as they are on paper; None: it is asked for.
-        suggested: default of the target that is asked for.
-        read_robot: function that reads the pose of the flange; None: it is typed.
+        target: target on the sheet, with the lengths on paper; None: the wizard asks for it.
+        suggested: default of the question for the target.
+        read_robot: function that reads the pose of the flange; None: the user types poses.
         camera: the camera's lens; None: calibrated from the same views.
         awaited: description, for people, of the picture that ``take_picture`` waits for, as from
             :attr:`PictureFolder.awaited`; empty if ``take_picture`` takes one.
@@ -148,7 +147,9 @@ async def _ask_setup(
     robot = Option(
         name="robot",
         label="How the robot shows the pose of its flange",
-        options={name: f"{', '.join(one.numbers)}; {one.title}" for name, one in ROBOTS.items()},
+        options={
+            name: f"{', '.join(robot.numbers)}; {robot.title}" for name, robot in ROBOTS.items()
+        },
     )
     label = "Largest error that is good enough; empty: a hundredth of the sheet's distance"
     allowed = replace(ALLOWED, label=label)
@@ -167,7 +168,7 @@ async def _ask_setup(
 
 @dataclass(eq=False)
 class _Views:
-    """One run of the wizard; its state follows from the answers alone."""
+    """One run of the wizard; its state depends on the answers only."""
 
     _target: Target
     _setup: Setup
@@ -216,13 +217,13 @@ class _Views:
             seen = motion_from_data(lying, CAMERA, TARGET)
             places = (calibration.camera_pose @ seen).apply(points)
         columns = shape_of(self._target)[0]
-        off: list[float] = []
+        errors: list[float] = []
         for direction in DIAGONALS[:TOUCHES]:
             number = int(np.argmax(points[:, :2] @ direction))
             row, column = divmod(number, columns)
             step = Step(
-                id=f"verify-{len(off) + 1}",
-                title=f"Touch {len(off) + 1} of {TOUCHES}",
+                id=f"verify-{len(errors) + 1}",
+                title=f"Touch {len(errors) + 1} of {TOUCHES}",
                 description=f"Move the tip of the tool onto point {column + 1} of row {row + 1} of "
                 "the sheet, counted from its origin, and take the tip's position from the robot, "
                 "in its base.",
@@ -230,11 +231,11 @@ class _Views:
             )
             answer = await ask(step)
             touched = np.array([1e-3 * answer[axis] for axis in "xyz"])
-            off.append(1e3 * float(np.linalg.norm(touched - places[number])))
-        note = f"the tip touched the sheet {', '.join(f'{one:.2f}' for one in off)} mm off"
-        others = tuple(one for one in calibration.warnings if one.code != Code.REFUTED)
+            errors.append(1e3 * float(np.linalg.norm(touched - places[number])))
+        note = f"the tip touched the sheet {', '.join(f'{error:.2f}' for error in errors)} mm off"
+        others = tuple(warning for warning in calibration.warnings if warning.code != Code.REFUTED)
         allowed = calibration.allowed
-        if max(off) > allowed.error:
+        if max(errors) > allowed.error:
             others = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *others)
         return replace(calibration, warnings=others), note
 
@@ -283,7 +284,7 @@ class _Views:
         return bool(sample)
 
     def _progress(self, count: int) -> str:
-        """Return a text with the number of views so far, and those advised and allowed."""
+        """Return a text with the numbers of views so far, advised and allowed."""
         end = (
             "to end, choose to calculate"
             if count >= MIN_POSES
@@ -296,12 +297,12 @@ class _Views:
         if answers.get("next") == "calculate":
             return {}
         typed = None
-        if isinstance(self._robot, str):  # a pose that is not valid must not cost a picture
+        if isinstance(self._robot, str):  # refuse an invalid pose before a picture is taken
             typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
         flange = typed or await self._flange()
         name = f"view {len(self._samples) + 1}"
-        view, preview, following = await asyncio.to_thread(self._found, image, name)
+        view, preview, following = await asyncio.to_thread(self._view_in, image, name)
         frames = [flange.target, flange.source]
         return {
             "frames": frames,
@@ -317,7 +318,7 @@ class _Views:
         pose = await self._robot()
         return Transform.from_pose(pose, "flange") if isinstance(pose, Pose) else pose
 
-    def _found(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
+    def _view_in(self, image: Any, name: str) -> tuple[TargetView, str, Suggestion]:
         """Return the view found in a picture, an SVG of it, and the next suggestion.
 
         A large SVG is left out.
@@ -335,7 +336,9 @@ class _Views:
 
     def _views(self) -> list[TargetView]:
         """Return the views, named by their numbers."""
-        views = [TargetView.from_data(one["view"], target=self._target) for one in self._samples]
+        views = [
+            TargetView.from_data(sample["view"], target=self._target) for sample in self._samples
+        ]
         return [replace(view, name=f"view {number}") for number, view in enumerate(views, 1)]
 
     def preview(self) -> dict[str, Any] | None:
@@ -352,19 +355,19 @@ class _Views:
             notes=(f"{len(self._samples)} views",),
             timeout=CALCULATION_TIMEOUT,
         )
-        found = (await ask(step, self._solve)).outcome
-        if "code" in found:
-            worst, code = len(self._samples), Code(found["code"])
-            judgement = refused(code, found["text"], worst=worst, cures=VIEW_CURES)
-            return None, (f"{code}: {found['text']}",), judgement
-        views = [one.to_data() for one in self._views()]
-        calibration = HandEyeCalibration.from_data({**found, "views": views})
+        check = (await ask(step, self._solve)).outcome
+        if "code" in check:
+            worst, code = len(self._samples), Code(check["code"])
+            judgement = refused(code, check["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {check['text']}",), judgement
+        views = [view.to_data() for view in self._views()]
+        calibration = HandEyeCalibration.from_data({**check, "views": views})
         _, _, notes, judgement = _outcome(calibration)
         return calibration, notes, judgement
 
     async def _solve(self, _answers: Answers) -> dict[str, Any]:
         """Return the calibration without the samples' views, or the reason why there is none."""
-        poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
+        poses = [motion_from_data(sample["pose"], *sample["frames"]) for sample in self._samples]
         work = partial(
             calibrate_hand_eye,
             poses,
@@ -405,7 +408,7 @@ class _Views:
 
 
 def _pose_inputs(robot: str, *, optional: bool) -> tuple[Number, ...]:
-    """Return the inputs of a pose; if it is ``optional``, it may be left out to calculate."""
+    """Return the inputs of a pose; if ``optional``, an empty pose means to calculate."""
     convention = ROBOTS[robot]
     unit = "mm" if convention.metre > 1 else "m"
     return tuple(
@@ -430,7 +433,7 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
 
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
-    remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
+    remarks = [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()
     figures = {
         **judgement.figures,
@@ -438,17 +441,17 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "mean_mm": 1e3 * calibration.mean_error,
-        "translation_error_mm": _known(1e3, calibration.translation_error),
-        "rotation_error_deg": _known(math.degrees(1.0), calibration.rotation_error),
+        "translation_error_mm": _measured(1e3, calibration.translation_error),
+        "rotation_error_deg": _measured(math.degrees(1.0), calibration.rotation_error),
         "remarks": remarks,
     }
     notes = [f"{figures['views']} views, {figures['method']}"]
     if held_out is not None:
         worst = calibration.worst
-        off = 1e3 * float(calibration.leave_one_out[worst])
+        error = 1e3 * float(calibration.leave_one_out[worst])
         notes += [
             f"{figures['held_out_mm']:.3g} mm rms on the sheet, at views that were left out",
-            f"the worst is view {worst + 1}: {off:.3g} mm",
+            f"the worst is view {worst + 1}: {error:.3g} mm",
         ]
     if figures["translation_error_mm"] is not None:
         notes.append(
@@ -458,5 +461,5 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     return Calibrated(calibration, figures, (*notes, *remarks), judgement)
 
 
-def _known(factor: float, value: float) -> float | None:
+def _measured(factor: float, value: float) -> float | None:
     return factor * value if math.isfinite(value) else None

@@ -105,8 +105,8 @@ class Journal:
         if os.fstat(self._stream.fileno()).st_size > _MAX_FILE:
             raise self._broken(f"more than {_MAX_FILE} bytes")
         data = self._stream.read() or b""
-        whole = data.rfind(b"\n") + 1
-        for number, line in enumerate(data[:whole].splitlines(), 1):
+        complete = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[:complete].splitlines(), 1):
             try:
                 value = json.loads(line)
             except ValueError as exc:
@@ -117,7 +117,7 @@ class Journal:
                 self.header = value
             else:
                 self.entries.append(value)
-        self._size = whole
+        self._size = complete
         self._cut()
 
     def _write(self, value: dict[str, Any]) -> dict[str, Any]:
@@ -140,9 +140,9 @@ class Journal:
         return read
 
     def _put(self, line: bytes) -> None:
-        rest = memoryview(line)
-        while rest:
-            rest = rest[self._stream.write(rest) :]
+        unwritten = memoryview(line)
+        while unwritten:
+            unwritten = unwritten[self._stream.write(unwritten) :]
         os.fsync(self._stream.fileno())
 
     def _cut(self) -> None:

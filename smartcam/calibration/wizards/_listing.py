@@ -52,14 +52,14 @@ def _row(folder: Folder, name: str) -> dict[str, Any]:
 def _held_out(kind: str, data: dict[str, Any]) -> float | None:
     """Return the held-out error of a calibration, mm."""
     if kind == HandEyeCalibration.kind:
-        found = HandEyeCalibration.from_data(data).held_out_error
+        error = HandEyeCalibration.from_data(data).held_out_error
     elif kind in KINDS:
         read = KINDS[kind].from_data(data)
         plane = read.plane if isinstance(read, SheetCalibration) else read
-        found = plane.held_out_error
+        error = plane.held_out_error
     else:
         return None
-    return None if found is None else 1e3 * found
+    return None if error is None else 1e3 * error
 
 
 def _last_check(path: Path) -> dict[str, Any]:
@@ -67,11 +67,11 @@ def _last_check(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as stream:
             stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE_BYTES))
-            *whole, _ = stream.read(2 * MAX_LINE_BYTES).split(b"\n")
+            *lines, _ = stream.read(2 * MAX_LINE_BYTES).split(b"\n")
     except FileNotFoundError:
         return {}
     try:
-        check = json.loads(whole[-1])
+        check = json.loads(lines[-1])
     except (IndexError, ValueError):
         return {}
     return check if isinstance(check, dict) else {}

@@ -79,38 +79,38 @@ class MarkCamera:
 
         Cancellation: as that of ``localize``.
         """
-        found = await self.localize()
+        localizations = await self.localize()
         rows = [
             {
-                "feature_id": one.feature_id,
-                "quality": one.quality,
-                "photo_index": one.photo_index,
-                "frame_id": one.pose.header.frame_id,
-                "x": one.pose.position.x,
-                "y": one.pose.position.y,
-                "theta": one.pose.orientation.theta,
+                "feature_id": localization.feature_id,
+                "quality": localization.quality,
+                "photo_index": localization.photo_index,
+                "frame_id": localization.pose.header.frame_id,
+                "x": localization.pose.position.x,
+                "y": localization.pose.position.y,
+                "theta": localization.pose.orientation.theta,
                 "y_down": self.y_down,
             }
-            for one in found
-            if self.feature in {"", one.feature_id}
+            for localization in localizations
+            if self.feature in {"", localization.feature_id}
         ]
         if not 0 < len(rows) <= MAX_MARKS:
             wanted = f"{self.feature!r} " if self.feature else ""
             raise (Code.SHAPE if rows else Code.TOO_FEW).refusal(
-                f"the camera found {len(rows)} marks {wanted}among {len(found)} localizations; "
-                f"expected 1 to {MAX_MARKS}",
+                f"the camera found {len(rows)} marks {wanted}among {len(localizations)} "
+                f"localizations; expected 1 to {MAX_MARKS}",
                 got=len(rows),
             )
         return rows
 
-    def check_y_down(self, before: bool | None, what: str) -> None:
+    def check_y_down(self, before: bool | None, label: str) -> None:
         """Raise MIRRORED if the direction of the y axis differs from ``before`` (None: unknown).
 
-        ``what``: name, for people, of the earlier picture or calibration.
+        ``label``: name, for people, of the earlier picture or calibration.
         """
         if None not in {before, self.y_down} and before != self.y_down:
             raise Code.MIRRORED.refusal(
-                f"{what} with y_down={before}, now it is {self.y_down}, and everything would be "
+                f"{label} with y_down={before}, now it is {self.y_down}, and everything would be "
                 f"mirrored; expected y_down={before}",
                 before,
                 self.y_down,
@@ -123,7 +123,7 @@ def clickable(marks: Sequence[Mark], answers: Sequence[Answers]) -> dict[str, An
         {"at": [mark.x, mark.y], "label": str(number), "answers": answer}
         for number, (mark, answer) in enumerate(zip(marks, answers, strict=True), 1)
     ]
-    return {"points": [], "marks": [one["at"] for one in choices], "choices": choices}
+    return {"points": [], "marks": [choice["at"] for choice in choices], "choices": choices}
 
 
 async def choose(marks: list[Mark], unit: str) -> list[Mark]:

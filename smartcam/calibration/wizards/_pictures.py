@@ -91,7 +91,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     try:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
-    except cv2.error:  # for no bytes, and for more pixels than OpenCV allows
+    except cv2.error:  # error for no bytes, and for more pixels than OpenCV allows
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
@@ -177,17 +177,17 @@ class PictureFolder:
     def _names(self) -> set[str]:
         """Return the names of the entries of the folder that are no pictures."""
         with contextlib.suppress(OSError):
-            found = [one.name for one in itertools.islice(self.path.iterdir(), MAX_FILES)]
-            return {one for one in found if Path(one).suffix.lower() not in SUFFIXES}
+            names = [path.name for path in itertools.islice(self.path.iterdir(), MAX_FILES)]
+            return {name for name in names if Path(name).suffix.lower() not in SUFFIXES}
         return set()
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
         """Return a note on files that came instead of a picture, and on earlier ones."""
         notes = [f"there before: {len(before)}"] if before else []
-        came = sorted(self._names() - others)
-        if came:
-            more = f" and {len(came) - 3} more" if len(came) > 3 else ""
-            notes.insert(0, f"came, but no picture: {', '.join(came[:3])}{more}")
+        new_names = sorted(self._names() - others)
+        if new_names:
+            more = f" and {len(new_names) - 3} more" if len(new_names) > 3 else ""
+            notes.insert(0, f"came, but no picture: {', '.join(new_names[:3])}{more}")
         return f" ({'; '.join(notes)})" if notes else ""
 
     def _look(self) -> dict[str, tuple[int, int]]:
@@ -221,5 +221,5 @@ class PictureFolder:
         return decode_picture(data, name)
 
 
-def _bad(name: str, expected: str, got: str) -> CalibrationError:
-    return Code.BAD_PICTURE.unexpected(f"{name}: expected {expected}", expected, got)
+def _bad(name: str, expected: str, actual: str) -> CalibrationError:
+    return Code.BAD_PICTURE.unexpected(f"{name}: expected {expected}", expected, actual)

@@ -116,7 +116,7 @@ class _MarkSource(PointSource):
             button="Take a picture",
             notes=(f"{done} points so far",) if done else (),
         )
-        await self.add_marks(await self._seen(step), MAX_POINTS, "points")
+        await self.add_marks(await self._ask_for_picture(step), MAX_POINTS, "points")
 
     async def redo(self, index: int) -> None:
         mark = self.touches[index].mark
@@ -132,7 +132,7 @@ class _MarkSource(PointSource):
             "must not hide the origin mark.",
             button="Take a picture",
         )
-        marks = [Mark.of(row) for row in await self._seen(step)]
+        marks = [Mark.of(row) for row in await self._ask_for_picture(step)]
         if len(marks) == 1:
             return marks[0], scale
         unit = self.camera_unit
@@ -161,11 +161,13 @@ class _MarkSource(PointSource):
         )
         return float((await ask(step))["ruler"]) / RULER_MM
 
-    async def _seen(self, step: Step) -> Sequence[Mapping[str, Any]]:
+    async def _ask_for_picture(self, step: Step) -> Sequence[Mapping[str, Any]]:
         """Ask for a picture; remember the direction of its y axis."""
         rows: Sequence[Mapping[str, Any]] = (await ask(step, self._picture)).outcome
         directions = [row.get("y_down") for row in rows]
-        self.y_down = next((one for one in directions if one is not None), self.y_down)
+        self.y_down = next(
+            (direction for direction in directions if direction is not None), self.y_down
+        )
         return rows
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
@@ -174,7 +176,7 @@ class _MarkSource(PointSource):
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_plane(
-            [(one.mark.x, one.mark.y) for one in self.touches],
+            [(touch.mark.x, touch.mark.y) for touch in self.touches],
             self.places,
             touch_sigma=self.sigma,
             nominal_scale=1.0 if self.camera_unit == "m" else None,

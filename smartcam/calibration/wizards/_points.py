@@ -134,11 +134,11 @@ class PointSource(Touches, ABC):
             "method": about["method"],
             "samples": [
                 {
-                    **self.sample(one),
-                    "robot": list(one.robot),
-                    "tool_z": None if one.tool_z is None else list(one.tool_z),
+                    **self.sample(touch),
+                    "robot": list(touch.robot),
+                    "tool_z": None if touch.tool_z is None else list(touch.tool_z),
                 }
-                for one in self.touches
+                for touch in self.touches
             ],
         }
         preview = self._preview(plane)
@@ -209,8 +209,8 @@ class PointSource(Touches, ABC):
                     again.clear()  # the numbers of points have changed
                 case "reorder" if order is not None:
                     self.touches = [
-                        replace(one, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
-                        for one, i in zip(self.touches, order.order, strict=True)
+                        replace(touch, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
+                        for touch, i in zip(self.touches, order.order, strict=True)
                     ]
                 case "side":
                     await self._ask_side()
@@ -221,7 +221,7 @@ class PointSource(Touches, ABC):
         """Ask where the tool pointed at all touches."""
         step = Step(id="side", title="Where the tool points", inputs=(SIDE,))
         self.side = (await ask(step))["side"]
-        self.touches = [replace(one, tool_z=SIDES[self.side]) for one in self.touches]
+        self.touches = [replace(touch, tool_z=SIDES[self.side]) for touch in self.touches]
 
     def _try_fit(
         self, *, robust: bool
@@ -243,7 +243,7 @@ class PointSource(Touches, ABC):
         """Return the order of touches that explains them far better, if there is exactly one."""
         touched = np.array(self.places)
         sigma = self.sigma or MAX_SIGMA.of(extent(touched))
-        marks = np.array([(one.mark.x, one.mark.y) for one in self.touches])
+        marks = np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
         return better_order(marks, touched, sigma)
 
     def _blamed(self, error: CalibrationError) -> Judgement:
@@ -261,13 +261,13 @@ class PointSource(Touches, ABC):
 
     def _fits_without(self, index: int) -> bool:
         """Return True if the touches fit without one of them, and another one is left as a test."""
-        rest = copy.copy(self)
-        rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        others = copy.copy(self)
+        others.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
-            codes = {one.code for one in rest.fit(robust=False).warnings}
+            codes = {warning.code for warning in others.fit(robust=False).warnings}
         except CalibrationError:
             return False
-        return len(rest.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
+        return len(others.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,
@@ -294,7 +294,9 @@ class PointSource(Touches, ABC):
             options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
         if judgement.option == "side" and self._read_robot is None:
             options["side"] = "say where the tool points"
-        doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
+        doubtful = plane is None or any(
+            warning.code in _SIGNS_OF_OUTLIERS for warning in plane.warnings
+        )
         if robust:
             options["all"] = "count all points, also those that do not agree with the others"
         elif len(self.touches) >= MIN_POINTS and doubtful:
@@ -309,7 +311,7 @@ class PointSource(Touches, ABC):
         """Return the data for a picture of the touches."""
         if plane is None:
             return {**plain(self.touches), "choices": self._choices()}
-        found = compared(
+        comparison = compared(
             plane,
             self.touches,
             plane.camera_points,
@@ -318,11 +320,13 @@ class PointSource(Touches, ABC):
             worst=plane.worst,
             left_out=plane.outliers,
         )
-        return {**found, **self.SHOWN, "choices": self._choices(found["points"])}
+        return {**comparison, **self.SHOWN, "choices": self._choices(comparison["points"])}
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
         """Return the touches as clickable choices, at the places where they are drawn."""
-        places = [one["at"][:2] for one in points] or [[t.mark.x, t.mark.y] for t in self.touches]
+        places = [point["at"][:2] for point in points] or [
+            [t.mark.x, t.mark.y] for t in self.touches
+        ]
         return [
             {"at": place, "label": str(number), "answers": {"point": number}}
             for number, place in enumerate(places, 1)
@@ -439,11 +443,11 @@ async def ask_to_save(
 
 
 def calibrated_plane(
-    calibration: PlaneCalibration, what: str = "the camera's x axis", along: Array | None = None
+    calibration: PlaneCalibration, label: str = "the camera's x axis", along: Array | None = None
 ) -> Calibrated:
     """Return a plane's calibration with its figures, in mm, and its notes.
 
-    ``what``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
+    ``label``: name of a direction, ``along`` (3,) in the robot's frame; None: the camera's x axis.
     """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
@@ -466,10 +470,10 @@ def calibrated_plane(
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
     x, y, z = calibration.rotation[:, 0] if along is None else along
     notes.append(
-        f"{what} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
+        f"{label} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
     )
-    notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
+    notes += [f"{warning.code}: {warning.text}" for warning in calibration.warnings]
     judgement = calibration.judged()
     figures = {
         **judgement.figures,
@@ -479,6 +483,6 @@ def calibrated_plane(
         "residual_mm": residual,
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "predicted_mm": predicted,
-        "remarks": [[one.code.value, one.text] for one in calibration.warnings],
+        "remarks": [[warning.code.value, warning.text] for warning in calibration.warnings],
     }
     return Calibrated(calibration, figures, tuple(notes), judgement)

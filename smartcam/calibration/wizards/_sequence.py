@@ -128,10 +128,10 @@ class _ScriptRun:
         self._send(None)
         for number, entry in enumerate(entries, 1):
             if self.request is None or self.request.step.id != entry["step"]:
-                here = "the end" if self.request is None else f"step {self.request.step.id!r}"
+                place = "the end" if self.request is None else f"step {self.request.step.id!r}"
                 self.close()
                 raise Code.WRONG_JOURNAL.refusal(
-                    f"entry {number} is of step {entry['step']!r}, expected {here}: another "
+                    f"entry {number} is of step {entry['step']!r}, expected {place}: another "
                     f"version of {wizard.name!r} wrote it"
                 )
             self.take(entry)
@@ -228,12 +228,12 @@ class WizardSession:
         self._run = self._resumed()
         if journal is not None and journal.header is None:
             journal.start(header)
-        self.resumed: dict[str, Any] | None = self._told_of(header)
+        self.resumed: dict[str, Any] | None = self._resumed_facts(header)
         self._errors: dict[str, str] = {}
         self._lock = asyncio.Lock()
         self._scope: asyncio.Timeout | None = None
 
-    def _told_of(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
+    def _resumed_facts(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return facts about the resumed journal; None if there is nothing to resume.
 
         They are shown because measurements may be old: touched marks may have moved since.
@@ -241,8 +241,8 @@ class WizardSession:
         if self.state != "asking" or not self._log.entries:
             return None
         done = [
-            {"step": one["step"], "answers": one["answers"], "at": one["at"]}
-            for one in copy.deepcopy(self._log.entries)
+            {"step": entry["step"], "answers": entry["answers"], "at": entry["at"]}
+            for entry in copy.deepcopy(self._log.entries)
         ]
         times = {"since": header.get("started_at"), "last": done[-1]["at"]}
         return {**times, "done": done, "parameters": copy.deepcopy(self.parameters)}
@@ -260,18 +260,18 @@ class WizardSession:
 
     def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         wizard, journal = self.wizard, self._journal
-        mine = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
+        expected = {"schema": SCHEMA, "wizard": wizard.name, "version": wizard.version}
         if journal is not None and journal.header is not None:
-            found = {name: journal.header.get(name) for name in mine}
-            if found != mine:
+            actual = {name: journal.header.get(name) for name in expected}
+            if actual != expected:
                 raise Code.WRONG_JOURNAL.refusal(
-                    f"{journal.path}: written by {_named(found)}, expected {_named(mine)}",
-                    mine,
-                    found,
+                    f"{journal.path}: written by {_named(actual)}, expected {_named(expected)}",
+                    expected,
+                    actual,
                 )
             return journal.header
         return {
-            **mine,
+            **expected,
             "flow": secrets.token_hex(8),
             "started_at": datetime.now(UTC).isoformat(),
             "parameters": _stored(dict(parameters), "the parameters"),
@@ -304,7 +304,7 @@ class WizardSession:
     def samples(self) -> list[dict[str, Any]]:
         """Answers and outcomes that were not undone, in order: ``step, answers, outcome, at``."""
         names = ("step", "answers", "outcome", "at")
-        return [{name: copy.deepcopy(one[name]) for name in names} for one in self._log.entries]
+        return [{name: copy.deepcopy(entry[name]) for name in names} for entry in self._log.entries]
 
     @property
     def token(self) -> str:
@@ -360,8 +360,8 @@ class WizardSession:
         """Return the approximate number of steps; None if it is not known."""
         if not self.wizard.steps or self.step is None:
             return None
-        rest = {"save": 0, "review": 1}.get(self.step.id, 2)
-        return max(self.wizard.steps, len(self._log.entries) + 1 + rest)
+        remaining = {"save": 0, "review": 1}.get(self.step.id, 2)
+        return max(self.wizard.steps, len(self._log.entries) + 1 + remaining)
 
     def _can(self) -> list[str]:
         if self.state != "asking":
@@ -491,16 +491,16 @@ class WizardSession:
             )
         return request
 
-    def _before(self, what: str, token: str) -> _ScriptRun:
-        """Return the coroutine as it was before the last step; ``what`` names the call."""
+    def _before(self, label: str, token: str) -> _ScriptRun:
+        """Return the coroutine as it was before the last step; ``label`` names the call."""
         self._expect(token)
-        if what not in self._can():
-            raise self._impossible(what)
+        if label not in self._can():
+            raise self._impossible(label)
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
-    def _impossible(self, what: str) -> CalibrationError:
+    def _impossible(self, label: str) -> CalibrationError:
         return Code.NOT_POSSIBLE.refusal(
-            f"{what}: not possible here; expected one of {', '.join(self._can())}", got=what
+            f"{label}: not possible here; expected one of {', '.join(self._can())}", got=label
         )
 
     async def _act(self, request: PendingStep, values: Answers) -> Any:
@@ -579,12 +579,12 @@ def _named(header: Mapping[str, Any]) -> str:
     return f"{header['wizard']!r} version {header['version']} ({header['schema']})"
 
 
-def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
+def _stored(value: dict[str, Any], label: str) -> dict[str, Any]:
     """Return a value as it will be read, so that a resumed sequence has the same one."""
     try:
         read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:
-        raise Code.NOT_STORABLE.refusal(f"{what} cannot be stored: {exc}") from exc
+        raise Code.NOT_STORABLE.refusal(f"{label} cannot be stored: {exc}") from exc
     return read
 
 

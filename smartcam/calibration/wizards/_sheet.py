@@ -153,9 +153,9 @@ class _SheetSource(PointSource):
 
         async def look(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
-            found = await asyncio.to_thread(_found, image, self._target, lens)
+            sighting = await asyncio.to_thread(_sheet_in, image, self._target, lens)
             known = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
-            return {**found, "lens_covariance": known}
+            return {**sighting, "lens_covariance": known}
 
         step = Step(
             id="picture",
@@ -167,11 +167,16 @@ class _SheetSource(PointSource):
             waiting=f"Waiting: {awaited}" if awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
-        found = (await ask(step, look)).outcome
-        self._view = TargetView.from_data(found["view"], target=self._target)
-        self._camera = None if found["camera"] is None else CameraModel.from_data(found["camera"])
-        self._lens_covariance = found.get("lens_covariance")  # older journals have no entry for it
-        self._svg = found["preview"]
+        picture_taken = (await ask(step, look)).outcome
+        self._view = TargetView.from_data(picture_taken["view"], target=self._target)
+        self._camera = (
+            None
+            if picture_taken["camera"] is None
+            else CameraModel.from_data(picture_taken["camera"])
+        )
+        # older journals have no entry for it
+        self._lens_covariance = picture_taken.get("lens_covariance")
+        self._svg = picture_taken["preview"]
 
     def shown(self, mark: Mark) -> dict[str, Any]:
         """Return notes on the picture, and the picture with a ring around the point."""
@@ -254,7 +259,7 @@ class _SheetSource(PointSource):
         return int(ids[int(np.argmax(nearest))])
 
     def _touched(self) -> list[int]:
-        return [one.mark.number or 0 for one in self.touches]
+        return [touch.mark.number or 0 for touch in self.touches]
 
     def fit(self, *, robust: bool) -> PlaneCalibration:
         return fit_corners(
@@ -274,7 +279,7 @@ class _SheetSource(PointSource):
 
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
         frame = self.about["camera_frame"] or None
-        found = calibrate_sheet(
+        calibration = calibrate_sheet(
             self._view,
             plane,
             camera=self._camera,
@@ -282,34 +287,39 @@ class _SheetSource(PointSource):
             camera_frame=frame,
         )
         middle = self._view.points.mean(axis=0)
-        ends = found.transform(np.add(middle, [[0.0, 0.0], [1.0, 0.0]]))
+        ends = calibration.transform(np.add(middle, [[0.0, 0.0], [1.0, 0.0]]))
         right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         _, figures, lines, _ = calibrated_plane(plane, "what is to the right in the picture", right)
         seen, predicted = len(self._view.ids), None
-        notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
+        notes = [*lines, f"{seen} points seen, {calibration.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:
-            errors = found.predicted_error(self._view.points)
+            errors = calibration.predicted_error(self._view.points)
             predicted = 1e3 * math.sqrt(float((errors**2).mean()))
             unknown = "; the lens' distortion comes on top"
-            if found.camera is not None:
-                known = found.lens_covariance is not None
+            if calibration.camera is not None:
+                known = calibration.lens_covariance is not None
                 unknown = "" if known else "; the lens' own error, which is not known, comes on top"
             notes.append(
                 f"predicted error from pixel to robot {predicted:.3f} mm rms where the target was "
                 f"seen{unknown}"
             )
-        notes += [f"{one.code}: {one.text}" for one in found.remarks]
-        remarks = [[one.code.value, one.text] for one in found.warnings]
-        judgement = found.judged()
-        more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
-        return Calibrated(found, figures | more | judgement.figures, tuple(notes), judgement)
+        notes += [f"{remark.code}: {remark.text}" for remark in calibration.remarks]
+        remarks = [[warning.code.value, warning.text] for warning in calibration.warnings]
+        judgement = calibration.judged()
+        more = {
+            "predicted_mm": predicted,
+            "seen": seen,
+            "rms_px": calibration.rms,
+            "remarks": remarks,
+        }
+        return Calibrated(calibration, figures | more | judgement.figures, tuple(notes), judgement)
 
     def example(self) -> tuple[float, float]:
         u, v = self._view.points[0].tolist()
         return u, v
 
 
-def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
+def _sheet_in(image: Any, target: Target, lens: CameraModel | None) -> dict[str, Any]:
     """Return a picture's view, the lens, and an SVG if it is small, as JSON takes them."""
     view = find_target(image, target)
     preview = draw_sheet(image, view, look_at_sheet(view, lens).plane)

@@ -107,15 +107,15 @@ class Number(Input):
     def _checked(self, value: object) -> Any:
         if value is None and self.optional:
             return None
-        whole = "a whole number" if self.integer else "a number"
+        expected = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _misfit(value, whole)
+            raise _misfit(value, expected)
         if not self.minimum <= value <= self.maximum:  # NaN is outside of every range
-            raise _misfit(value, f"{whole} from {self.minimum:g} to {self.maximum:g}")
+            raise _misfit(value, f"{expected} from {self.minimum:g} to {self.maximum:g}")
         if not self.integer:
             return float(value)
         if value != math.floor(value):
-            raise _misfit(value, whole)
+            raise _misfit(value, expected)
         return int(value)
 
 
@@ -225,20 +225,24 @@ class Step:
         return {
             "$schema": DIALECT,
             "type": "object",
-            "properties": {one.name: one.schema() for one in self.inputs},
-            "required": [one.name for one in self.inputs if one.name not in self.defaults()],
+            "properties": {input_field.name: input_field.schema() for input_field in self.inputs},
+            "required": [
+                input_field.name
+                for input_field in self.inputs
+                if input_field.name not in self.defaults()
+            ],
             "additionalProperties": False,
         }
 
     def defaults(self) -> Answers:
         """Return the default answers by their inputs' names; inputs may have none."""
         values: Answers = {}
-        for one in self.inputs:
-            value = one.default
-            if value is None and isinstance(one, Option):
-                value = next(iter(one.options))
-            if value is not None or (isinstance(one, Number) and one.optional):
-                values[one.name] = value
+        for input_field in self.inputs:
+            value = input_field.default
+            if value is None and isinstance(input_field, Option):
+                value = next(iter(input_field.options))
+            if value is not None or (isinstance(input_field, Number) and input_field.optional):
+                values[input_field.name] = value
         return values
 
     def with_defaults(self, parameters: Mapping[str, Any]) -> Step:
@@ -247,7 +251,10 @@ class Step:
         Raises:
             CalibrationError: WRONG_ANSWERS: a parameter is no valid answer.
         """
-        return replace(self, inputs=tuple(_with_default(one, parameters) for one in self.inputs))
+        return replace(
+            self,
+            inputs=tuple(_with_default(input_field, parameters) for input_field in self.inputs),
+        )
 
     def checked(self, answers: object) -> Answers:
         """Return answers in their internal form, with defaults for missing ones.
@@ -261,30 +268,30 @@ class Step:
         given = {**self.defaults(), **cast("Mapping[str, Any]", answers)}
         errors: dict[str, str] = {}
         values: Answers = {}
-        for one in self.inputs:
+        for input_field in self.inputs:
             try:
-                values[one.name] = one.checked(given.pop(one.name))
+                values[input_field.name] = input_field.checked(given.pop(input_field.name))
             except KeyError:
-                errors[one.name] = "no answer"
+                errors[input_field.name] = "no answer"
             except ValueError as exc:
-                errors[one.name] = str(exc)
+                errors[input_field.name] = str(exc)
         if given:
-            names = ", ".join(one.name for one in self.inputs) or "nothing"
+            names = ", ".join(input_field.name for input_field in self.inputs) or "nothing"
             errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {names}"
         if errors:
             raise _wrong(errors)
         return values
 
 
-def _with_default(one: Input, parameters: Mapping[str, Any]) -> Input:
-    value = parameters.get(one.name)
+def _with_default(input_field: Input, parameters: Mapping[str, Any]) -> Input:
+    value = parameters.get(input_field.name)
     if value is None:
-        return one
+        return input_field
     try:
-        return replace(one, default=one.checked(value))
+        return replace(input_field, default=input_field.checked(value))
     except ValueError as exc:
         raise Code.WRONG_ANSWERS.refusal(
-            f"parameter {one.name}: {exc}", got={one.name: str(exc)}
+            f"parameter {input_field.name}: {exc}", got={input_field.name: str(exc)}
         ) from exc
 
 
@@ -311,22 +318,24 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
     for kind in ("values", "strings", "options"):
         lists[f"descriptions_for_needed_{kind}"] = []
         lists[f"default_needed_{kind}"] = []
-    for one in step.inputs:
-        kind, default = _as_listed(one, step.defaults().get(one.name))
-        unit = f" [{one.unit}]" if isinstance(one, Number) and one.unit else ""
-        lists[f"descriptions_for_needed_{kind}"].append(one.label + unit)
+    for input_field in step.inputs:
+        kind, default = _as_listed(input_field, step.defaults().get(input_field.name))
+        unit = (
+            f" [{input_field.unit}]" if isinstance(input_field, Number) and input_field.unit else ""
+        )
+        lists[f"descriptions_for_needed_{kind}"].append(input_field.label + unit)
         lists[f"default_needed_{kind}"].append(default)
     return lists
 
 
-def _as_listed(one: Input, default: Any) -> tuple[str, Any]:
-    match one:
+def _as_listed(input_field: Input, default: Any) -> tuple[str, Any]:
+    match input_field:
         case Number():
             return "values", 0.0 if default is None else float(default)
         case Text():
             return "strings", default or ""
         case Option():
-            return "options", " ".join([str(default), *one.options])
+            return "options", " ".join([str(default), *input_field.options])
         case _:
             return "options", " ".join(["yes" if default else "no", *_YES_NO])
 
@@ -353,11 +362,15 @@ def from_lists(
         if len(row) != count:
             raise _wrong({"base": f"{len(row)} {kind}: expected {count}"})
     answers: Answers = {}
-    for one in step.inputs:
-        value = given[_as_listed(one, None)[0]].pop(0)
-        if isinstance(one, Flag):
+    for input_field in step.inputs:
+        value = given[_as_listed(input_field, None)[0]].pop(0)
+        if isinstance(input_field, Flag):
             value = _YES_NO.get(value, value)
-        elif isinstance(one, Number) and one.optional and value == 0.0 < one.minimum:
+        elif (
+            isinstance(input_field, Number)
+            and input_field.optional
+            and value == 0.0 < input_field.minimum
+        ):
             value = None
-        answers[one.name] = value
+        answers[input_field.name] = value
     return answers

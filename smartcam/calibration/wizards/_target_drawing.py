@@ -105,8 +105,8 @@ def draw(
         f'href="data:image/png;base64,{_png(grey.bytes)}"/>',
         *canvas.covered(counts),
     ]
-    found = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
-    texts = [found, _seen(counts, earlier, view)]
+    summary = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
+    texts = [summary, _covered(counts, earlier, view)]
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:
@@ -160,7 +160,9 @@ def _with(svg: str, parts: Sequence[str]) -> str:
     return "\n".join([head.rstrip("\n"), *parts, END]) + tail
 
 
-def _seen(counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None) -> str:
+def _covered(
+    counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None
+) -> str:
     views = len(earlier) + (view is not None)
     plural = "" if views == 1 else "s"
     return f"{np.count_nonzero(counts)} of {counts.size} cells seen by {views} view{plural}"

@@ -33,19 +33,19 @@ def _length(name: str, label: str, *, optional: bool = False) -> Number:
 
 _INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
     "checkerboard": (
-        *(replace(one, label=f"{one.label} of inner corners") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of inner corners") for count in _COUNTS),
         _length("square", "Side of a square"),
         Flag(name="origin_mark", label="A black dot marks the origin", default=True),
     ),
     "charuco": (
-        *(replace(one, label=f"{one.label} of squares") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of squares") for count in _COUNTS),
         _length("square", "Side of a square"),
         _length("marker", "Side of a marker"),
         Text(name="dictionary", label="Dictionary of the markers", default="DICT_5X5_250"),
         Flag(name="legacy_pattern", label="Printed by an OpenCV before 4.6"),
     ),
     "circles": (
-        *(replace(one, label=f"{one.label} of dots") for one in _COUNTS),
+        *(replace(count, label=f"{count.label} of dots") for count in _COUNTS),
         _length("spacing", "Distance of two dots of a row"),
         _length("diameter", "Diameter of a dot"),
         Flag(name="asymmetric", label="Every other row is shifted"),
@@ -121,7 +121,7 @@ async def _which_target(suggested: Target | None, square: float | None) -> Targe
         return target_from_data(_checked(data))
     step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
     given = await ask(step.with_defaults({"square": square}))
-    lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
+    lengths = {field.name for field in _INPUTS[kind] if isinstance(field, Number) and field.unit}
     values = {
         name: 1e-3 * value if name in lengths and value is not None else value
         for name, value in given.items()

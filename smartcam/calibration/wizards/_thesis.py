@@ -129,7 +129,7 @@ class CalibrationStart(NamedTuple):
     def topics(self) -> list[str]:
         """Topics with pictures that the request names, the preferred one first."""
         named = (self.topic_image2, self.topic_image1)
-        return [one for one in named if one not in {"", SMARTCAMERA}]
+        return [topic for topic in named if topic not in {"", SMARTCAMERA}]
 
     @property
     def source(self) -> str:
@@ -185,7 +185,7 @@ class _Sequence:
         pictured: time of the last picture, UTC; None if it is not known.
     """
 
-    asked: CalibrationStart
+    start_request: CalibrationStart
     first: Step
     service: CalibrationService | None = None
     shown: bool = False
@@ -244,7 +244,7 @@ class ThesisCalibration:
 
     # ------------------------------------------------------------------ StartCalibration
 
-    async def start(self, asked: CalibrationStart) -> None:
+    async def start(self, request: CalibrationStart) -> None:
         """Begin a calibration; :meth:`perform` returns its first step.
 
         Raises:
@@ -254,14 +254,14 @@ class ThesisCalibration:
         """
         self._check_free()
         graph = self.graph
-        self._check_graph(asked.topics, asked.tf_frame_robot_tcp)
-        base = asked.tf_frame_robot_base
-        if graph is not None and asked.tf_frame_robot_tcp and not base:
+        self._check_graph(request.topics, request.tf_frame_robot_tcp)
+        base = request.tf_frame_robot_base
+        if graph is not None and request.tf_frame_robot_tcp and not base:
             with self._alone("StartCalibration"):
-                base = await graph.root(asked.tf_frame_robot_tcp)
+                base = await graph.root(request.tf_frame_robot_tcp)
             self._check_free()
-        asked = asked._replace(tf_frame_robot_base=base)
-        self._sequence = _Sequence(asked, _first_step(asked, self._name))
+        request = request._replace(tf_frame_robot_base=base)
+        self._sequence = _Sequence(request, _first_step(request, self._name))
         self._touch()
 
     def _check_free(self) -> None:
@@ -288,11 +288,11 @@ class ThesisCalibration:
 
     # ------------------------------------------------------- PerformCurrentAndGetNextStep
 
-    async def perform(self, asked: StepRequest, camera: CalibrationCamera) -> dict[str, Any]:
+    async def perform(self, request: StepRequest, camera: CalibrationCamera) -> dict[str, Any]:
         """Answer the step that was returned last; return the fields of the next step.
 
         Args:
-            asked: request with the answers.
+            request: request with the answers.
             camera: the camera that this call uses.
 
         Raises:
@@ -306,21 +306,21 @@ class ThesisCalibration:
                 f"{self._name}: no calibration is under way ({self._last}); expected "
                 "StartCalibration first"
             )
-        if asked.abort:
+        if request.abort:
             return await self._abort(sequence)
         with self._alone("PerformCurrentAndGetNextStep"):
             self._camera = camera
-            errors = await self._performed(sequence, asked)
+            errors = await self._performed(sequence, request)
         if sequence.aborted:
             return _fields(_ABORTED, f"{self._name}: another call has aborted the calibration")
         return self._reply(sequence, errors)
 
     @contextlib.contextmanager
-    def _alone(self, what: str) -> Iterator[None]:
+    def _alone(self, label: str) -> Iterator[None]:
         """Refuse a call while another call is running."""
         if self._busy:
             raise Code.NOT_POSSIBLE.refusal(
-                f"{self._name}: another call is under way; {what} was not done. Expected its "
+                f"{self._name}: another call is under way; {label} was not done. Expected its "
                 "answer to come first, or abort"
             )
         self._busy = True
@@ -331,27 +331,27 @@ class ThesisCalibration:
             self._busy = False
             self._touch()
 
-    async def _performed(self, sequence: _Sequence, asked: StepRequest) -> Mapping[str, str]:
+    async def _performed(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
         """Carry out a request; return its errors by the inputs' names."""
         first, sequence.shown = not sequence.shown, True
         try:
-            if self.graph is not None and sequence.asked.tf_frame_robot_tcp:
+            if self.graph is not None and sequence.start_request.tf_frame_robot_tcp:
                 self.graph.listen()  # so that the robot's pose at the picture is known
-            if asked.repeat_last_step:
+            if request.repeat_last_step:
                 return await self._back(sequence)
             if first:
-                return _early_inputs(asked)
-            return await self._answered(sequence, asked)
+                return _early_inputs(request)
+            return await self._answered(sequence, request)
         except SmartCamError as exc:
             return {"base": str(exc)}
         except OSError as exc:
             return {"base": f"the journal: {exc.strerror or exc}"}
 
-    async def _answered(self, sequence: _Sequence, asked: StepRequest) -> Mapping[str, str]:
+    async def _answered(self, sequence: _Sequence, request: StepRequest) -> Mapping[str, str]:
         step, session = sequence.step, sequence.session
         if step is None:
             return {}
-        given = from_lists(step, asked.value_inputs, asked.text_inputs, asked.option_inputs)
+        given = from_lists(step, request.value_inputs, request.text_inputs, request.option_inputs)
         if session is None:
             await self._begin(sequence, step.checked(given))
             return {}
@@ -386,10 +386,10 @@ class ThesisCalibration:
         Raises:
             CalibrationError: as :meth:`CalibrationService.start`.
         """
-        asked, name = sequence.asked, answers["name"]
+        request, name = sequence.start_request, answers["name"]
         self._files.folder.calibration(name)  # refused before anything is measured
-        fixed = asked.fixed_camera or answers["fixed_camera"]
-        source = asked._replace(fixed_camera=fixed).source or answers["pictures"]
+        fixed = request.fixed_camera or answers["fixed_camera"]
+        source = request._replace(fixed_camera=fixed).source or answers["pictures"]
         if source != SMARTCAMERA:
             self._check_graph([source], "")
         lens = None
@@ -398,7 +398,7 @@ class ThesisCalibration:
             if sequence.aborted:
                 return
         wizard = self._wizard(sequence, fixed == "True", source, lens)
-        parameters = {**_parameters(asked, self._camera), "asked": [fixed, source, *asked]}
+        parameters = {**_parameters(request, self._camera), "asked": [fixed, source, *request]}
         service = CalibrationService(self._files.folder, [wizard])
         _start(service, name, wizard.name, parameters)
         sequence.service = service
@@ -409,14 +409,14 @@ class ThesisCalibration:
     ) -> Wizard:
         """Return the wizard for a camera in this place with this source of pictures."""
         save_to = self._files.folder.calibration
-        read = bool(sequence.asked.tf_frame_robot_tcp)
+        read = bool(sequence.start_request.tf_frame_robot_tcp)
 
         async def take() -> Any:
             return await self._picture(sequence, source)
 
         async def tip() -> Pose:
-            found = await self._tool(sequence, None)
-            return replace(found, at=found.at or datetime.now(UTC)).pose()
+            tip = await self._tool(sequence, None)
+            return replace(tip, at=tip.at or datetime.now(UTC)).pose()
 
         async def flange() -> Transform:
             return await self._tool(sequence, sequence.pictured)
@@ -440,19 +440,19 @@ class ThesisCalibration:
         )
 
     async def _localize(self) -> list[Localization]:
-        return await _there(self._camera).localize()
+        return await _checked(self._camera).localize()
 
     async def _picture(self, sequence: _Sequence, source: str) -> Any:
         sequence.pictured = None
         if source == SMARTCAMERA:
-            return await _there(self._camera).take_picture()
-        image, sequence.pictured = await _there(self.graph).picture(source)
+            return await _checked(self._camera).take_picture()
+        image, sequence.pictured = await _checked(self.graph).picture(source)
         return image
 
     async def _tool(self, sequence: _Sequence, utc: float | None) -> Transform:
-        asked = sequence.asked
-        return await _there(self.graph).pose(
-            asked.tf_frame_robot_tcp, asked.tf_frame_robot_base, utc
+        request = sequence.start_request
+        return await _checked(self.graph).pose(
+            request.tf_frame_robot_tcp, request.tf_frame_robot_base, utc
         )
 
     # ------------------------------------------------------------------ the end
@@ -585,7 +585,7 @@ class CalibrationDesks:
             desk.close()
 
 
-def _there(value: T | None) -> T:
+def _checked(value: T | None) -> T:
     """Return a value that earlier checks found not to be None."""
     if value is None:
         raise Code.NOT_POSSIBLE.refusal(
@@ -594,7 +594,7 @@ def _there(value: T | None) -> T:
     return value
 
 
-def _first_step(asked: CalibrationStart, camera: str) -> Step:
+def _first_step(request: CalibrationStart, camera: str) -> Step:
     """Return the step that asks for the facts that a request lacks."""
     inputs: list[Input] = [
         Text(
@@ -606,24 +606,24 @@ def _first_step(asked: CalibrationStart, camera: str) -> Step:
             max_length=MAX_NAME_LENGTH,
         )
     ]
-    if not asked.source:
+    if not request.source:
         label = f"Topic with pictures of the camera, or {SMARTCAMERA} for this camera itself"
         inputs.append(Text(name="pictures", label=label, default=SMARTCAMERA))
-    if not asked.fixed_camera:
+    if not request.fixed_camera:
         inputs.append(Option(name="fixed_camera", label="Where the camera is", options=FIXED))
     text = "A calibration of this name that was broken off goes on where it was."
     return Step(id="first", title="Calibration", description=text, inputs=tuple(inputs))
 
 
-def _parameters(asked: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
+def _parameters(request: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
     """Return the defaults of a wizard's steps that a request gives."""
     defaults: dict[str, Any] = {"setup": "eye-in-hand"}
     if camera is not None:
         defaults["camera_unit"] = camera.unit
-    if asked.tf_frame_robot_base:
-        defaults["robot_frame"] = asked.tf_frame_robot_base
-    if asked.checkerboard_squaresize_m:
-        defaults["square"] = 1e3 * asked.checkerboard_squaresize_m
+    if request.tf_frame_robot_base:
+        defaults["robot_frame"] = request.tf_frame_robot_base
+    if request.checkerboard_squaresize_m:
+        defaults["square"] = 1e3 * request.checkerboard_squaresize_m
     return defaults
 
 
@@ -642,9 +642,9 @@ def _start(
         service.start(name, wizard, parameters, fresh=True)
 
 
-def _early_inputs(asked: StepRequest) -> Mapping[str, str]:
+def _early_inputs(request: StepRequest) -> Mapping[str, str]:
     """Return the error for answers to a step that was never returned to a client."""
-    if asked.value_inputs or asked.text_inputs or asked.option_inputs:
+    if request.value_inputs or request.text_inputs or request.option_inputs:
         return {"base": "this step was not shown before; expected no inputs in the first call"}
     return {}
 
@@ -660,18 +660,22 @@ def _last_step(name: str, view: Mapping[str, Any]) -> Step:
 def _fields(step: Step, error: str) -> dict[str, Any]:
     """Return the fields of a reply with a step."""
     texts = [step.description]
-    for one in step.inputs:
-        if isinstance(one, Option):
-            texts.append(f"{one.label}:")
-            texts += [f"  {key}: {text}" for key, text in one.options.items()]
-    if any(one.optional and one.minimum > 0 for one in step.inputs if isinstance(one, Number)):
+    for input_field in step.inputs:
+        if isinstance(input_field, Option):
+            texts.append(f"{input_field.label}:")
+            texts += [f"  {key}: {text}" for key, text in input_field.options.items()]
+    if any(
+        input_field.optional and input_field.minimum > 0
+        for input_field in step.inputs
+        if isinstance(input_field, Number)
+    ):
         texts.append("Where a number may be missing, 0 stands for no answer.")
     if step.verdict is not None:
         texts.append(step.verdict.text)
     return {
         "error": error,
         "header_text": step.title,
-        "description_text": "\n".join(one for one in (*texts, *step.notes) if one),
+        "description_text": "\n".join(text for text in (*texts, *step.notes) if text),
         "button_text": step.button,
         **as_lists(step),
     }

@@ -31,12 +31,12 @@ def plain(touches: Sequence[Touch]) -> dict[str, Any]:
     """Return touches without a calibration: ``points`` of ``label, feature, camera, robot``."""
     points = [
         {
-            "label": str(number) if one.what == "mark" else one.what,
-            "feature": one.mark.feature,
-            "camera": [one.mark.x, one.mark.y],
-            "robot": list(one.robot),
+            "label": str(number) if touch.what == "mark" else touch.what,
+            "feature": touch.mark.feature,
+            "camera": [touch.mark.x, touch.mark.y],
+            "robot": list(touch.robot),
         }
-        for number, one in enumerate(touches, 1)
+        for number, touch in enumerate(touches, 1)
     ]
     return {"points": points}
 
@@ -50,7 +50,7 @@ def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[
         return None
     return {
         **plain(touches),
-        "marks": [[one.x, one.y] for one in marks],
+        "marks": [[mark.x, mark.y] for mark in marks],
         "next": [mark.x, mark.y],
     }
 
@@ -93,11 +93,11 @@ def compared(
             None if out or errors is None else (across @ errors[index] @ across.T)[:2, :2].tolist()
         )
     origin = across @ (calibration.origin - centre)
-    at = np.array([one.robot for one in touches]).reshape(-1, 3)
-    off = np.isin(np.arange(len(at)), [*left_out])
+    at = np.array([touch.robot for touch in touches]).reshape(-1, 3)
+    is_left_out = np.isin(np.arange(len(at)), [*left_out])
     view = _view(
-        across @ (np.concatenate([counted, at[~off]]) - centre).T,
-        np.column_stack([origin, across @ (at[off] - centre).T]),
+        across @ (np.concatenate([counted, at[~is_left_out]]) - centre).T,
+        np.column_stack([origin, across @ (at[is_left_out] - centre).T]),
     )
     return {
         **preview,
@@ -114,8 +114,8 @@ def _view(points: Array, others: Array) -> Array:
     low, high = points[:2].min(axis=1), points[:2].max(axis=1)
     half = 0.5 * (high - low)
     flat = others[:2].T
-    near = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
-    shown = np.vstack([low, high, near])
+    visible = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
+    shown = np.vstack([low, high, visible])
     low, high = shown.min(axis=0), shown.max(axis=0)
     margin = MARGIN_RATIO * float((high - low).max())
     return np.array([low - margin, high + margin])

@@ -101,12 +101,12 @@ class Touches:
     @property
     def places(self) -> list[Vector]:
         """Positions of the tip at the touches, metres."""
-        return [one.robot for one in self.touches]
+        return [touch.robot for touch in self.touches]
 
     @property
     def tool_z(self) -> Array | None:
         """Mean direction of the tool's axis; None if it is not known."""
-        axes = [one.tool_z for one in self.touches if one.tool_z is not None]
+        axes = [touch.tool_z for touch in self.touches if touch.tool_z is not None]
         return np.mean(axes, axis=0) if axes else None
 
     @property
@@ -137,23 +137,23 @@ class Touches:
             self.touches.append(await self.touch(f"touch-{number}", title, place, mark))
 
     async def touch(
-        self, step_id: str, title: str, place: str, mark: Mark, what: str = "mark"
+        self, step_id: str, title: str, place: str, mark: Mark, label: str = "mark"
     ) -> Touch:
         """Ask for a touch.
 
         ``place``: text that names the place to touch. ``mark``: the camera's mark there.
-        ``what``: attribute of :class:`Touch`.
+        ``label``: attribute of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
         step = Step(id=step_id, title=title, description=f"{description}.", **self.shown(mark))
-        return await self.ask_touch(step, lambda _: mark, what)
+        return await self.ask_touch(step, lambda _: mark, label)
 
     def shown(self, mark: Mark) -> dict[str, Any]:
         """Return the ``notes`` and the ``preview`` of a step that asks for a touch."""
         return {"preview": before(self.touches, self.marks, mark)}
 
     async def ask_touch(
-        self, step: Step, mark_of: Callable[[StepAnswer], Mark], what: str = "mark"
+        self, step: Step, mark_of: Callable[[StepAnswer], Mark], label: str = "mark"
     ) -> Touch:
         """Ask for a touch by a step that names the point; its answer decides the mark.
 
@@ -165,13 +165,13 @@ class Touches:
             )
             x, y, z = answer.outcome["position"]
             axis = _axis_z(Quaternion(*answer.outcome["orientation"]))
-            return Touch(mark_of(answer), (x, y, z), axis, what)
+            return Touch(mark_of(answer), (x, y, z), axis, label)
         unit = self.about.get("unit", "m")
         place = tuple(Number(name=axis, label=axis, unit=unit) for axis in "xyz")
         text = f"{step.description} Then take its position from the robot, in its base."
         answer = await ask(replace(step, description=text, inputs=(*step.inputs, *place)))
         x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
-        return Touch(mark_of(answer), (x, y, z), SIDES[self.side], what)
+        return Touch(mark_of(answer), (x, y, z), SIDES[self.side], label)
 
 
 async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:

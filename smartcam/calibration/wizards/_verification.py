@@ -104,12 +104,14 @@ def touches_needed(calibration: PlaneCalibration, camera_point: ArrayLike) -> in
     NOT_FINITE; UNVERIFIED if the touches' sigma is not known; MissingExtraError: SciPy is not
     installed.
     """
-    own = float(np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1])
+    own_variance = float(
+        np.linalg.eigvalsh(calibration.covariance_at(np.atleast_2d(camera_point))[0])[-1]
+    )
     sigma = calibration.touch_sigma or 0.0
     freedom = None if calibration.sigma_given else calibration.freedom
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
-        variance = own + sigma**2 / count
+        variance = own_variance + sigma**2 / count
         shift = min(KNOCK_M**2 / max(variance, KNOCK_M**2 / _MAX_SHIFT), _MAX_SHIFT)
         if (
             _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift)
@@ -182,24 +184,24 @@ class _DriftCheck(Touches):
         self.camera_unit = about.outcome.get("camera_unit", "m")
         self._camera = camera
         self._record_to = record_to
-        found = PlaneCalibration.from_data(about.outcome["data"])
+        calibration = PlaneCalibration.from_data(about.outcome["data"])
         if self.sigma is not None:
-            found = replace(found, touch_sigma=self.sigma, sigma_given=True)
-        self.calibration = found
+            calibration = replace(calibration, touch_sigma=self.sigma, sigma_given=True)
+        self.calibration = calibration
 
     async def run(self) -> dict[str, Any]:
         while True:
             await self._touch_marks()
             if not self.touches:
                 continue
-            drift = self.calibration.check(self._seen(), self.places)
+            drift = self.calibration.check(self._touched_marks(), self.places)
             figures = self._figures(drift)
             choice = await ask(self._verdict(drift, figures), partial(self._end, drift, figures))
             if choice["next"] == "finish":
                 return {"name": self.name, **figures, **choice.outcome}
 
-    def _seen(self) -> Array:
-        return np.array([(one.mark.x, one.mark.y) for one in self.touches])
+    def _touched_marks(self) -> Array:
+        return np.array([(touch.mark.x, touch.mark.y) for touch in self.touches])
 
     async def _picture(self, answers: Answers) -> list[dict[str, Any]]:
         self._camera.check_y_down(self.calibration.y_down, f"{self.name} was made")
@@ -260,7 +262,7 @@ class _DriftCheck(Touches):
             preview=compared(
                 self.calibration,
                 self.touches,
-                self._seen(),
+                self._touched_marks(),
                 drift.offsets,
                 worst=offsets.index(max(offsets)),
             ),
@@ -268,8 +270,8 @@ class _DriftCheck(Touches):
 
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
-        needed = [touches_needed(self.calibration, point) for point in self._seen()]
-        enough = [one for one in needed if one is not None]
+        needed = [touches_needed(self.calibration, point) for point in self._touched_marks()]
+        enough = [name for name in needed if name is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),
@@ -305,12 +307,12 @@ class _DriftCheck(Touches):
                     **figures,
                     "samples": [
                         {
-                            "feature_id": one.mark.feature,
-                            "camera": [one.mark.x, one.mark.y],
-                            "robot": list(one.robot),
+                            "feature_id": touch.mark.feature,
+                            "camera": [touch.mark.x, touch.mark.y],
+                            "robot": list(touch.robot),
                             "offset": offset,
                         }
-                        for one, offset in zip(self.touches, drift.offsets.tolist(), strict=True)
+                        for touch, offset in zip(self.touches, drift.offsets.tolist(), strict=True)
                     ],
                 }
             )

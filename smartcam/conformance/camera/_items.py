@@ -25,7 +25,9 @@ from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._results import Check, Item, Question
 
 _MODULES = (session_checks, running_checks, setting_checks, message_checks, questions)
-_DECLARED = [one for module in _MODULES for one in vars(module).values() if isinstance(one, Item)]
+_DECLARED = [
+    member for module in _MODULES for member in vars(module).values() if isinstance(member, Item)
+]
 
 
 def _is_late(item: Item) -> tuple[bool, bool]:

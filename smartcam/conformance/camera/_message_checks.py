@@ -32,7 +32,7 @@ def wrong_magic(camera: CameraUnderTest) -> bytes:
     return bytes(byte ^ 0xFF for byte in frame[:size]) + frame[size:]
 
 
-def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
+def _ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
     """Check that the camera ignores these bytes and answers a Query after them once."""
     with camera.session() as client:
         client.fence()
@@ -40,10 +40,12 @@ def _ignored(camera: CameraUnderTest, what: str, *data: bytes) -> None:
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        came = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
-        results = of_kind(came, MessageId.RESULT_CONTAINER)
-        if len(came) - len(results) != 1:
-            raise Differs(f"no answer to {what}, one to the Query after it", client.words(mark))
+        answers = [
+            message for message in client.received[mark:] if message.message_id != MessageId.STATUS
+        ]
+        results = of_kind(answers, MessageId.RESULT_CONTAINER)
+        if len(answers) - len(results) != 1:
+            raise Differs(f"no answer to {label}, one to the Query after it", client.words(mark))
 
 
 @check(_IGNORED, dialects=SMART)

@@ -1,6 +1,6 @@
 """Observe events that several checks need: inspections, switches, a reboot.
 
-Each observation is made at most once for a camera, so that a part is not inspected twenty times.
+Each observation is made at most once for a camera, since inspections take time.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
 
 T = TypeVar("T")
 
 INSPECTION_COUNT = 3
-"""Number of inspections that are observed, so that a changing order shows."""
+"""Number of observed inspections; several show whether the order of messages varies."""
 
 REBOOT_POLL_INTERVAL = 0.25
 """Largest number of seconds between two Connects to a camera that restarts."""
@@ -45,24 +45,24 @@ class ObservedRun(NamedTuple):
     """One trigger and its outcome."""
 
     sent_at: float  # time of sending
-    came: list[Heard]  # frames until the camera waited for the next trigger
+    frames: list[ReceivedFrame]  # frames until the camera waited for the next trigger
     under_way: int | None  # status word, asked for right after the trigger; ``bid`` only
     word: int  # size of a number, bytes
     waiting: int  # mask of Waiting for Trigger
 
     @property
-    def results(self) -> list[Heard]:
+    def results(self) -> list[ReceivedFrame]:
         """The result containers."""
-        return of_kind(self.came, MessageId.RESULT_CONTAINER)
+        return of_kind(self.frames, MessageId.RESULT_CONTAINER)
 
     def places(self) -> tuple[int | None, int | None, int | None]:
         """Return the places where Waiting ended, the first result came, and Waiting began again."""
         fell = result = rose = None
-        for place, heard in enumerate(self.came):
-            if heard.message_id == MessageId.RESULT_CONTAINER and result is None:
+        for place, message in enumerate(self.frames):
+            if message.message_id == MessageId.RESULT_CONTAINER and result is None:
                 result = place
-            elif heard.message_id == MessageId.STATUS:
-                set_ = int.from_bytes(heard.body[: self.word], "little") & self.waiting
+            elif message.message_id == MessageId.STATUS:
+                set_ = int.from_bytes(message.body[: self.word], "little") & self.waiting
                 if not set_ and fell is None:
                     fell = place
                 elif set_ and fell is not None and rose is None:
@@ -79,15 +79,15 @@ def inspections(camera: CameraUnderTest) -> list[ObservedRun]:
         Differs: the camera takes no trigger.
     """
     camera.require(Allow.TRIGGER)
-    found: list[ObservedRun] = []
+    runs: list[ObservedRun] = []
     with camera.session() as client:
         for _ in range(INSPECTION_COUNT):
             camera.ready(client)
-            found.append(_inspect_once(camera, client))
-    times = [one.results[0].at - one.sent_at for one in found if one.results]
+            runs.append(_inspect_once(camera, client))
+    times = [run.results[0].at - run.sent_at for run in runs if run.results]
     if times:
         camera.measured["trigger until result"] = max(times)
-    return found
+    return runs
 
 
 def _inspect_once(camera: CameraUnderTest, client: RawClient) -> ObservedRun:
@@ -174,15 +174,15 @@ def no_id(camera: CameraUnderTest) -> bool:
     if camera.dialect != "b16":
         return False
     first = [
-        int.from_bytes(one.results[0].body[: camera.wire.word], "little")
-        for one in inspections(camera)
-        if one.results
+        int.from_bytes(inspection.results[0].body[: camera.wire.word], "little")
+        for inspection in inspections(camera)
+        if inspection.results
     ]
-    found = camera.application not in first
-    if not found and len(set(first)) > 1:
+    application_is_new = camera.application not in first
+    if not application_is_new and len(set(first)) > 1:
         raise Undescribed("the same id in front of each result", str(first))
-    camera.learn_quirk("no_id", on=found)
-    return found
+    camera.learn_quirk("no_id", on=application_is_new)
+    return application_is_new
 
 
 # ---------------------------------------------------------------------- triggers too many
@@ -215,13 +215,13 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
                 left = deadline - time.monotonic()
                 if left <= 0 or client.next(left) is None:
                     break
-            heard, place = client.received[place], place + 1
-            if heard.message_id != MessageId.STATUS:
+            message, place = client.received[place], place + 1
+            if message.message_id != MessageId.STATUS:
                 continue
-            if not camera.wire.numbers(heard.body)[0] & bits.overtriggered:
-                fell_at = None if rose_at is None else heard.at
+            if not camera.wire.numbers(message.body)[0] & bits.overtriggered:
+                fell_at = None if rose_at is None else message.at
             elif rose_at is None:
-                rose_at = heard.at
+                rose_at = message.at
                 deadline = rose_at + camera.options.timeout
         client.listen(takes)
         results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
@@ -231,7 +231,7 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
 class Stopped(NamedTuple):
     """A trigger to a stopped camera and its outcome."""
 
-    came: list[Heard]
+    frames: list[ReceivedFrame]
     text: str  # observation in words
 
 
@@ -244,8 +244,8 @@ def stopped_trigger(camera: CameraUnderTest) -> Stopped:
         camera.stop(client)
         mark = len(client.received)
         client.send(m.Trigger())
-        came = client.listen(takes + camera.options.quiet)
-        return Stopped(came, client.words(mark))
+        messages = client.listen(takes + camera.options.quiet)
+        return Stopped(messages, client.words(mark))
 
 
 # ---------------------------------------------------------------------- switch, reboot
@@ -255,8 +255,8 @@ class Switch(NamedTuple):
     """A switch and its outcome."""
 
     application: int  # application that was asked for
-    came: list[Heard]  # the frames until the answer and the status that is not busy
-    answer: Heard
+    frames: list[ReceivedFrame]  # the frames until the answer and the status that is not busy
+    answer: ReceivedFrame
     active: int  # application that Query reported afterwards
     seconds: float  # seconds from the request to the answer
 
@@ -285,19 +285,20 @@ def switch(camera: CameraUnderTest) -> Switch:
         )
         took = answer.at - began
         _wait_not_busy(camera, client, mark)
-        came = client.received[mark:]
+        messages = client.received[mark:]
         camera.measured["switch"] = took
-        return Switch(other, came, answer, camera.active(client), took)
+        return Switch(other, messages, answer, camera.active(client), took)
 
 
 def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
     """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
     words = camera.wire.statuses(client.received[mark:])
-    if busy and any(one & busy for one in words) and words[-1] & busy:
+    if busy and any(word & busy for word in words) and words[-1] & busy:
         client.until(
-            lambda one: (
-                one.message_id == MessageId.STATUS and not camera.wire.numbers(one.body)[0] & busy
+            lambda message: (
+                message.message_id == MessageId.STATUS
+                and not camera.wire.numbers(message.body)[0] & busy
             ),
             camera.options.timeout,
             "a status without BUSY after the switch",

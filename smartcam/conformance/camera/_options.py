@@ -67,7 +67,7 @@ class Allow(enum.Flag):
             if name == "all":
                 allowed |= ~cls.NOTHING
             elif name.upper() not in cls.__members__:
-                known = ", ".join([*(one.lower() for one in cls.__members__), "all"])
+                known = ", ".join([*(member.lower() for member in cls.__members__), "all"])
                 raise ConfigurationError(f"--camera-allow: {name!r} is unknown; known are {known}")
             else:
                 allowed |= cls[name.upper()]
@@ -76,7 +76,7 @@ class Allow(enum.Flag):
     @property
     def names(self) -> list[str]:
         """The actions' names, in lower case."""
-        return [one.name.lower() for one in type(self) if one in self and one.name]
+        return [flag.name.lower() for flag in type(self) if flag in self and flag.name]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,10 +51,10 @@ def code(camera: CameraUnderTest) -> bool:
     """Answers begin with a result code."""
     with camera.link() as client:
         answer = client.answer(m.Connect())
-    found = {(1,): False, (0, 1): True}.get(camera.wire.numbers(answer.body))
-    if found is None:
+    code_ = {(1,): False, (0, 1): True}.get(camera.wire.numbers(answer.body))
+    if code_ is None:
         raise Undescribed("the version 1, or the code 0 and the version", camera.wire.spell(answer))
-    return found
+    return code_
 
 
 @question(
@@ -76,8 +76,8 @@ def waiting_before_result(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger rises before the result comes."""
     inspection_time(camera)  # raises if there are no results
     orders: set[bool] = set()
-    for one in [unasked(camera)] if camera.wire.is_bid else inspections(camera):
-        _, result, rose = one.places()
+    for run in [unasked(camera)] if camera.wire.is_bid else inspections(camera):
+        _, result, rose = run.places()
         if result is None or rose is None:
             raise NotObserved("a status with Waiting for Trigger did not come by itself")
         orders.add(rose < result)
@@ -90,12 +90,12 @@ def waiting_before_result(camera: CameraUnderTest) -> bool:
 def busy_while_processing(camera: CameraUnderTest) -> bool:
     """BUSY is set during an inspection (BVS ID: Ready is not)."""
     bits, seen = camera.wire.bits, set[bool]()
-    for one in inspections(camera):
-        if one.under_way is not None:
-            words = [one.under_way]
+    for inspection in inspections(camera):
+        if inspection.under_way is not None:
+            words = [inspection.under_way]
         else:
-            end = one.places()[2]
-            words = camera.wire.statuses(one.came[:end])
+            end = inspection.places()[2]
+            words = camera.wire.statuses(inspection.frames[:end])
         words = [word for word in words if not word & bits.waiting]
         if words and camera.wire.is_bid:
             seen.add(not words[0] & bits.ready)
@@ -112,8 +112,8 @@ def busy_while_processing(camera: CameraUnderTest) -> bool:
 def hidden_triggers(camera: CameraUnderTest) -> bool:
     """Waiting for Trigger stays set during an inspection."""
     seen = set[bool]()
-    for one in inspections(camera):
-        fell, result, _ = one.places()
+    for inspection in inspections(camera):
+        fell, result, _ = inspection.places()
         if result is None:
             raise NotObserved("no result came")
         seen.add(fell is None)
@@ -142,7 +142,7 @@ def overtriggered_time(camera: CameraUnderTest) -> float:
 def overtriggered_when_stopped(camera: CameraUnderTest) -> bool:
     """Overtriggered rises for a trigger to a stopped camera, too."""
     seen, bit = stopped_trigger(camera), camera.wire.bits.overtriggered
-    return any(word & bit for word in camera.wire.statuses(seen.came))
+    return any(word & bit for word in camera.wire.statuses(seen.frames))
 
 
 @question(_OPEN, needs=Allow.RUN | Allow.TRIGGER, dialects=SMART)
@@ -155,17 +155,17 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
         client.send(m.Trigger(), m.Stop())
         client.fence()
         client.listen(takes + camera.patience)
-        came = client.received[mark:]
-        if all(word & camera.wire.bits.running for word in camera.wire.statuses(came)):
+        messages = client.received[mark:]
+        if all(word & camera.wire.bits.running for word in camera.wire.statuses(messages)):
             raise Differs("a status without Running after Stop", client.words(mark))
-    results = len(of_kind(came, MessageId.RESULT_CONTAINER))
+    results = len(of_kind(messages, MessageId.RESULT_CONTAINER))
     return f"{results or 'no'} result{'' if results == 1 else 's'}"
 
 
 @question("ID-b 210, published", needs=Allow.TRIGGER, dialects=("bid",))
 def push_status(camera: CameraUnderTest) -> bool:
     """A status comes by itself with every change."""
-    return bool(of_kind(unasked(camera).came, MessageId.STATUS))
+    return bool(of_kind(unasked(camera).frames, MessageId.STATUS))
 
 
 @question("ID-a 227 against ID-b 216, published", dialects=("bid",), documents=("C4",))
@@ -187,12 +187,12 @@ def ready_bit(camera: CameraUnderTest) -> str:
 def switch_answer(camera: CameraUnderTest) -> str:
     """The answer to a switch comes before or after the status without BUSY."""
     seen, busy = switch(camera), camera.wire.bits.busy
-    answered = seen.came.index(seen.answer)
+    answered = seen.frames.index(seen.answer)
     was_busy = False
-    for place, one in enumerate(seen.came):
-        if one.message_id != MessageId.STATUS:
+    for place, message in enumerate(seen.frames):
+        if message.message_id != MessageId.STATUS:
             continue
-        if camera.wire.numbers(one.body)[0] & busy:
+        if camera.wire.numbers(message.body)[0] & busy:
             was_busy = True
         elif was_busy:
             return "after_status" if answered > place else "before_status"
@@ -229,7 +229,7 @@ def switch_while_running(camera: CameraUnderTest) -> str:
 def _switch_answers(client: RawClient, mark: int) -> list[int]:
     """Return the codes of the answers to a switch."""
     answers = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
-    return [(*client.wire.numbers(one.body), -1)[0] for one in answers]
+    return [(*client.wire.numbers(answer.body), -1)[0] for answer in answers]
 
 
 def _was_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> bool:
@@ -251,13 +251,13 @@ def big_endian_number(camera: CameraUnderTest) -> bool:
         camera.ready(client)
         client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
         field = next_number(camera, client)
-    found = {little: False, little[::-1]: True}.get(field)
-    if found is None:
+    order = {little: False, little[::-1]: True}.get(field)
+    if order is None:
         raise Undescribed(
             f"{little.hex(' ')}, as it was set, or the other way round", field.hex(" ")
         )
-    camera.learn_quirk("big_endian_number", on=found)
-    return found
+    camera.learn_quirk("big_endian_number", on=order)
+    return order
 
 
 @question(_OPEN, needs=Allow.INPUT | Allow.TRIGGER, dialects=SMART)
@@ -320,7 +320,7 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
         answers = of_kind(client.received[mark:], MessageId.DISCONNECT)
         if not answers:
             return "silent"
-        if [camera.wire.numbers(one.body) for one in answers] != [(0,)]:
+        if [camera.wire.numbers(answer.body) for answer in answers] != [(0,)]:
             raise Undescribed("the code 0, once", client.words(mark))
         return "code"
 
@@ -337,9 +337,9 @@ def bad_message(camera: CameraUnderTest) -> str:
         )
         client.fence()
         answers = [
-            (one.message_id, camera.wire.numbers(one.body))
-            for one in client.received[mark:-1]
-            if one.message_id in {UNKNOWN_ID, MessageId.SWITCH_APPLICATION}
+            (message.message_id, camera.wire.numbers(message.body))
+            for message in client.received[mark:-1]
+            if message.message_id in {UNKNOWN_ID, MessageId.SWITCH_APPLICATION}
         ]
         if answers == [(UNKNOWN_ID, (0x13,)), (MessageId.SWITCH_APPLICATION, (0x10,))]:
             return "code"
@@ -355,42 +355,42 @@ def second_client(camera: CameraUnderTest) -> str:
         try:
             second = stack.enter_context(camera.link())
             second.answer(m.Connect())
-            came = "answered"
+            outcome = "answered"
         except (NotObserved, EndedError):
-            came = "ended"
+            outcome = "ended"
         except Differs:
-            came = "left without an answer"
+            outcome = "left without an answer"
         try:
             first.fence()
             goes_on = True
         except (Differs, EndedError):
             goes_on = False
-    way = {("answered", False): "takeover", ("ended", True): "refuse"}.get((came, goes_on))
-    if way is None:
+    verdict = {("answered", False): "takeover", ("ended", True): "refuse"}.get((outcome, goes_on))
+    if verdict is None:
         raise Undescribed(
             "one of two clients is served",
-            f"the second client's Connect was {came}; the first client is "
+            f"the second client's Connect was {outcome}; the first client is "
             f"{'served on' if goes_on else 'not served any more'}",
         )
-    return way
+    return verdict
 
 
 @question(_OPEN, dialects=("handbook", "thesis"), transports=("tcp",))
 def bad_frame(camera: CameraUnderTest) -> str:
     """Course of a TCP stream after bytes that are no frame."""
     longest = camera.wire.dialect.header.max_payload
-    found = {
+    outcomes = {
         "a wrong magic number": _after(camera, wrong_magic(camera)),
         "an impossible length": _after(
             camera, camera.wire.frame(MessageId.QUERY_APPLICATION, length=longest)
         ),
     }
-    ways = set(found.values())
+    ways = set(outcomes.values())
     if len(ways) == 1 and ways <= {"skip", "close"}:
         return ways.pop()
     raise Undescribed(
         "the same after both: skip or close",
-        "; ".join(f"after {what}: {way}" for what, way in found.items()),
+        "; ".join(f"after {label}: {outcome}" for label, outcome in outcomes.items()),
     )
 
 
@@ -414,7 +414,9 @@ def _after(camera: CameraUnderTest, data: bytes) -> str:
             return "close"
         if client.ended:
             return "close"
-        answers = [one for one in client.received[mark:] if one.message_id != MessageId.STATUS]
+        answers = [
+            message for message in client.received[mark:] if message.message_id != MessageId.STATUS
+        ]
         return "skip" if len(answers) == 1 else "it is taken for a frame"
 
 

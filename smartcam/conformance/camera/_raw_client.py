@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.conformance.camera._verdicts import Differs, NotObserved
-from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
+from smartcam.conformance.camera._wire import BadBytesError, RawDialect, ReceivedFrame
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import MessageId
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
-MAX_HEARD_BYTES = 1 << 24
+MAX_RECEIVED_BYTES = 1 << 24
 """Largest number of bytes of bodies that one client keeps: 256 of the largest results. More end the
 experiment."""
 
@@ -29,7 +29,7 @@ MAX_TRAIL = 60
 CLOSE_TIMEOUT = 0.2
 """Seconds that the camera has to close its side after a Disconnect."""
 
-LOOK_AGAIN = 0.01
+STATUS_POLL_INTERVAL = 0.01
 """Seconds between two requests for a status that does not come unasked."""
 
 
@@ -56,7 +56,7 @@ class RawClient:
     _on_change: Callable[[], None]  # called before a message that changes the camera's state
 
     def __post_init__(self) -> None:
-        self.received: list[Heard] = []  # every frame that came, in order
+        self.received: list[ReceivedFrame] = []  # every frame that came, in order
         self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
@@ -70,8 +70,8 @@ class RawClient:
             opened = socket.create_connection(self._address, timeout=self._timeout)
             opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return opened
-        found = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
-        family, kind, proto, _, where = found[0]
+        addresses = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
+        family, kind, proto, _, where = addresses[0]
         opened = socket.socket(family, kind, proto)
         try:
             opened.connect(where)
@@ -121,11 +121,11 @@ class RawClient:
 
     def write(self, *data: bytes) -> float:
         """Send any bytes; as :meth:`send`."""
-        for one in data:
-            self._note(">", self.wire.spell_request(one))
+        for message in data:
+            self._note(">", self.wire.spell_request(message))
         at = time.monotonic()
-        for one in [b"".join(data)] if self._tcp else data:
-            self._write(one)
+        for message in [b"".join(data)] if self._tcp else data:
+            self._write(message)
         return at
 
     def _write(self, data: bytes) -> None:
@@ -139,7 +139,7 @@ class RawClient:
 
     # ------------------------------------------------------------------ in
 
-    def next(self, within: float) -> Heard | None:
+    def next(self, within: float) -> ReceivedFrame | None:
         """Return the next frame, None if none comes within so many seconds.
 
         Raises:
@@ -148,19 +148,19 @@ class RawClient:
         """
         deadline = time.monotonic() + within
         while True:
-            heard = self._cut()
-            if heard is not None:
-                return heard
+            message = self._cut()
+            if message is not None:
+                return message
             left = deadline - time.monotonic()
             if left <= 0 or not self._receive(left):
                 return None
 
-    def _cut(self) -> Heard | None:
+    def _cut(self) -> ReceivedFrame | None:
         if not self._buffer:
             return None
         try:
-            found = self.wire.cut(self._buffer)
-            if not self._tcp and (found is None or found[2] != len(self._buffer)):
+            frame = self.wire.cut(self._buffer)
+            if not self._tcp and (frame is None or frame[2] != len(self._buffer)):
                 raise BadBytesError(
                     f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
                 )
@@ -168,19 +168,19 @@ class RawClient:
             self._note("<", hex_excerpt(self._buffer))
             self._buffer = b""
             raise Differs(f"frames of dialect {self.wire.dialect.name}", str(exc)) from exc
-        if found is None:
+        if frame is None:
             return None
-        message_id, body, size = found
+        message_id, body, size = frame
         self._buffer = self._buffer[size:]
-        heard = Heard(time.monotonic(), message_id, body)
-        self._note("<", self.wire.spell(heard))
+        message = ReceivedFrame(time.monotonic(), message_id, body)
+        self._note("<", self.wire.spell(message))
         self._kept += len(body)
-        if self._kept > MAX_HEARD_BYTES:
-            raise NotObserved(f"the camera sent more than {MAX_HEARD_BYTES} bytes meanwhile")
-        self.received.append(heard)
+        if self._kept > MAX_RECEIVED_BYTES:
+            raise NotObserved(f"the camera sent more than {MAX_RECEIVED_BYTES} bytes meanwhile")
+        self.received.append(message)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]
-        return heard
+        return message
 
     def _receive(self, within: float) -> bool:
         if self.ended:
@@ -209,8 +209,13 @@ class RawClient:
     # ------------------------------------------------------------------ waits
 
     def until(
-        self, fits: Callable[[Heard], object] | int, within: float, expected: str, *, mark: int = -1
-    ) -> Heard:
+        self,
+        fits: Callable[[ReceivedFrame], object] | int,
+        within: float,
+        expected: str,
+        *,
+        mark: int = -1,
+    ) -> ReceivedFrame:
         """Return the first frame that fits, of those after ``mark`` and those that come now.
 
         Args:
@@ -223,11 +228,11 @@ class RawClient:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
-        is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
+        is_it = fits if callable(fits) else lambda message: message.message_id == fits
         first = len(self.received) if mark < 0 else mark
-        for heard in self.received[first:]:
-            if is_it(heard):
-                return heard
+        for message in self.received[first:]:
+            if is_it(message):
+                return message
         deadline = time.monotonic() + within
         while (left := deadline - time.monotonic()) > 0:
             heard_now = self.next(left)
@@ -235,7 +240,7 @@ class RawClient:
                 return heard_now
         raise Differs(f"{expected} within {within:g} s", self.words(first))
 
-    def answer(self, request: m.Message, *, within: float | None = None) -> Heard:
+    def answer(self, request: m.Message, *, within: float | None = None) -> ReceivedFrame:
         """Send a request and return its answer, which has its id; raises as :meth:`until`."""
         message_id = self.wire.dialect.message_id(request)
         mark = len(self.received)
@@ -243,14 +248,14 @@ class RawClient:
         within = self._timeout if within is None else within
         return self.until(message_id, within, f"an answer to {type(request).__name__}", mark=mark)
 
-    def trigger(self, expected: str = "a result", *, within: float | None = None) -> Heard:
+    def trigger(self, expected: str = "a result", *, within: float | None = None) -> ReceivedFrame:
         """Send a trigger and return the next result; raises as :meth:`until`."""
         mark = len(self.received)
         self.send(m.Trigger())
         within = self._timeout if within is None else within
         return self.until(MessageId.RESULT_CONTAINER, within, expected, mark=mark)
 
-    def fence(self) -> list[Heard]:
+    def fence(self) -> list[ReceivedFrame]:
         """Send a Query and return the frames before its answer: all that were on their way.
 
         Raises:
@@ -261,7 +266,7 @@ class RawClient:
         self.answer(m.Query())
         return self.received[mark:-1]
 
-    def listen(self, seconds: float) -> list[Heard]:
+    def listen(self, seconds: float) -> list[ReceivedFrame]:
         """Return the frames that come in so many seconds; the end of the link ends it."""
         mark, deadline = len(self.received), time.monotonic() + seconds
         with contextlib.suppress(EndedError):
@@ -271,7 +276,7 @@ class RawClient:
 
     def words(self, first: int = 0) -> str:
         """Describe the frames from a place of :attr:`received` on, for a difference."""
-        shown = [self.wire.spell(one) for one in self.received[first:]]
+        shown = [self.wire.spell(message) for message in self.received[first:]]
         if len(shown) > 5:
             shown = [*shown[:4], f"{len(shown) - 4} more"]
         end = ["the end of the link"] if self.ended else []
@@ -302,7 +307,7 @@ class RawClient:
             if left <= 0:
                 raise Differs(f"{expected} within {within:g} s", f"the status stays {word:#x}")
             if self.wire.is_bid:
-                self.listen(LOOK_AGAIN)
+                self.listen(STATUS_POLL_INTERVAL)
                 word = self.look()
             else:
                 self.next(left)

@@ -16,10 +16,10 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
-SAME_TIME = 0.2
+EQUAL_TIME_SHARE = 0.2
 """Part by which a measured time may differ from a quirk's default and still count as equal."""
 
-SAME_SECONDS = 0.02
+EQUAL_TIME_SECONDS = 0.02
 """Seconds by which a measured time may differ and still count as equal."""
 
 
@@ -40,7 +40,7 @@ class CameraReport:
 
     def add(self, finding: CameraFinding) -> None:
         """Add the outcome of a check or question; if it is repeated, the last outcome counts."""
-        self.findings = [one for one in self.findings if one.item.name != finding.item.name]
+        self.findings = [older for older in self.findings if older.item.name != finding.item.name]
         self.findings.append(finding)
 
     # ------------------------------------------------------------------ contents
@@ -53,17 +53,17 @@ class CameraReport:
     @property
     def differing(self) -> list[CameraFinding]:
         """The findings in which the camera differs from the documents."""
-        return [one for one in self.findings if one.failed]
+        return [finding for finding in self.findings if finding.failed]
 
     @property
     def quirks(self) -> dict[str, Any]:
         """The settings of the emulator that describe the camera, as far as they were observed."""
         return {
-            one.item.quirk: one.value
-            for one in self.findings
-            if isinstance(one.item, Question)
-            and one.item.quirk is not None
-            and one.outcome is CheckOutcome.OBSERVED
+            finding.item.quirk: finding.value
+            for finding in self.findings
+            if isinstance(finding.item, Question)
+            and finding.item.quirk is not None
+            and finding.outcome is CheckOutcome.OBSERVED
         }
 
     def __getitem__(self, name: str) -> CameraFinding:
@@ -72,9 +72,9 @@ class CameraReport:
         Raises:
             KeyError: the check was not done.
         """
-        for one in self.findings:
-            if one.item.name == name:
-                return one
+        for finding in self.findings:
+            if finding.item.name == name:
+                return finding
         raise KeyError(name)
 
     # ------------------------------------------------------------------ as text
@@ -94,7 +94,9 @@ class CameraReport:
             lines[-1] = f"NOT LEFT AS IT WAS: {camera.left}"
         if camera.gone:
             lines.append(f"THE CAMERA IS GONE: {camera.gone}")
-        count = Counter(one.outcome for one in self.findings if isinstance(one.item, Check))
+        count = Counter(
+            finding.outcome for finding in self.findings if isinstance(finding.item, Check)
+        )
         lines.append(
             f"checks: {count[CheckOutcome.AS_DOCUMENTED]} as documented, "
             f"{count[CheckOutcome.DIFFERS]} not, {count[CheckOutcome.NOT_OBSERVED]} not observed"
@@ -106,29 +108,30 @@ class CameraReport:
 
     def _differences(self) -> list[str]:
         lines: list[str] = []
-        for one in self.differing:
+        for difference in self.differing:
             lines += [
-                f"  {one.item.name}: {one.item.about}",
-                f"    source:   {one.source}, {one.grade}",
-                f"    expected: {one.expected}",
-                f"    came:     {one.observed}",
-                *(f"      {row}" for row in one.wire),
+                f"  {difference.item.name}: {difference.item.about}",
+                f"    source:   {difference.source}, {difference.grade}",
+                f"    expected: {difference.expected}",
+                f"    came:     {difference.observed}",
+                *(f"      {row}" for row in difference.wire),
             ]
         return ["", "differs from the documented device:", *lines] if lines else []
 
     def _answers(self) -> list[str]:
         lines = [
-            f"  {one.item.name}: {_plain(one.value)}  ({one.item.about}{_decides(one)})"
-            for one in self.findings
-            if one.outcome is CheckOutcome.OBSERVED
+            f"  {finding.item.name}: {_plain(finding.value)}  "
+            f"({finding.item.about}{_decides(finding)})"
+            for finding in self.findings
+            if finding.outcome is CheckOutcome.OBSERVED
         ]
         return ["", "open questions, answered:", *lines] if lines else []
 
     def _unseen(self) -> list[str]:
         reasons: dict[str, list[str]] = {}
-        for one in self.findings:
-            if one.outcome is CheckOutcome.NOT_OBSERVED:
-                reasons.setdefault(one.text, []).append(one.item.name)
+        for finding in self.findings:
+            if finding.outcome is CheckOutcome.NOT_OBSERVED:
+                reasons.setdefault(finding.text, []).append(finding.item.name)
         lines: list[str] = []
         for why, names in reasons.items():
             lines.append(f"  because {why}:")
@@ -144,16 +147,16 @@ class CameraReport:
     def yaml(self) -> str:
         """Return the quirks as a part of a scenario file; unobserved ones are comments."""
         lines: list[str] = []
-        for one in self.findings:
-            item = one.item
+        for finding in self.findings:
+            item = finding.item
             if not isinstance(item, Question) or item.quirk is None:
                 continue
-            if one.outcome is CheckOutcome.OBSERVED:
-                note = "  # as in the emulator" if _is_default(item.quirk, one.value) else ""
-                lines.append(f"  {item.quirk}: {_plain(one.value)}{note}")
-            elif one.outcome is not CheckOutcome.NOT_APPLICABLE:
-                what = "no setting fits" if one.failed else "not observed"
-                lines.append(f"  # {item.quirk}: {what}")
+            if finding.outcome is CheckOutcome.OBSERVED:
+                note = "  # as in the emulator" if _is_default(item.quirk, finding.value) else ""
+                lines.append(f"  {item.quirk}: {_plain(finding.value)}{note}")
+            elif finding.outcome is not CheckOutcome.NOT_APPLICABLE:
+                comment = "no setting fits" if finding.failed else "not observed"
+                lines.append(f"  # {item.quirk}: {comment}")
         if all(line.startswith("  #") for line in lines):
             return "\n".join(["quirks: {}", *lines])
         return "\n".join(["quirks:", *lines])
@@ -174,8 +177,12 @@ class CameraReport:
             "allowed": camera.options.allow.names,
             "measured_seconds": {name: round(s, 6) for name, s in camera.measured.items()},
             "quirks": self.quirks,
-            "checks": [one.as_json() for one in self.findings if isinstance(one.item, Check)],
-            "questions": [one.as_json() for one in self.findings if isinstance(one.item, Question)],
+            "checks": [
+                finding.as_json() for finding in self.findings if isinstance(finding.item, Check)
+            ],
+            "questions": [
+                finding.as_json() for finding in self.findings if isinstance(finding.item, Question)
+            ],
         }
 
     def write(self, path: str) -> None:
@@ -202,5 +209,5 @@ def _decides(finding: CameraFinding) -> str:
 def _is_default(quirk: str, value: object) -> bool:
     default = Quirks.model_fields[quirk].default
     if isinstance(default, float) and isinstance(value, float):
-        return abs(value - default) <= max(SAME_SECONDS, SAME_TIME * default)
+        return abs(value - default) <= max(EQUAL_TIME_SECONDS, EQUAL_TIME_SHARE * default)
     return bool(value == default)

@@ -69,7 +69,7 @@ class Question(Item):
     def quirk(self) -> str | None:
         """The field of :class:`~smartcam.emulator.Quirks` whose value is the answer.
 
-        None for a fact without such a field.
+        None for a fact without a field.
         """
         return self.name if self.name in Quirks.model_fields else None
 

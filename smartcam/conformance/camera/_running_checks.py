@@ -56,15 +56,15 @@ def trigger_gives_one_result(camera: CameraUnderTest) -> str:
     """A trigger gives one result container, of the active application."""
     inspection_time(camera)  # raises if there are no results
     word = camera.wire.word
-    for one in inspections(camera):
-        if len(one.results) != 1:
-            raise Differs("one result for each trigger", f"{len(one.results)} results")
-        body = one.results[0].body
+    for inspection in inspections(camera):
+        if len(inspection.results) != 1:
+            raise Differs("one result for each trigger", f"{len(inspection.results)} results")
+        body = inspection.results[0].body
         named = int.from_bytes(body[:word], "little")
         if camera.dialect != "b16" and named != camera.application:
             raise Differs(
                 f"the id {camera.application} in front of the result",
-                camera.wire.spell(one.results[0]),
+                camera.wire.spell(inspection.results[0]),
             )
     return f"{len(inspections(camera))} triggers"
 
@@ -72,33 +72,37 @@ def trigger_gives_one_result(camera: CameraUnderTest) -> str:
 @check("ID-b 221, published", needs=Allow.TRIGGER, dialects=("bid",))
 def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
-    for one in inspections(camera):
-        answers = of_kind(one.came, MessageId.TRIGGER)
-        if [camera.wire.numbers(heard.body) for heard in answers] != [(0,)]:
-            shown = "; ".join(map(camera.wire.spell, one.came)) or "nothing"
+    for inspection in inspections(camera):
+        answers = of_kind(inspection.frames, MessageId.TRIGGER)
+        if [camera.wire.numbers(message.body) for message in answers] != [(0,)]:
+            shown = "; ".join(map(camera.wire.spell, inspection.frames)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", shown)
 
 
 @check({"": "SC-A30, SC-C50, published", "bid": "ID-b 210, published"}, needs=Allow.TRIGGER)
 def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
     """Waiting for Trigger falls with a trigger and rises when the next would be taken."""
-    for one in inspections(camera):
-        if one.under_way is not None:
-            fell = not one.under_way & one.waiting
-            if not fell and one.results and one.results[0].at - one.sent_at < camera.options.quiet:
+    for inspection in inspections(camera):
+        if inspection.under_way is not None:
+            fell = not inspection.under_way & inspection.waiting
+            if (
+                not fell
+                and inspection.results
+                and inspection.results[0].at - inspection.sent_at < camera.options.quiet
+            ):
                 continue  # the inspection was over before the status came
             rose = True  # the observation has waited for it
         else:
-            places = one.places()
+            places = inspection.places()
             fell, rose = places[0] is not None, places[2] is not None
         if not (fell and rose):
-            shown = "; ".join(map(camera.wire.spell, one.came)) or "nothing"
+            shown = "; ".join(map(camera.wire.spell, inspection.frames)) or "nothing"
             raise Differs("Waiting for Trigger falls with a trigger and rises again", shown)
 
 
 @check("SC-A30, SC-B33, published", needs=Allow.TRIGGER, dialects=SMART)
 def dropped_trigger_is_told(camera: CameraUnderTest) -> None:
-    """Of two triggers at once one is dropped, and a status with Overtriggered says so."""
+    """One of two triggers at once is dropped, and a status with Overtriggered says so."""
     seen = overtrigger(camera)
     if seen.rose_at is None:
         if seen.results >= 2:
@@ -176,8 +180,8 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         camera.stop(client)
         client.fence()
         mark = len(client.received)
-        came = client.listen(2 * camera.options.quiet)
-        if of_kind(came, MessageId.RESULT_CONTAINER):
+        messages = client.listen(2 * camera.options.quiet)
+        if of_kind(messages, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.words(mark))
 
 
@@ -223,5 +227,5 @@ def _changes_nothing(camera: CameraUnderTest, message: Message) -> None:
 def stopped_camera_ignores_triggers(camera: CameraUnderTest) -> None:
     """A trigger to a stopped camera gives no result."""
     seen = stopped_trigger(camera)
-    if of_kind(seen.came, MessageId.RESULT_CONTAINER):
+    if of_kind(seen.frames, MessageId.RESULT_CONTAINER):
         raise Differs("no result of a stopped camera", seen.text)

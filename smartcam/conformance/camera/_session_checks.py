@@ -17,7 +17,7 @@ from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
 
 TRANSIT_TIME = 0.02
 """Seconds, at least, that messages which were sent before a Disconnect may take to arrive."""
@@ -43,8 +43,8 @@ def connect_is_answered(camera: CameraUnderTest) -> None:
                 answer = client.answer(m.Connect())
     except (Differs, EndedError, NotObserved) as exc:
         camera.gone = str(exc)
-        came = exc.came if isinstance(exc, Differs) else str(exc)
-        raise Differs("an answer to Connect", came) from exc
+        outcome = exc.came if isinstance(exc, Differs) else str(exc)
+        raise Differs("an answer to Connect", outcome) from exc
     camera.measured["connect"] = answer.at - began
     numbers = camera.wire.numbers(answer.body)
     coded = camera.wire.is_bid or (camera.dialect == "b16" and len(answer.body) == 4)
@@ -115,8 +115,8 @@ def silent_after_disconnect(camera: CameraUnderTest) -> None:
         client.fence()
         mark = len(client.received)
         client.send(m.Disconnect())
-        came = _without_answer(camera, client.listen(camera.options.quiet))
-        if came:
+        messages = _without_answer(camera, client.listen(camera.options.quiet))
+        if messages:
             raise Differs("nothing after Disconnect", client.words(mark))
 
 
@@ -132,11 +132,11 @@ def deaf_after_disconnect(camera: CameraUnderTest) -> None:
             raise Differs("no answer to a Query after Disconnect", client.words(mark))
 
 
-def _without_answer(camera: CameraUnderTest, came: list[Heard]) -> list[Heard]:
+def _without_answer(camera: CameraUnderTest, messages: list[ReceivedFrame]) -> list[ReceivedFrame]:
     """Return the frames without the answer to Disconnect that ``bid`` may give (C3)."""
     if not camera.wire.is_bid:
-        return came
-    return [one for one in came if one.message_id != MessageId.DISCONNECT]
+        return messages
+    return [message for message in messages if message.message_id != MessageId.DISCONNECT]
 
 
 @check("SC-A29, published", needs=Allow.TRIGGER)
@@ -148,10 +148,10 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
         mark = len(client.received)
         client.send(m.Trigger())
         ended_at = client.send(m.Disconnect())
-        came = client.listen(takes + camera.options.quiet)
+        messages = client.listen(takes + camera.options.quiet)
         grace = max(TRANSIT_TIME, 2 * camera.measured.get("query", 0.0))
-        results = of_kind(came, MessageId.RESULT_CONTAINER)
-        if any(one.at - ended_at > grace for one in results):
+        results = of_kind(messages, MessageId.RESULT_CONTAINER)
+        if any(result.at - ended_at > grace for result in results):
             raise Differs("no result after Disconnect", client.words(mark))
     if results:
         raise NotObserved("the result was on its way already")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.conformance.camera._options import ConformanceOptions
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
     from smartcam.protocols import FramedDialect
     from smartcam.settings import Address
 
@@ -112,10 +112,10 @@ class CameraUnderTest:
     def _detect(self) -> FramedDialect:
         address = self._address
         if address.dialect is None:
-            found = self.once("dialect", lambda: asyncio.run(_probe(address)))
-            if isinstance(found, str):
-                raise Differs("an answer to Connect in one of the dialects", found)
-            address = found
+            spoken = self.once("dialect", lambda: asyncio.run(_probe(address)))
+            if isinstance(spoken, str):
+                raise Differs("an answer to Connect in one of the dialects", spoken)
+            address = spoken
         dialect = load_protocol("bvs").dialects[cast("str", address.dialect)]
         return cast("FramedDialect", dialect).with_quirks(address.quirks)
 
@@ -138,10 +138,10 @@ class CameraUnderTest:
                 self._learned[name] = observe()
             except (Differs, NotObserved, EndedError) as exc:
                 self._learned[name] = exc
-        found = self._learned[name]
-        if isinstance(found, Exception):
-            raise found
-        return cast("T", found)
+        learned = self._learned[name]
+        if isinstance(learned, Exception):
+            raise learned
+        return cast("T", learned)
 
     def forget_trail(self) -> None:
         """Begin a new record of messages on the wire."""
@@ -165,11 +165,11 @@ class CameraUnderTest:
             with client:
                 yield client
         finally:
-            for heard in client.received:
-                self._learn_code(heard)
-                flaw = self.wire.flaw(heard)
+            for message in client.received:
+                self._learn_code(message)
+                flaw = self.wire.flaw(message)
                 if flaw is not None:
-                    self.flaws.setdefault(flaw, self.wire.spell(heard))
+                    self.flaws.setdefault(flaw, self.wire.spell(message))
 
     def open(self) -> RawClient:
         """Open a link to the camera; the caller closes it.
@@ -223,7 +223,7 @@ class CameraUnderTest:
         self.gone = why
         raise NotObserved(f"there is no session: {why}")
 
-    def greet(self, client: RawClient) -> Heard:
+    def greet(self, client: RawClient) -> ReceivedFrame:
         """Connect on a link and return the answer; also wait for a status that comes unasked.
 
         Raises:
@@ -237,10 +237,10 @@ class CameraUnderTest:
             client.until(MessageId.STATUS, self.options.timeout, "a status after Connect", mark=0)
         return answer
 
-    def _learn_code(self, heard: Heard) -> None:
+    def _learn_code(self, message: ReceivedFrame) -> None:
         """Learn whether ``b16`` answers have a code, from the length of the answer to Connect."""
-        if self.dialect == "b16" and heard.message_id == MessageId.CONNECT:
-            self.learn_quirk("code", on=len(heard.body) == 4)
+        if self.dialect == "b16" and message.message_id == MessageId.CONNECT:
+            self.learn_quirk("code", on=len(message.body) == 4)
 
     # ------------------------------------------------------------------ its state
 
@@ -313,7 +313,7 @@ class CameraUnderTest:
             lambda word: word & bits.running, self.options.timeout, "a status with Running"
         )
 
-    def load(self, client: RawClient, application: int) -> list[Heard]:
+    def load(self, client: RawClient, application: int) -> list[ReceivedFrame]:
         """Load an application; return the frames from the request to its end.
 
         Raises:
@@ -413,13 +413,13 @@ class CameraUnderTest:
 async def _probe(address: Address) -> Address | str:
     """Return the address with its dialect, or the outcome of each try as text."""
     tried: list[str] = []
-    found: Address | str | None = None
+    outcome: Address | str | None = None
     async with contextlib.aclosing(probe_trials(address, timeout=DETECTION_TIMEOUT)) as trials:
         async for trial in trials:
             if trial.address.scheme != address.scheme:
                 break
             if trial.answer is not None:
-                found = parse_address(trial.answer.url)
+                outcome = parse_address(trial.answer.url)
                 break
             tried.append(str(trial))
-    return found or "; ".join(tried)
+    return outcome or "; ".join(tried)

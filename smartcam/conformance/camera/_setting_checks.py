@@ -18,7 +18,7 @@ from smartcam.protocols._inside import MessageId
 if TYPE_CHECKING:
     from smartcam.conformance.camera._raw_client import RawClient
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
-    from smartcam.conformance.camera._wire import Heard
+    from smartcam.conformance.camera._wire import ReceivedFrame
 
 UNKNOWN_APPLICATION = 0xFFFD
 """An id that most probably no application has; it fits 16 bits."""
@@ -81,9 +81,9 @@ def busy_during_a_switch(camera: CameraUnderTest) -> None:
     """BUSY is set during a switch."""
     seen = switch(camera)
     busy = camera.wire.bits.busy
-    words = camera.wire.statuses(seen.came)
+    words = camera.wire.statuses(seen.frames)
     if not any(word & busy for word in words) or words[-1] & busy:
-        shown = "; ".join(map(camera.wire.spell, seen.came))
+        shown = "; ".join(map(camera.wire.spell, seen.frames))
         raise Differs("a status with BUSY during the switch, and one without it after", shown)
 
 
@@ -113,9 +113,9 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
         )
         done = (0, other)
         client.until(
-            lambda one: (
-                camera.wire.numbers(one.body) == done
-                and one.message_id == MessageId.SWITCH_APPLICATION
+            lambda message: (
+                camera.wire.numbers(message.body) == done
+                and message.message_id == MessageId.SWITCH_APPLICATION
             ),
             camera.options.switch_timeout,
             "the answer to the first switch",
@@ -126,10 +126,10 @@ def second_switch_meanwhile(camera: CameraUnderTest) -> None:
 
 
 def _judge_second(
-    camera: CameraUnderTest, client: RawClient, mark: int, query: Heard, active: int
+    camera: CameraUnderTest, client: RawClient, mark: int, query: ReceivedFrame, active: int
 ) -> None:
     switched = of_kind(client.received[mark:], MessageId.SWITCH_APPLICATION)
-    answers = [camera.wire.numbers(one.body) for one in switched]
+    answers = [camera.wire.numbers(message.body) for message in switched]
     numbers = camera.wire.numbers(query.body)
     if camera.wire.is_bid:
         if numbers != (0x16, 0) or answers[0] != (0x16, active) or len(answers) != 2:

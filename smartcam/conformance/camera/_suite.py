@@ -53,11 +53,11 @@ class _Reports:
 
 def _reports(config: pytest.Config) -> _Reports:
     """Return the plugin that shows the reports at the end; it is registered when first needed."""
-    found = config.pluginmanager.get_plugin(_Reports.NAME)
-    if not isinstance(found, _Reports):
-        found = _Reports()
-        config.pluginmanager.register(found, _Reports.NAME)
-    return found
+    reports = config.pluginmanager.get_plugin(_Reports.NAME)
+    if not isinstance(reports, _Reports):
+        reports = _Reports()
+        config.pluginmanager.register(reports, _Reports.NAME)
+    return reports
 
 
 class CameraConformance:

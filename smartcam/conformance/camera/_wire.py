@@ -33,7 +33,7 @@ class BadBytesError(Exception):
     """Received bytes are no frame of this dialect; the text says why."""
 
 
-class Heard(NamedTuple):
+class ReceivedFrame(NamedTuple):
     """One frame of the camera."""
 
     at: float  # time of arrival of the last byte, time.monotonic()
@@ -41,9 +41,9 @@ class Heard(NamedTuple):
     body: bytes  # the bytes after the header
 
 
-def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
+def of_kind(frames: Iterable[ReceivedFrame], message_id: int) -> list[ReceivedFrame]:
     """Return the frames that have an id."""
-    return [one for one in frames if one.message_id == message_id]
+    return [frame for frame in frames if frame.message_id == message_id]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class RawDialect:
 
     @property
     def is_bid(self) -> bool:
-        """True if the dialect is that of BVS ID."""
+        """True if the dialect is BVS ID's."""
         return self.dialect.name == "bid"
 
     # ------------------------------------------------------------------ out
@@ -132,26 +132,26 @@ class RawDialect:
         count = len(body) // self.word
         return struct.unpack_from(f"<{count}{code}", body)
 
-    def statuses(self, frames: Iterable[Heard]) -> list[int]:
+    def statuses(self, frames: Iterable[ReceivedFrame]) -> list[int]:
         """Return the status words among frames."""
-        bodies = (one.body for one in of_kind(frames, MessageId.STATUS))
+        bodies = (frame.body for frame in of_kind(frames, MessageId.STATUS))
         return [int.from_bytes(body[: self.word], "little") for body in bodies]
 
     # ------------------------------------------------------------------ in words
 
-    def spell(self, heard: Heard) -> str:
+    def spell(self, message: ReceivedFrame) -> str:
         """Return a frame of the camera in readable form, with hex."""
-        return self._spell(Sender.CAMERA, heard.message_id, heard.body)
+        return self._spell(Sender.CAMERA, message.message_id, message.body)
 
     def spell_request(self, data: bytes) -> str:
         """Return a sent frame in readable form, with hex; only hex for bytes that are no frame."""
         try:
-            found = self.cut(data)
+            message = self.cut(data)
         except BadBytesError:
-            found = None
-        if found is None or found[2] != len(data):
+            message = None
+        if message is None or message[2] != len(data):
             return hex_excerpt(data)
-        return self._spell(Sender.CLIENT, found[0], found[1], data)
+        return self._spell(Sender.CLIENT, message[0], message[1], data)
 
     def _spell(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
         spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
@@ -161,18 +161,18 @@ class RawDialect:
             shown = f"id {message_id:#04x}"
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
 
-    def flaw(self, heard: Heard) -> str | None:
+    def flaw(self, message: ReceivedFrame) -> str | None:
         """Return the undocumented property of a frame of the camera, None if there is none."""
-        if self.is_bid and self.numbers(heard.body) in _REFUSALS:
+        if self.is_bid and self.numbers(message.body) in _REFUSALS:
             return None  # a refusal may be only its code, for any request
-        size = self._sizes().get(heard.message_id)
+        size = self._sizes().get(message.message_id)
         if size is None:
-            return f"message {heard.message_id:#04x} is not one of a camera's"
+            return f"message {message.message_id:#04x} is not one of a camera's"
         least, exact = size
-        if len(heard.body) < least or (exact and len(heard.body) != least):
-            some = "" if exact else " or more"
-            name = MessageId(heard.message_id).name
-            return f"{name} has {len(heard.body)} bytes of body: expected {least}{some}"
+        if len(message.body) < least or (exact and len(message.body) != least):
+            more = "" if exact else " or more"
+            name = MessageId(message.message_id).name
+            return f"{name} has {len(message.body)} bytes of body: expected {least}{more}"
         return None
 
     def _sizes(self) -> Mapping[int, tuple[int, bool]]:

@@ -43,7 +43,7 @@ class ClientCheck:
     dialects: tuple[str, ...] = EVERY_DIALECT  # dialects that the check is about
 
     def applies(self, dialect: str, transport: str) -> bool:
-        """Return True if the check applies to such a camera."""
+        """Return True if the check applies to this kind of camera."""
         scene = self.scene
         return (
             dialect in self.dialects and dialect in scene.dialects and transport in scene.transports

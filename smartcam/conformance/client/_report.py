@@ -59,7 +59,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
     wrong = check.rule(run)
     if wrong is None:
         return None
-    said = "; ".join(filter(None, (run.outcome.error, run.outcome.output)))
+    outcome_text = "; ".join(filter(None, (run.outcome.error, run.outcome.output)))
     return ClientFinding(
         check=check.name,
         grade=check.grade.value,
@@ -70,7 +70,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
         expects=check.expects,
         source=check.source,
         wire=tuple(run.lines),
-        output=said,
+        output=outcome_text,
     )
 
 
@@ -82,10 +82,12 @@ def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """
     reporter.section("smartcam: the client")
     for grade in Grade:
-        some = [one for one in findings if one.grade == grade.value]
-        if not some:
+        findings_of_grade = [finding for finding in findings if finding.grade == grade.value]
+        if not findings_of_grade:
             continue
-        reporter.write_line(f"{grade.value}: {len(some)}")
-        for one in some:
+        reporter.write_line(f"{grade.value}: {len(findings_of_grade)}")
+        for named in findings_of_grade:
             full = grade is Grade.SHOULD
-            reporter.write_line(str(one) if full else f"{one.check} ({one.camera}): {one.wrong}")
+            reporter.write_line(
+                str(named) if full else f"{named.check} ({named.camera}): {named.wrong}"
+            )

@@ -17,7 +17,7 @@ from smartcam.protocols.messages import Request, Sender
 if TYPE_CHECKING:
     from smartcam.conformance.client._runs import ClientRun, RecordedMessage
 
-GRACE = 0.05
+STATUS_GRACE = 0.05
 """Seconds that a status may take to reach the client, which cannot know it earlier."""
 
 
@@ -25,21 +25,21 @@ def _wrong_results(run: ClientRun) -> str | None:
     """Return the first mistake in the client's results; too few results are no mistake."""
     scene, sent, last = run.scene, run.sent_turns, -1
     for number, data in enumerate(run.outcome.results, 1):
-        what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
+        label = f"result {number}, {data[:32].hex(' ') or 'empty'},"
         content = read_container(data)
         if content is None:
-            return f"{what} is {len(data)} bytes long; the containers have 8 after the id"
+            return f"{label} is {len(data)} bytes long; the containers have 8 after the id"
         application, turn = content
         if application != scene.application:
-            return f"{what} is of application {application}, not of {scene.application}"
+            return f"{label} is of application {application}, not of {scene.application}"
         if turn not in sent:
-            return f"{what} was never sent"
+            return f"{label} was never sent"
         if turn in scene.stale:
-            return f"{what} is of an inspection that was under way before the client's trigger"
+            return f"{label} is of an inspection that was under way before the client's trigger"
         if turn == last:
-            return f"{what} is of the same inspection as the one before"
+            return f"{label} is of the same inspection as the one before"
         if turn < last:
-            return f"{what} is of an earlier inspection than the one before"
+            return f"{label} is of an earlier inspection than the one before"
         last = turn
     if len(run.outcome.results) > scene.wanted:
         return f"it gave {len(run.outcome.results)} results, {scene.wanted} were wanted"
@@ -84,26 +84,26 @@ def gives_results(run: ClientRun) -> str | None:
 
 def sends_whole_messages(run: ClientRun) -> str | None:
     """The client sends only messages of the dialect."""
-    for _, one in run.requests:
-        if one.error is not None and "came in state" in one.error:
+    for _, request in run.requests:
+        if request.error is not None and "came in state" in request.error:
             continue  # a message, at the wrong time
-        if one.error is not None or one.message is None:
-            return f"the camera ignores {one.hex or 'it'}: {one.error or 'no such message'}"
+        if request.error is not None or request.message is None:
+            return f"the camera ignores {request.hex or 'it'}: {request.error or 'no such message'}"
     return None
 
 
 def connects_first(run: ClientRun) -> str | None:
     """The client sends only Connect, and Disconnect before it, until the answer to Connect."""
     answered: set[str] = set()
-    for one in run.messages:
-        if isinstance(one.message, m.ConnectAnswer):
-            answered.add(one.peer)
+    for message in run.messages:
+        if isinstance(message.message, m.ConnectAnswer):
+            answered.add(message.peer)
         elif (
-            one.sender is Sender.CLIENT
-            and one.peer not in answered
-            and not isinstance(one.message, (m.Connect, m.Disconnect))
+            message.sender is Sender.CLIENT
+            and message.peer not in answered
+            and not isinstance(message.message, (m.Connect, m.Disconnect))
         ):
-            return f"{_name(one)} came before Connect was answered"
+            return f"{_name(message)} came before Connect was answered"
     if not answered:
         return "it did not connect"
     return None
@@ -112,12 +112,12 @@ def connects_first(run: ClientRun) -> str | None:
 def disconnects(run: ClientRun) -> str | None:
     """The client's last word is Disconnect."""
     last: dict[str, RecordedMessage] = {}
-    for one in run.messages:
-        if one.sender is Sender.CLIENT:
-            last[one.peer] = one
+    for message in run.messages:
+        if message.sender is Sender.CLIENT:
+            last[message.peer] = message
     if not last:
         return "it did not connect"
-    left = [one for one in last.values() if not isinstance(one.message, m.Disconnect)]
+    left = [request for request in last.values() if not isinstance(request.message, m.Disconnect)]
     return f"its last word was {_name(left[0])}" if left else None
 
 
@@ -127,23 +127,23 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
     A trigger may stand between two Queries, or two Get status: their answers come in order.
     """
     open_requests: set[tuple[str, type[m.Message]]] = set()
-    for one in run.messages:
-        message = one.message
+    for request in run.messages:
+        message = request.message
         if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
-            key = (one.peer, message.answer)
+            key = (request.peer, message.answer)
             if key in open_requests:
-                return f"{_name(one)} came although the one before was not answered yet"
+                return f"{_name(request)} came although the one before was not answered yet"
             open_requests.add(key)
         if isinstance(message, m.Trigger):  # a trigger may stand between two queries
-            open_requests -= {(one.peer, m.QueryAnswer), (one.peer, m.StatusReport)}
-        elif message is not None and one.sender is Sender.CAMERA:
-            open_requests.discard((one.peer, type(message)))
+            open_requests -= {(request.peer, m.QueryAnswer), (request.peer, m.StatusReport)}
+        elif message is not None and request.sender is Sender.CAMERA:
+            open_requests.discard((request.peer, type(message)))
     return None
 
 
 def triggers_as_told(run: ClientRun) -> str | None:
     """The client sends the number of triggers in its task."""
-    count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
+    count = sum(isinstance(request.message, m.Trigger) for _, request in run.requests)
     if count != run.scene.wanted:
         return f"it sent {count} triggers, {run.scene.wanted} were asked for"
     return None
@@ -151,14 +151,14 @@ def triggers_as_told(run: ClientRun) -> str | None:
 
 def never_triggers(run: ClientRun) -> str | None:
     """The client does not trigger an application that runs by itself."""
-    count = sum(isinstance(one.message, m.Trigger) for _, one in run.requests)
+    count = sum(isinstance(request.message, m.Trigger) for _, request in run.requests)
     return f"it sent {count} triggers" if count else None
 
 
 def triggers_when_waiting(run: ClientRun) -> str | None:
     """The client triggers while the last status that was sent has Waiting for Trigger."""
-    for place, one in run.requests:
-        if isinstance(one.message, m.Trigger):
+    for place, request in run.requests:
+        if isinstance(request.message, m.Trigger):
             status = run.status_before(place)
             if status is None or Status.WAITING_FOR_TRIGGER not in status:
                 shown = "no status had been sent" if status is None else f"the status was {status}"
@@ -169,12 +169,12 @@ def triggers_when_waiting(run: ClientRun) -> str | None:
 def stops_first(run: ClientRun) -> str | None:
     """The client stops the application before it loads another."""
     running = run.scene.running
-    for _, one in run.requests:
-        if isinstance(one.message, (m.Start, m.Stop)):
-            running = isinstance(one.message, m.Start)
-        elif isinstance(one.message, m.SwitchApplication):
+    for _, request in run.requests:
+        if isinstance(request.message, (m.Start, m.Stop)):
+            running = isinstance(request.message, m.Start)
+        elif isinstance(request.message, m.SwitchApplication):
             if running and run.dialect.name in SMART:
-                return f"{_name(one)} came while the application ran"
+                return f"{_name(request)} came while the application ran"
             return None
     return "it did not send SwitchApplication"
 
@@ -182,34 +182,36 @@ def stops_first(run: ClientRun) -> str | None:
 def waits_for_switch(run: ClientRun) -> str | None:
     """The client gives no command between SwitchApplication and its answer."""
     switching: RecordedMessage | None = None
-    for one in run.messages:
-        if isinstance(one.message, m.SwitchApplication):
-            switching = one
-        elif isinstance(one.message, m.SwitchAnswer):
+    for message in run.messages:
+        if isinstance(message.message, m.SwitchApplication):
+            switching = message
+        elif isinstance(message.message, m.SwitchAnswer):
             return None
-        elif switching is not None and _is_command(one):
-            seconds = one.time - switching.time
-            return f"{_name(one)} came {seconds:.3f} s after SwitchApplication, before its answer"
+        elif switching is not None and _is_command(message):
+            seconds = message.time - switching.time
+            return (
+                f"{_name(message)} came {seconds:.3f} s after SwitchApplication, before its answer"
+            )
     return None if switching is not None else "it did not send SwitchApplication"
 
 
 def is_quiet_while_busy(run: ClientRun) -> str | None:
     """The client gives no command while the last status that was sent has BUSY."""
     since: float | None = None
-    for one in run.messages:
-        if isinstance(one.message, m.StatusReport) and not one.lost:
-            busy = Status.BUSY in one.message.status
-            since = None if not busy else one.time if since is None else since
-        elif since is not None and _is_command(one) and one.time - since > GRACE:
-            return f"{_name(one)} came {one.time - since:.3f} s after BUSY was sent"
+    for message in run.messages:
+        if isinstance(message.message, m.StatusReport) and not message.lost:
+            busy = Status.BUSY in message.message.status
+            since = None if not busy else message.time if since is None else since
+        elif since is not None and _is_command(message) and message.time - since > STATUS_GRACE:
+            return f"{_name(message)} came {message.time - since:.3f} s after BUSY was sent"
     return None
 
 
-def _is_command(one: RecordedMessage) -> bool:
+def _is_command(request: RecordedMessage) -> bool:
     """Return True if a message is a command; queries and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
-    return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
+    return request.sender is Sender.CLIENT and not isinstance(request.message, harmless)
 
 
-def _name(one: RecordedMessage) -> str:
-    return one.hex if one.message is None else type(one.message).__name__
+def _name(request: RecordedMessage) -> str:
+    return request.hex if request.message is None else type(request.message).__name__

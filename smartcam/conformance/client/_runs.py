@@ -72,31 +72,35 @@ class ClientRun:
     @property
     def requests(self) -> Iterator[tuple[int, RecordedMessage]]:
         """The client's messages, with their places in ``messages``."""
-        return ((n, one) for n, one in enumerate(self.messages) if one.sender is Sender.CLIENT)
+        return (
+            (n, message)
+            for n, message in enumerate(self.messages)
+            if message.sender is Sender.CLIENT
+        )
 
     @property
     def sent_turns(self) -> list[int]:
         """Turns of the results that really came from the application, in order."""
-        found: list[int] = []
-        for one in self.messages:
-            if isinstance(one.message, ResultContainer) and not one.lost:
-                content = read_container(one.message.data)
+        turns: list[int] = []
+        for message in self.messages:
+            if isinstance(message.message, ResultContainer) and not message.lost:
+                content = read_container(message.message.data)
                 if content is not None and content[0] == self.scene.application:
-                    found.append(content[1])
-        return found
+                    turns.append(content[1])
+        return turns
 
     def status_before(self, place: int) -> Status | None:
         """Return the last status that the camera had sent before a place, None for none."""
-        for one in reversed(self.messages[:place]):
-            if isinstance(one.message, StatusReport) and not one.lost:
-                return one.message.status
+        for message in reversed(self.messages[:place]):
+            if isinstance(message.message, StatusReport) and not message.lost:
+                return message.message.status
         return None
 
     @property
     def lines(self) -> list[str]:
         """The last messages on the wire as lines, for people."""
         left_out = len(self.messages) - MAX_LINES
-        lines = [str(one) for one in self.messages[-MAX_LINES:]]
+        lines = [str(message) for message in self.messages[-MAX_LINES:]]
         return [f"... {left_out} before" if left_out > 0 else "", *lines][left_out <= 0 :]
 
 
@@ -148,7 +152,7 @@ async def perform(
         began = camera.clock.now
         outcome = await client.perform(task, timeout)
         await _settle(camera)
-        messages = tuple(_message_of(camera.spoken, one, began) for one in _merged(camera.log))
+        messages = tuple(_message_of(camera.spoken, entry, began) for entry in _merged(camera.log))
     return ClientRun(
         scene=scene,
         task=task,
@@ -176,20 +180,20 @@ async def _settle(camera: EmulatedCamera) -> None:
 def _merged(log: Iterable[LogEntry]) -> list[LogEntry]:
     """Join the entry of an ignored frame with the entry that gives the reason."""
     merged: list[LogEntry] = []
-    for one in log:
+    for entry in log:
         before = merged[-1] if merged else None
         if (
-            one.error is not None
+            entry.error is not None
             and before is not None
-            and before.direction == one.direction
-            and before.peer == one.peer
+            and before.direction == entry.direction
+            and before.peer == entry.peer
             and before.message_id is not None
             and before.error is None
-            and before.hex == one.hex
+            and before.hex == entry.hex
         ):
-            merged[-1] = before._replace(error=one.error)
+            merged[-1] = before._replace(error=entry.error)
         else:
-            merged.append(one)
+            merged.append(entry)
     return merged
 
 

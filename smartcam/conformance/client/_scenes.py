@@ -29,7 +29,7 @@ BUSY_SECONDS = 1.0
 """Seconds of BUSY after a switch's answer: long enough for a client that starts slowly to see
 it."""
 
-STATUS_GO = 0x280
+WAITING_STATUS = 0x280
 """Status with Running and Waiting for Trigger."""
 
 _CONTAINER = struct.Struct("<ii")
@@ -119,7 +119,9 @@ def _unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
     data = dialect.encode_frame(Frame(0x77, b"new in this firmware"))
     # not before the answer to Connect: until then the camera sends nothing (SC-A28, published)
     between = ("StatusReport", "QueryAnswer", "ResultContainer")
-    return [f.Insert(data=data, on=one, where="before", times=None) for one in between]
+    return [
+        f.Insert(data=data, on=message_type, where="before", times=None) for message_type in between
+    ]
 
 
 def _unknown_bits(dialect: FramedDialect) -> Sequence[BaseFault]:
@@ -133,7 +135,7 @@ def _other_result(dialect: FramedDialect) -> Sequence[BaseFault]:
 
 
 def _status_between(dialect: FramedDialect) -> Sequence[BaseFault]:
-    fields: dict[str, int | str] = {"status": STATUS_GO}
+    fields: dict[str, int | str] = {"status": WAITING_STATUS}
     return [f.Insert(message="StatusReport", fields=fields, on="QueryAnswer", times=None)]
 
 

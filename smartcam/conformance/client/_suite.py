@@ -58,11 +58,11 @@ def _names(config: Any, option: str, known: Sequence[str]) -> tuple[str, ...] | 
     text: str | None = config.getoption(option, default=None)
     if text is None:
         return None
-    found = tuple(name.strip() for name in text.split(",") if name.strip())
-    for name in found:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
         if name not in known:
             raise pytest.UsageError(f"{option}: {name!r}; known are {', '.join(known)}")
-    return found or None
+    return names or None
 
 
 class ClientConformance:
@@ -97,7 +97,7 @@ class ClientConformance:
             The data of the results, in order, each without the application's id.
 
         Raises:
-            NotImplementedError: the client cannot do such a task; its tests are skipped.
+            NotImplementedError: the client does not support the task; its tests are skipped.
             Exception: any error that means that the client has failed.
         """
         raise NotImplementedError

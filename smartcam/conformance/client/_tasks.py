@@ -2,7 +2,7 @@
 
 A command gets the task as arguments and prints one line for each result: the bytes of the result
 container after the application id as hex, or a JSON object that has them as ``data`` or ``raw``.
-Its exit code is 0 if it has done the task, 77 if it cannot do such a task at all, and any other
+Its exit code is 0 if it has done the task, 77 if it does not support the task, and any other
 number if it failed.
 """
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     Perform: TypeAlias = "Callable[[Task], Iterable[bytes] | Awaitable[Iterable[bytes]]]"
 
 UNSUPPORTED = 77
-"""Exit code of a command that cannot do such a task; automake's tests use it for "skipped"."""
+"""Exit code of a command that does not support a task; automake's tests use it for "skipped"."""
 
 MAX_OUTPUT_BYTES = 1 << 20
 """Largest number of bytes of a command's output that are read; a client that prints more has
@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
         results: data of the results that the client gave, in order.
         error: the client's text about its failure; None if the client reports success.
         ended: whether the client ended in time.
-        supported: whether the client can do such a task at all.
+        supported: whether the client supports the task.
         seconds: duration of the task.
         output: further output of the client, shortened.
     """
@@ -172,7 +172,7 @@ class _Worker:
     def cancel(self) -> None:
         inside = self._inside
         if inside is not None:
-            with contextlib.suppress(RuntimeError):  # its loop is closed already
+            with contextlib.suppress(RuntimeError):  # the transport's loop is closed already
                 inside[0].call_soon_threadsafe(inside[1].cancel)
 
     def _run(self) -> None:
@@ -194,7 +194,7 @@ class _Worker:
             given = asyncio.run(self._await_it())
         else:
             given = cast("Iterable[bytes]", self._function(self._task))
-        return tuple(bytes(one) for one in given)
+        return tuple(bytes(result) for result in given)
 
     async def _await_it(self) -> Iterable[bytes]:
         current = asyncio.current_task()
@@ -226,7 +226,7 @@ class CommandClient(Client):
         else:
             expected = "a text, or the program and its arguments"
             given = check_all(command, "client command", expected)
-            words = [check_text(one, "client command") for one in given]
+            words = [check_text(text, "client command") for text in given]
         self._template = words
         self._cwd = None if cwd is None else str(check_path(cwd, "cwd", "client command"))
         text = " ".join(self._template)
@@ -276,16 +276,16 @@ class CommandClient(Client):
             return Outcome(ended=False, seconds=time.monotonic() - began)
         finally:
             await _end(process)
-        seconds, said = time.monotonic() - began, _shorten(err)
+        seconds, errors = time.monotonic() - began, _shorten(err)
         if process.returncode == UNSUPPORTED:
-            return Outcome(supported=False, seconds=seconds, output=said)
+            return Outcome(supported=False, seconds=seconds, output=errors)
         try:
             results, error = read_results(out), None
         except ValueError as exc:
             results, error = (), str(exc)
         if process.returncode:
             error = f"exit code {process.returncode}"
-        return Outcome(results, error, seconds=seconds, output=said)
+        return Outcome(results, error, seconds=seconds, output=errors)
 
 
 async def _read(process: asyncio.subprocess.Process) -> tuple[bytes, bytes]:

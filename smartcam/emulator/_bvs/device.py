@@ -90,7 +90,7 @@ class _Event(enum.IntEnum):
     BUSY_ENDS = 4
     FREE_RUN = 5
 
-    __hash__ = int.__hash__  # that of Enum is a slow function in Python
+    __hash__ = int.__hash__  # the hash of Enum is a slow function in Python
 
 
 class _Inspection(NamedTuple):
@@ -157,7 +157,7 @@ class Device:
         self._entered: list[DeviceState] = []
         self._bits = 0  # bits of the status word, as last seen
         first = next(iter(self._applications)) if active is None else active
-        self._take_up(self._applications[self._known(first)])
+        self._take_up(self._applications[self._known_application(first)])
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
@@ -317,12 +317,12 @@ class Device:
         """Call a function for every state that the device enters from now on.
 
         It is called right after the event that led to the state; for a message or an operator's
-        action, by the next :meth:`tell_entered`.
+        action, by the next :meth:`report_entered`.
         """
         self._on_entered = on_entered
         self._bits = self._status_word()
 
-    def tell_entered(self) -> None:
+    def report_entered(self) -> None:
         """Report the states that were entered since the last call."""
         while self._entered and self._on_entered is not None:
             states, self._entered = self._entered, []
@@ -384,9 +384,9 @@ class Device:
         Raises:
             ConfigurationError: no application has that id.
         """
-        application = check_application(application, who="device")
+        application = check_application(application, caller="device")
         running = check_flag(running, "running", "device")
-        target = self._applications[self._known(application)]
+        target = self._applications[self._known_application(application)]
         with self.around():
             if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
                 return False
@@ -457,7 +457,7 @@ class Device:
 
     def drop_triggers(self, count: int) -> None:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
-        self._trigger_drops += check_integer(count, "count", 0, who="device")
+        self._trigger_drops += check_integer(count, "count", 0, caller="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the running inspection, or else the next one.
@@ -653,7 +653,7 @@ class Device:
             self._now = max(self._now, when)
             action()
             if self._entered:
-                self.tell_entered()
+                self.report_entered()
         self._now = target
 
     def _end_overtrigger(self) -> None:
@@ -753,19 +753,19 @@ class Device:
         self._inspector = application.inspector
         application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
 
-    def _inspected(self, run: _Inspection, found: Values | None) -> None:
+    def _inspected(self, run: _Inspection, values: Values | None) -> None:
         """Use an inspector's result; a fault may delay the run's end."""
         self._inspector = None
         with self.around():
-            finish = functools.partial(self._finish_run, run, found)
+            finish = functools.partial(self._finish_run, run, values)
             self._events[_Event.INSPECTED] = (self._now + run.change.late, finish)
             self._advance(self._now)
 
-    def _finish_run(self, run: _Inspection, found: Values | None = None) -> None:
+    def _finish_run(self, run: _Inspection, values: Values | None = None) -> None:
         """Send the result, and set Waiting for Trigger (the order is a quirk)."""
         self._processing = False
         self._change = RunChange()
-        result = self._result(run, found)
+        result = self._result(run, values)
         if self.quirks.waiting_before_result:
             self._report()
         if result is not None and not run.change.silent:
@@ -774,19 +774,19 @@ class Device:
                 self._send(result)
         self._report()
 
-    def _result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
+    def _result(self, run: _Inspection, values: Values | None) -> m.ResultContainer | None:
         """Return the result; a repeated one is built only once."""
         if self._period is None:
-            return self._build_result(run, found)
+            return self._build_result(run, values)
         key = (run.turn % self._period, self._byte_order)
         result = self._containers.get(key)
         if result is None:
-            result = self._build_result(run, found)
+            result = self._build_result(run, values)
             if result is not None:
                 self._containers[key] = result
         return result
 
-    def _build_result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
+    def _build_result(self, run: _Inspection, values: Values | None) -> m.ResultContainer | None:
         application = self._active
         order = self._byte_order
         try:
@@ -799,8 +799,8 @@ class Device:
                     values=run.input,
                     byte_order=order,
                 )
-            elif found is not None:
-                data = application.container_of(found, number=run.number, byte_order=order)
+            elif values is not None:
+                data = application.container_of(values, number=run.number, byte_order=order)
             else:
                 data = None  # the inspection failed
         except ENDS_PROGRAM:
@@ -844,8 +844,8 @@ class Device:
         except InterpretationError as exc:
             _log.debug("= input data dropped: %s", exc)
             return None
-        found: Mapping[str, Any] = values._asdict()
-        return found
+        inputs: Mapping[str, Any] = values._asdict()
+        return inputs
 
     def _next_input(self) -> Mapping[str, Any] | None:
         inspected = isinstance(self._active, InspectedApplication)
@@ -904,7 +904,7 @@ class Device:
         self._reported = now = (self._status_word(), self._endian)
         self._send(_status_report(*now))
 
-    def _known(self, application: int) -> int:
+    def _known_application(self, application: int) -> int:
         if application not in self._applications:
             known = ", ".join(str(key) for key in self._applications)
             raise ConfigurationError(f"no application has the id {application}; there are {known}")

@@ -114,15 +114,15 @@ class EmulatedInSight(LineCamera):
         quirks: InSightQuirks | Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        who = "emulator"
-        online = check_flag(online, "online", who)
-        model = check_text(model, "model", who, least=1, most=100)
+        caller = "emulator"
+        online = check_flag(online, "online", caller)
+        model = check_text(model, "model", caller, least=1, most=100)
         if active is not None:
-            active = check_application_or_name(active, "active", who)
-        jobs = check_all(jobs, "jobs", "a list of jobs", who)
+            active = check_application_or_name(active, "active", caller)
+        jobs = check_all(jobs, "jobs", "a list of jobs", caller)
         users, evaluations, info = (
-            None if given is None else check_texts(given, what, who)
-            for what, given in (("users", users), ("evaluations", evaluations), ("info", info))
+            None if given is None else check_texts(given, option, caller)
+            for option, given in (("users", users), ("evaluations", evaluations), ("info", info))
         )
         self.device = InSightDevice(jobs, active=active, online=online, image=image)
         self.refuse_login: bool = False
@@ -136,7 +136,7 @@ class EmulatedInSight(LineCamera):
             quirks=validated(InSightQuirks, {} if quirks is None else quirks, "quirks"),
         )
         self._ordered: deque[_Ordered] = deque()
-        self._heard: Tally[str] = Tally()
+        self._commands_received: Tally[str] = Tally()
         self._offset = 0  # nanoseconds from the device's time, which stands still while stopped
         self._was_online = online
         super().__init__(**options)
@@ -174,7 +174,7 @@ class EmulatedInSight(LineCamera):
     def shown(self) -> dict[str, Any]:
         """Return the state of the camera that its page shows."""
         device, job = self.device, self.device.job
-        jobs = [one for one in device.jobs.values() if one.id is not None]
+        jobs = [job for job in device.jobs.values() if job.id is not None]
         return {
             **super().shown(),
             "mode": device.mode,
@@ -187,13 +187,13 @@ class EmulatedInSight(LineCamera):
             "applications": [
                 {
                     **dict.fromkeys(SHOWN),
-                    "id": one.id,
-                    "name": one.file,
-                    "rate": one.rate,
-                    "load_time": one.load_time,
-                    "processing_time": one.processing_time,
+                    "id": job.id,
+                    "name": job.file,
+                    "rate": job.rate,
+                    "load_time": job.load_time,
+                    "processing_time": job.processing_time,
                 }
-                for one in jobs
+                for job in jobs
             ],
             "cells": dict(device.cells),
             "quirks": self.quirks,
@@ -218,12 +218,12 @@ class EmulatedInSight(LineCamera):
     @property
     def sessions(self) -> list[str]:
         """Address and port of the clients that are logged in, the oldest session first."""
-        return [one.peer for one in self._by_number() if one.logged_in]
+        return [client.peer for client in self._by_number() if client.logged_in]
 
     @property
     def links(self) -> list[str]:
         """Address and port of all clients that are connected."""
-        return [one.peer for one in self._by_number()]
+        return [client.peer for client in self._by_number()]
 
     @classmethod
     def image_answer(cls, image: NDArray[np.uint8]) -> bytes:
@@ -278,8 +278,8 @@ class EmulatedInSight(LineCamera):
 
     def drop_connections(self) -> None:
         """End every connection at once, like a broken network. Running events continue."""
-        for one in self._by_number():
-            one.close("dropped")
+        for client in self._by_number():
+            client.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
         """Wait until clients have sent a command ``count`` times since the beginning.
@@ -298,13 +298,14 @@ class EmulatedInSight(LineCamera):
         Cancellation: safe.
         """
         mnemonic = check_text(command, "command", "wait_heard", least=1, most=100).upper()
-        count = check_integer(count, "count", 0, who="wait_heard")
+        count = check_integer(count, "count", 0, caller="wait_heard")
         timeout = check_seconds(timeout, "timeout", "wait_heard")
         try:
-            await self._heard.wait(mnemonic, count, timeout)
+            await self._commands_received.wait(mnemonic, count, timeout)
         except TimeoutError as exc:
             raise ResponseTimeoutError(
-                f"the emulator heard {self._heard[mnemonic]} of {count} {mnemonic} in {timeout} s",
+                f"the emulator received {self._commands_received[mnemonic]} of {count} {mnemonic} "
+                f"in {timeout} s",
                 waited=timeout,
             ) from exc
 
@@ -323,8 +324,8 @@ class EmulatedInSight(LineCamera):
 
     def make_client(self, link: ClientLink, server: LineServer) -> TelnetClient:
         """Return a new client."""
-        taken = {one.number for one in self._by_number()}
-        number = next(one for one in range(MAX_SESSIONS + 1) if one not in taken)
+        taken = {client.number for client in self._by_number()}
+        number = next(number for number in range(MAX_SESSIONS + 1) if number not in taken)
         return TelnetClient(self, link, server, number)
 
     def greet(self, client: LineClient) -> None:
@@ -365,7 +366,7 @@ class EmulatedInSight(LineCamera):
             client.respond(str(code).encode("ascii") + words.LINE_END)
         else:
             self._commands.execute(line, client.respond)
-        self._heard.add(mnemonic if mnemonic in words.COMMANDS else "")
+        self._commands_received.add(mnemonic if mnemonic in words.COMMANDS else "")
 
     # ------------------------------------------------------------------ inside
 
@@ -377,8 +378,8 @@ class EmulatedInSight(LineCamera):
         return None
 
     def _by_number(self) -> list[TelnetClient]:
-        clients = [one for one in self._clients.values() if isinstance(one, TelnetClient)]
-        return sorted(clients, key=lambda one: one.number)
+        clients = [client for client in self._clients.values() if isinstance(client, TelnetClient)]
+        return sorted(clients, key=lambda client: client.number)
 
     def _after_start(self) -> None:
         self._offset = nanoseconds(self.clock.now) - self.device.now
@@ -395,5 +396,5 @@ class EmulatedInSight(LineCamera):
 
     def _due(self) -> int | None:
         due, later = self.device.due, super()._due()
-        mine = None if due is None else due + self._offset
-        return min((one for one in (mine, later) if one is not None), default=None)
+        own_time = None if due is None else due + self._offset
+        return min((time for time in (own_time, later) if time is not None), default=None)

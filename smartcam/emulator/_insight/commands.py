@@ -59,7 +59,7 @@ class Respond(Protocol):
 
 
 class InSightCommands:
-    """A camera's commands; the arguments are those of the emulator.
+    """A camera's commands; the arguments are the emulator's.
 
     Raises:
         ConfigurationError: an argument is wrong.
@@ -79,9 +79,9 @@ class InSightCommands:
         self._info = {**_INFO, **(info or {})}
         if len(self._info) != len(_INFO):
             raise ConfigurationError(f"info: known are {', '.join(_INFO)}")
-        for what, texts in (("info", self._info), ("evaluations", self._evaluations)):
+        for option, texts in (("info", self._info), ("evaluations", self._evaluations)):
             for name, text in texts.items():
-                _check_sendable(f"{what}: {name}", text)
+                _check_sendable(f"{option}: {name}", text)
         self._at_once: Mapping[str, Callable[[str], bytes]] = {
             "GO": lambda _: _line(str(int(device.online))),
             "SO": self._set_online,
@@ -162,8 +162,8 @@ class InSightCommands:
     def _set_value(
         self, argument: str, kind: str, read: Callable[[str], int | float | str | None]
     ) -> bytes:
-        key, rest = self._target(argument)
-        value = read(rest)
+        key, rest_of_line = self._target(argument)
+        value = read(rest_of_line)
         if key is None or value is None:
             return _coded(StatusCode.INVALID_ARGUMENT)
         return _coded(self._device.request_value(key, kind, value))
@@ -173,8 +173,8 @@ class InSightCommands:
         cell = words.parse_wire_cell(argument)
         if cell is not None:
             return cell[0].wire, cell[1]
-        name, _, rest = argument.partition(" ")
-        return self._named(name), rest
+        name, _, others = argument.partition(" ")
+        return self._named(name), others
 
     def _named(self, name: str) -> str | None:
         """Return the key of a cell with a name, None if there is no such cell.
@@ -239,7 +239,7 @@ def coded_image(image: NDArray[np.uint8]) -> CodedImage:
 
 
 def _seen_image(sight: Callable[[], Any]) -> CodedImage | None:
-    """Return the image of the last run; None if it is no image of such a camera."""
+    """Return the image of the last run; None if the camera could not have taken it."""
     try:
         return coded_image(check_image(sight()))
     except ConfigurationError as exc:

@@ -57,7 +57,7 @@ class _PendingEvent:
             on_code(code)
 
     def end(self, code: StatusCode) -> None:
-        """Finish the event, whatever its outcome."""
+        """Finish the event, also after a failure."""
         self.over = True
         self.report(code)
 
@@ -146,9 +146,9 @@ class InSightDevice:
         Raises:
             ConfigurationError: there is no such job.
         """
-        for one in self.jobs.values():
-            if one.id == job if isinstance(job, int) else one.is_called(job):
-                return one
+        for job_ in self.jobs.values():
+            if job_.id == job if isinstance(job, int) else job_.is_called(job):
+                return job_
         known = ", ".join(self.jobs) or "none"
         raise ConfigurationError(f"job {job!r} is not on the camera; there are: {known}")
 
@@ -209,12 +209,12 @@ class InSightDevice:
         Raises:
             ConfigurationError: there is no such job, or another one is being loaded.
         """
-        found = self.find(job)
+        job_found = self.find(job)
         if self._loading:
             raise ConfigurationError(f"job {job!r}: another one is being loaded")
         with self.around():
             self._break_run()
-            self.job = found
+            self.job = job_found
             self._begin_job()
 
     def set_blind(self, blind: bool) -> None:
@@ -252,7 +252,7 @@ class InSightDevice:
     def request_job(self, job: str | int, on_code: OnCode) -> None:
         """Load a job for a client (``LF``, ``SJ``); ``on_code`` gets the code when that is done."""
         try:
-            found = self.find(job)
+            job_found = self.find(job)
         except ConfigurationError:
             on_code(StatusCode.FAILED)
             return
@@ -263,11 +263,11 @@ class InSightDevice:
 
         def loaded() -> None:
             self._loading = False
-            self.job = found
+            self.job = job_found
             self._begin_job()
             on_code(StatusCode.DONE)
 
-        self.after(found.load_time, loaded)
+        self.after(job_found.load_time, loaded)
 
     def request_event(self, event: int, on_code: OnCode, *, at_image: bool) -> None:
         """Cause an event, 0 to 8, for a client; ``on_code`` gets the code.
@@ -343,13 +343,13 @@ class InSightDevice:
                 if at_image and not run.over:
                     run.report(StatusCode.DONE)
 
-        def done(found: Values | None) -> None:
+        def done(values: Values | None) -> None:
             with self.around():
                 if run.over:
                     return
                 self._run = self._inspector = None
                 self._count_run()
-                job.take(self._cells, found)
+                job.take(self._cells, values)
                 run.end(StatusCode.DONE)
 
         self._inspector = job.inspector

@@ -215,10 +215,10 @@ class InspectedJob(Job):
         """Return the cells' texts right after loading: all need a run."""
         return dict.fromkeys(self.sources, words.ERROR_VALUE)
 
-    def take(self, cells: dict[str, str], found: Values | None) -> None:
+    def take(self, cells: dict[str, str], values: Values | None) -> None:
         """Put an inspector's findings into the cells; those without a value are in error."""
         cells.update(self.fresh_cells())
-        for name, value in _named_values(found):
+        for name, value in _named_values(values):
             key = cell_key(name)
             if key in self.sources:
                 cells[key] = self._show(key, value, 0)
@@ -231,16 +231,16 @@ class InspectedJob(Job):
             return words.ERROR_VALUE
 
 
-def _named_values(found: Values | None) -> Iterator[tuple[str, Any]]:
+def _named_values(values: Values | None) -> Iterator[tuple[str, Any]]:
     """Yield values with the names of their cells."""
-    if isinstance(found, Mapping):
-        for name, value in found.items():
+    if isinstance(values, Mapping):
+        for name, value in values.items():
             if isinstance(value, Sequence) and not isinstance(value, str):
                 yield from _named_values(value)
             else:
                 yield name, value
         return
-    for number, record in enumerate(found or (), start=1):
+    for number, record in enumerate(values or (), start=1):
         for name, value in _named_values(record):
             yield f"{name}_{number}", value
 

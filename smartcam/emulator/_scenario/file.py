@@ -28,7 +28,7 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
     if others:
         raise ConfigurationError(
             f"scenario {path}: one camera was expected, it has {1 + len(others)}: "
-            f"{', '.join(one.name for one in (first, *others))}; EmulatedFleet takes them all"
+            f"{', '.join(part.name for part in (first, *others))}; EmulatedFleet takes them all"
         )
     return first
 
@@ -52,13 +52,13 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
         scenarios = file.each()
         if dialect is None:
             return scenarios
-        return tuple(one.model_copy(update={"dialect": dialect}) for one in scenarios)
+        return tuple(scenario.model_copy(update={"dialect": dialect}) for scenario in scenarios)
 
     def mistake(file: ScenarioFile) -> Mistake | None:
         for index, scenario in enumerate(each(file)):
-            found = scenario.mistake()
-            if found is not None:
-                place, text = found
+            mistake = scenario.mistake()
+            if mistake is not None:
+                place, text = mistake
                 return file.place(index, place), text
         return None
 

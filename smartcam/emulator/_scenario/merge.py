@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _KNOWN: Mapping[str, tuple[str, ...]] = {
     "dialect": tuple(BVS.dialects),
-    "transport": tuple(one.value for one in Transport),
+    "transport": tuple(transport.value for transport in Transport),
 }
 
 
@@ -37,13 +37,13 @@ def make_plan(
         ConfigurationError: an option is wrong, or not supported by the camera.
     """
     changes = {key: value for key, value in given.items() if value is not None}
-    for what, names in _KNOWN.items():
-        if what not in changes:
+    for section, names in _KNOWN.items():
+        if section not in changes:
             continue
-        word = changes[what] = check_text(changes[what], what, "emulator", most=100)
+        word = changes[section] = check_text(changes[section], section, "emulator", most=100)
         if word not in names:
             raise ConfigurationError(
-                f"emulator: {what} {word!r} is unknown; known are {', '.join(names)}"
+                f"emulator: {section} {word!r} is unknown; known are {', '.join(names)}"
                 f"{did_you_mean(word, names)}"
             )
     if scenario is None:
@@ -59,7 +59,7 @@ def make_plan(
     ids = {application.id for application in added}
     changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
     timeline = check_all(timeline, "timeline", "a list of cues", "emulator")
-    cues = (validated(Cue, one, f"cue {number}") for number, one in enumerate(timeline, start=1))
+    cues = (validated(Cue, cue, f"cue {number}") for number, cue in enumerate(timeline, start=1))
     changes["timeline"] = (*base.timeline, *cues)
     plan = base.model_copy(update=changes)
     mistake = plan.mistake()

@@ -102,7 +102,7 @@ class Scenario(EmulatorData):
 
     def mistake(self) -> Mistake | None:
         """Return the place of something that the camera cannot do, and the reason; or None."""
-        from smartcam.emulator._makes import emulated_class  # it imports this module
+        from smartcam.emulator._makes import emulated_class  # that module imports this one
 
         try:
             kind = emulated_class(self.protocol)
@@ -152,14 +152,14 @@ class ScenarioFile(Scenario):
         )
 
     def _merged(self, index: int, camera: Scenario, common: dict[str, Any]) -> Scenario:
-        own = {name: getattr(camera, name) for name in camera.model_fields_set}
+        own_fields = {name: getattr(camera, name) for name in camera.model_fields_set}
         ids = {application.id for application in camera.applications}
         quirks = {name: getattr(camera.quirks, name) for name in camera.quirks.model_fields_set}
         merged = {
             **common,
             "name": f"camera{index + 1}",
             "seed": self.seed + index,
-            **own,
+            **own_fields,
             "applications": (
                 *camera.applications,
                 *(app for app in self.applications if app.id not in ids),
@@ -175,13 +175,13 @@ class ScenarioFile(Scenario):
         if not self.cameras:
             return place
         camera = self.cameras[index]
-        name, *rest = place
-        if name == "timeline" and isinstance(rest[0], int):
-            own = rest[0] - len(self.timeline)
-            return place if own < 0 else ("cameras", index, name, own, *rest[1:])
-        if name == "applications" and isinstance(rest[0], int):
-            own = rest[0] - len(camera.applications)
-            return ("cameras", index, *place) if own < 0 else (name, own, *rest[1:])
+        name, *others = place
+        if name == "timeline" and isinstance(others[0], int):
+            cue_index = others[0] - len(self.timeline)
+            return place if cue_index < 0 else ("cameras", index, name, cue_index, *others[1:])
+        if name == "applications" and isinstance(others[0], int):
+            cue_index = others[0] - len(camera.applications)
+            return ("cameras", index, *place) if cue_index < 0 else (name, cue_index, *others[1:])
         return ("cameras", index, *place) if name in camera.model_fields_set else place
 
 

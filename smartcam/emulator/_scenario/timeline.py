@@ -44,7 +44,7 @@ _log = logging.getLogger("smartcam.emulator")
 MAX_PENDING = 10_000
 """Largest number of cues that wait for their time; a further one is dropped, with a warning."""
 
-MAX_AT_ONCE = 1000
+MAX_CUES_AT_ONCE = 1000
 """Largest number of cues at one instant, since cues that cause each other would go on forever. A
 further one is dropped, with a warning."""
 
@@ -57,7 +57,7 @@ _Seconds = Annotated[float, Field(ge=0, le=86_400, allow_inf_nan=False)]
 
 
 class _OneOrMore:
-    """In a schema, one fault stands for a list of one."""
+    """Allow a single fault instead of a list of one in a schema."""
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -152,7 +152,7 @@ class _CueState:
     """A cue and its counts."""
 
     cue: Cue
-    random: Random  # its own random numbers, so that no cue changes those of another
+    random: Random  # the cue's random numbers, so that no cue changes another's
     seen: int = 0  # number of times that its moment came
     done: int = 0  # number of times that its faults were injected
 
@@ -293,8 +293,10 @@ class Timeline:
             row = self._waiting.pop(0)
             now, count = self._instant
             self._instant = (now, count + 1) if now == self._clock.now else (self._clock.now, 1)
-            if self._instant[1] > MAX_AT_ONCE:
-                _log.warning("! timeline: more than %d cues at once, one is dropped", MAX_AT_ONCE)
+            if self._instant[1] > MAX_CUES_AT_ONCE:
+                _log.warning(
+                    "! timeline: more than %d cues at once, one is dropped", MAX_CUES_AT_ONCE
+                )
                 continue
             row.done += 1
             try:

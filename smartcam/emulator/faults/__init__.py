@@ -294,7 +294,7 @@ def _build(name: str, fields: Mapping[str, int | str]) -> m.Message:
 
 
 class HalfOpen(EndingFault):
-    """From this message on nothing is sent and nothing is read on the connection.
+    """Nothing is sent and nothing is read on the connection from this message on.
 
     The connection stays open, as when a cable is pulled; it keeps the session until another client
     connects. It ends with a reset after ``seconds``, when the emulator stops or when the faults are
@@ -504,7 +504,7 @@ class FiredFault(NamedTuple):
     Attributes:
         time: seconds of the emulator's clock.
         fault: the fault, as it was given.
-        message: the message that the fault applied to, as its sender meant it; None if the fault
+        message: the message that the fault applied to, before the fault; None if the fault
             waited for none.
     """
 
@@ -522,9 +522,9 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
     """
     made: list[Fault] = []
     faults = check_all(given, "faults", "a list of faults", "emulator")
-    for number, one in enumerate(faults, start=1):
+    for number, fault in enumerate(faults, start=1):
         try:
-            made.append(_ADAPTER.validate_python(one))
+            made.append(_ADAPTER.validate_python(fault))
         except ValidationError as exc:
             raise ConfigurationError(f"fault {number}: {validation_text(exc)}") from exc
     return tuple(made)

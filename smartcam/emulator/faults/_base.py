@@ -164,7 +164,7 @@ class BaseFault(EmulatorData):
         return None if self.on is None and self.can_act_at_once else self.default_sender
 
     def fits(self, name: str, message_id: int) -> bool:
-        """Return True if the fault waits for such a message of its speaker."""
+        """Return True if the fault waits for this kind of message of its sender."""
         return self.on is None or self.on == name or self.on == message_id
 
 

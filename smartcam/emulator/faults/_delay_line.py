@@ -1,7 +1,6 @@
-"""Send transmissions in order, each at its time. It knows no socket and no fault.
+"""Send transmissions in order, each at its time, without knowledge of sockets and faults.
 
-Everything that delays messages on a link uses it: the emulator's faults give it messages, the link
-proxy gives it bytes of a stream or datagrams.
+The emulator's faults delay messages by this module; the link proxy, bytes of a stream or datagrams.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ class Ending(NamedTuple):
     # event; ``eof`` means that the sender has ended
     how: Literal["close", "reset", "stall", "half_open", "eof"]
     cause: str  # kind of the fault, or name of the rule
-    # seconds that a half-open connection stays; None: as long as possible
+    # seconds for which a half-open connection stays; None: as long as possible
     seconds: float | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Transmission:
-    """Bytes that pass a link, with their delays and pauses."""
+    """Bytes for a link, with their delays and pauses."""
 
-    parts: list[bytes]  # bytes still to pass; each part is one write
+    parts: list[bytes]  # bytes still to send; each part is one write
     _: KW_ONLY
     pauses: list[float] = field(
         default_factory=list[float]
     )  # seconds before each part but the first
     delay: float = 0.0  # seconds before the first part
     overtaken: bool = False  # whether later parts may pass this one while it waits
-    # number of following parts to wait for, and the most seconds to wait
+    # number of later parts to wait for, and the longest wait in seconds
     gather: tuple[int, float] | None = None
-    # without an order: whether it goes after those parts and not together with them
+    # without an order: whether the transmission is sent after those parts, not with them
     behind: bool = False
     end: Ending | None = None  # event of the connection after it
     faults: list[str] = field(
@@ -50,7 +49,7 @@ class Transmission:
 
     @property
     def size(self) -> int:
-        """The number of bytes still to pass."""
+        """The number of bytes still to send."""
         return sum(map(len, self.parts))
 
     def take(self) -> bytes:
@@ -62,7 +61,7 @@ T = TypeVar("T", bound=Transmission)
 
 
 class _Waiting(Generic[T]):
-    """A transmission that has not passed yet; ``missing`` is the number it still waits for."""
+    """A waiting transmission; ``missing``: number of later parts that it still waits for."""
 
     __slots__ = ("company", "due", "missing", "paused", "sent", "turns", "until")
 
@@ -73,12 +72,12 @@ class _Waiting(Generic[T]):
         # time until which it waits for others, nanoseconds
         self.until = self.due + nanoseconds(seconds)
         self.company: list[T] = []  # parts that it waited for, without an order
-        self.paused = False  # a part has passed, and its pause has not begun
-        self.turns = 0  # turns of the timer before it passes
+        self.paused = False  # whether a part was sent, and its pause has not begun
+        self.turns = 0  # turns of the timer before the next part is sent
 
     @property
     def when(self) -> int:
-        """Time at which the message passes if nothing more comes, nanoseconds."""
+        """Time at which the message is sent if no later one arrives, nanoseconds."""
         return self.until if self.missing > 0 else self.due
 
     def pause(self, now: int, turns: int) -> None:
@@ -92,13 +91,13 @@ class _Waiting(Generic[T]):
 class DelayLine(Generic[T]):
     """One direction of one link.
 
-    :meth:`put` transmissions, then call :meth:`run`. Passing bytes go to ``carry``.
+    :meth:`put` transmissions, then call :meth:`run`. ``carry`` is called with the bytes to send.
     """
 
     clock: Clock
     _: KW_ONLY
     # with an order (TCP), nothing passes a waiting transmission unless it may be overtaken, and
-    # all that pass at one time are carried together; without it (UDP) each part goes by itself
+    # all transmissions of one time are carried together; without it (UDP) each part goes by itself
     ordered: bool
     wake: Callable[[], None]  # called when run() is due
     # gets passing transmissions and the bytes of each, for one write; it may stop() the line
@@ -108,7 +107,7 @@ class DelayLine(Generic[T]):
     turns: int = 0  # turns of the event loop that a pause of no time takes
 
     def __post_init__(self) -> None:
-        self.size: int = 0  # bytes on it
+        self.size: int = 0  # bytes of all waiting transmissions
         self.stopped: bool = False  # whether nothing passes until go_on()
         self._queue: deque[_Waiting[T]] = deque()
         self._loose: list[_Waiting[T]] = []
@@ -121,21 +120,21 @@ class DelayLine(Generic[T]):
     def put(self, sent: Iterable[T], amount: int = 1) -> None:
         """Add the transmissions of a message; call :meth:`run` next.
 
-        They count as ``amount`` for transmissions that wait for following ones.
+        They count as ``amount`` for transmissions that wait for later ones.
         """
         now = self._now
         gatherer = self._count(amount, now)
-        for one in sent:
-            self.size += one.size
-            if gatherer is not None and not one.delay:
-                gatherer.company.append(one)
-            elif self.ordered and not one.overtaken:
-                self._queue.append(_Waiting(one, now))
+        for message in sent:
+            self.size += message.size
+            if gatherer is not None and not message.delay:
+                gatherer.company.append(message)
+            elif self.ordered and not message.overtaken:
+                self._queue.append(_Waiting(message, now))
             else:
-                self._loose.append(_Waiting(one, now))
+                self._loose.append(_Waiting(message, now))
 
     def run(self) -> None:
-        """Let all transmissions pass whose time has come."""
+        """Send all transmissions whose time has come."""
         if self._running or self.stopped:
             return
         self._running = True
@@ -147,12 +146,12 @@ class DelayLine(Generic[T]):
         self._arm()
 
     def stop(self) -> None:
-        """Let nothing pass until :meth:`go_on`."""
+        """Send nothing until :meth:`go_on`."""
         self.stopped = True
         self._timer.set(None)
 
     def go_on(self) -> None:
-        """Let waiting transmissions pass, as :meth:`run`, also if the line was stopped."""
+        """Send waiting transmissions like :meth:`run`, also after :meth:`stop`."""
         self.stopped = False
         self.run()
 
@@ -164,75 +163,85 @@ class DelayLine(Generic[T]):
         self._queue.clear()
         self._loose.clear()
         for waiting in left:
-            for one in (waiting.sent, *waiting.company):
-                self.lost(one)
+            for message in (waiting.sent, *waiting.company):
+                self.lost(message)
 
     @property
     def _now(self) -> int:
         return nanoseconds(self.clock.now)
 
     def _count(self, amount: int, now: int) -> _Waiting[T] | None:
-        """Count new transmissions for those that wait; return the one to join."""
-        waiting = [one for one in (*self._queue, *self._loose) if one.missing > 0]
-        for one in waiting:
-            one.missing -= amount
-            if one.sent.behind and one.missing <= 0:
-                one.due = max(one.due, now)
-        together = [one for one in waiting if not self.ordered and not one.sent.behind]
+        """Count new transmissions for waiting ones; return the transmission to join."""
+        waiting = [
+            waiting_message
+            for waiting_message in (*self._queue, *self._loose)
+            if waiting_message.missing > 0
+        ]
+        for waiting_message in waiting:
+            waiting_message.missing -= amount
+            if waiting_message.sent.behind and waiting_message.missing <= 0:
+                waiting_message.due = max(waiting_message.due, now)
+        together = [
+            waiting_message
+            for waiting_message in waiting
+            if not self.ordered and not waiting_message.sent.behind
+        ]
         return together[0] if together else None
 
     def _run_loose(self) -> None:
-        """Pass transmissions that may be overtaken, and all without an order."""
+        """Send transmissions that may be overtaken, and all without an order."""
         now = self._now
-        due = [one for one in self._loose if one.when <= now]
-        for one in sorted(due, key=lambda one: (one.when, one.sent.behind)):
-            if one not in self._loose:  # closed meanwhile
+        due = [waiting_message for waiting_message in self._loose if waiting_message.when <= now]
+        for waiting_message in sorted(
+            due, key=lambda waiting_message: (waiting_message.when, waiting_message.sent.behind)
+        ):
+            if waiting_message not in self._loose:  # closed meanwhile
                 return
             if self.ordered:
-                self._loose.remove(one)
-                self._queue.append(one)
+                self._loose.remove(waiting_message)
+                self._queue.append(waiting_message)
             else:
-                self._pass_datagrams(one)
+                self._pass_datagrams(waiting_message)
 
-    def _pass_datagrams(self, one: _Waiting[T]) -> None:
-        """Pass the due parts, one datagram each; joined parts are one datagram."""
-        sent = one.sent
+    def _pass_datagrams(self, waiting_message: _Waiting[T]) -> None:
+        """Send the due parts, one datagram each; joined parts are one datagram."""
+        sent = waiting_message.sent
         if sent.gather is not None and not sent.behind:
-            self._loose.remove(one)
-            together = [sent, *one.company]
+            self._loose.remove(waiting_message)
+            together = [sent, *waiting_message.company]
             self._hand_over([self._next(each, whole=True) for each in together])
             for each in together:
                 self._finish(each)
             return
-        one.missing = 0
-        while one in self._loose and one.due <= self._now:
+        waiting_message.missing = 0
+        while waiting_message in self._loose and waiting_message.due <= self._now:
             self._hand_over([self._next(sent)])
             if sent.parts:
-                one.pause(self._now, 0)
-            elif one in self._loose:
-                self._loose.remove(one)
+                waiting_message.pause(self._now, 0)
+            elif waiting_message in self._loose:
+                self._loose.remove(waiting_message)
                 self._finish(sent)
 
     def _run_queue(self) -> None:
         batch: list[tuple[T, bytes]] = []
         while self._queue and not self.stopped and self._queue[0].when <= self._now:
-            one = self._queue[0]
-            if one.paused:
-                one.pause(self._now, self.turns)
-            if one.turns or one.due > self._now:
+            first = self._queue[0]
+            if first.paused:
+                first.pause(self._now, self.turns)
+            if first.turns or first.due > self._now:
                 break
-            one.missing = 0
-            sent = one.sent
+            first.missing = 0
+            sent = first.sent
             batch.append(self._next(sent))
             if sent.parts:
-                one.paused = True
+                first.paused = True
                 batch = self._hand_over(batch)
                 continue
             self._queue.popleft()
             if sent.end is not None:
                 batch = self._hand_over(batch)
-                if self.stopped:  # bytes before the end have not passed yet
-                    self._queue.appendleft(one)
+                if self.stopped:  # bytes before the end were not sent yet
+                    self._queue.appendleft(first)
                 else:
                     self._finish(sent)
         self._hand_over(batch)
@@ -257,7 +266,7 @@ class DelayLine(Generic[T]):
     def _arm(self) -> None:
         """Set the timer for the next transmission."""
         waiting = [*list(self._queue)[:1], *self._loose]
-        when = min((one.when for one in waiting), default=None)
+        when = min((waiting_message.when for waiting_message in waiting), default=None)
         self._timer.set(None if self.stopped else when)
 
     def _tick(self) -> None:

@@ -24,7 +24,7 @@ class Stage:
     device: Any
     refuse: Callable[[float], None]  # closes the port for a number of seconds
     let_second_client_in: Callable[[], None]  # lets another client connect
-    clear: Callable[[], None]  # forgets the faults that wait, and ends those that last
+    clear: Callable[[], None]  # forgets waiting faults, and ends lasting ones
 
 
 def _condition(stage: Stage, fault: f.Condition) -> None:
@@ -81,7 +81,7 @@ _NEEDS: Mapping[type[DeviceFault], str] = {
 
 
 def kinds_of(device: object) -> frozenset[str]:
-    """Return the kinds of faults that a camera with such a device supports."""
+    """Return the kinds of faults that a camera with this kind of device supports."""
     return frozenset(
         kind
         for kind, fault in f.FAULTS.items()

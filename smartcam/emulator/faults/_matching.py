@@ -1,4 +1,4 @@
-"""Match faults with messages: the waiting ones, those that a message triggers, the past ones."""
+"""Match faults with messages; keep waiting, triggered and past faults."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class FaultQueue:
         return [row.fault for row in self._all]
 
     def add(self, given: Iterable[BaseFault | Mapping[str, Any]]) -> None:
-        """Add faults after those that wait.
+        """Add faults after the waiting ones.
 
         Raises:
             ConfigurationError: one of the faults is wrong, or too many would wait; none was added.

@@ -93,19 +93,19 @@ class WireCodec(Protocol):
 class WireMessage(Transmission):
     """A message on its way, or an insertion."""
 
-    what: Frame | bytes  # the frame as its sender meant it; bytes that make no frame
+    what: Frame | bytes  # the frame before faults, or bytes that make no frame
     original: bytes  # original bytes of the message
     changeable: bool = True  # whether later faults act on the message
     passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
-    def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
+    def of(cls, message: Frame | bytes, data: bytes) -> WireMessage:
         """Return a message that passes unchanged."""
-        return cls([data], what=what, original=data)
+        return cls([data], what=message, original=data)
 
     @property
     def wire(self) -> bytes | None:
-        """The bytes that passed, None if they are those that were meant."""
+        """The bytes that passed, None if no fault changed them."""
         return None if self.passed == self.original else bytes(self.passed)
 
     def place(self, offset: int) -> tuple[int, int]:
@@ -193,16 +193,16 @@ _Sent: TypeAlias = "list[WireMessage]"
 
 def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: WireCodec) -> _Sent:
     result: _Sent = []
-    for one in sent:
-        result.append(one)
-        if one.changeable:
-            one.faults.append(fault.kind)
-            result += [one.copy() for _ in range(fault.copies)]
+    for message in sent:
+        result.append(message)
+        if message.changeable:
+            message.faults.append(fault.kind)
+            result += [message.copy() for _ in range(fault.copies)]
     return result
 
 
 def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
-    places = [number for number, one in enumerate(sent) if one.changeable]
+    places = [number for number, message in enumerate(sent) if message.changeable]
     if not places:
         return sent
     word = fault.inserted
@@ -221,10 +221,10 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
 def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec) -> _Sent:
     seconds = fault.seconds if isinstance(fault, f.HalfOpen) else None
     if fault.when == "before":
-        for one in sent:
-            if one.changeable:
-                one.drop()
-                one.faults.append(fault.kind)
+        for message in sent:
+            if message.changeable:
+                message.drop()
+                message.faults.append(fault.kind)
     sent[-1].end = sent[-1].end or Ending(fault.kind, fault.kind, seconds)
     return sent
 
@@ -247,10 +247,10 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
         if rebuild is not None:
             sent = rebuild(fault, sent, dialect)
             continue
-        for one in sent:
-            if one.changeable:
-                one.faults.append(fault.kind)
-                _CHANGES[type(fault)](fault, one)
+        for unit in sent:
+            if unit.changeable:
+                unit.faults.append(fault.kind)
+                _CHANGES[type(fault)](fault, unit)
     return sent
 
 
@@ -277,5 +277,5 @@ def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage
 def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
     """Return a datagram as a message, with its frame if it is exactly one."""
     messages = cut(data, dialect.framer(len(data)), dialect)
-    whole = [one.original for one in messages] == [data]
-    return messages[0] if whole else WireMessage.of(data, data)
+    unchanged = [message.original for message in messages] == [data]
+    return messages[0] if unchanged else WireMessage.of(data, data)

@@ -90,11 +90,11 @@ KNOWN_CALLS = 4096
 KNOWN_CAMERAS = 1000
 """Largest number of unshared cameras whose numbers would continue if they came back."""
 
-FIRST_TRY = 30.0
+FIRST_ATTEMPT_TIMEOUT = 30.0
 """Seconds of the timeout at the start for the first attempt to connect to a camera."""
 
 
-WORD_AHEAD = 0.02
+END_NOTICE_DELAY = 0.02
 """Seconds between the last message about a camera and the end of its presence, which would
 overtake the message in the engine."""
 
@@ -108,22 +108,22 @@ class CallNumbers:
 
     def __init__(self, floor: int = 0) -> None:
         self.floor = floor
-        self._known: set[int] = set()
+        self._known_calls: set[int] = set()
 
     @property
     def last(self) -> int:
         """The highest received number."""
-        return max(self._known, default=self.floor)
+        return max(self._known_calls, default=self.floor)
 
     def is_new(self, call: int) -> bool:
         """Return True if a call is received for the first time, and remember it."""
-        if call <= self.floor or call in self._known:
+        if call <= self.floor or call in self._known_calls:
             return False
-        self._known.add(call)
-        if len(self._known) > KNOWN_CALLS:
-            kept = sorted(self._known)[KNOWN_CALLS // 2 :]
-            self.floor = kept[0] - 1
-            self._known = set(kept)
+        self._known_calls.add(call)
+        if len(self._known_calls) > KNOWN_CALLS:
+            newest = sorted(self._known_calls)[KNOWN_CALLS // 2 :]
+            self.floor = newest[0] - 1
+            self._known_calls = set(newest)
         return True
 
 
@@ -134,7 +134,7 @@ class Guest:
     Questions and commands have separate bounds, so that neither blocks the other.
 
     Attributes:
-        who: name and secret of the program.
+        program: name and secret of the program.
         number: number of the program in the results of its triggers.
         present: whether the program's presence was seen.
         questions, commands: numbers of its calls of each kind.
@@ -144,7 +144,7 @@ class Guest:
         last_state: number of the last state in the program's replies, by camera.
     """
 
-    who: ProgramName
+    program: ProgramName
     number: int
     present: bool
     questions: CallNumbers = field(default_factory=CallNumbers)
@@ -227,7 +227,7 @@ class Agent:
         # by role: present programs, by their tokens; and programs that left, oldest first, with
         # their last call
         self._present = collections.defaultdict[str, set[str]](set)
-        self._gone = collections.defaultdict[str, dict[str, int]](dict)
+        self._counts_of_removed = collections.defaultdict[str, dict[str, int]](dict)
         self._of_role: collections.Counter[str] = collections.Counter()  # number of programs
         # running questions, by program
         self._questions: collections.Counter[str] = collections.Counter()
@@ -262,8 +262,8 @@ class Agent:
             await self._claims.refuse_namesake(timeout)
             declared.append(bus.watch(keys.program("*"), self._on_program))
             for role in (None, *ROLES_OF_NAMES):
-                pattern, hear = self._calls_of(role, "**"), self._hears(role)
-                declared.append(bus.subscribe(pattern, hear, patient=role == VIEWER))
+                pattern, on_call = self._calls_of(role, "**"), self._call_handler(role)
+                declared.append(bus.subscribe(pattern, on_call, patient=role == VIEWER))
             self._plain.open()
             self._summaries.open()
             self._bundle.open()
@@ -289,7 +289,7 @@ class Agent:
         for program in [*self._programs]:
             self._forget(program, going_back=False)
         for task in self._workers.close():
-            self._own(task)
+            self._add_task(task)
         for task in tuple(self._tasks):
             task.cancel()
         try:
@@ -341,10 +341,10 @@ class Agent:
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         if frames_of is not None:
             self._frames[name] = frames_of
-        found = self._frames.get(name, NO_FRAMES)
-        reporter = found.reporter
+        state = self._frames.get(name, NO_FRAMES)
+        reporter = state.reporter
         frames = SharedFrames(
-            name, found.make, self._sender, self._encoder, found.url, reporter is not None
+            name, state.make, self._sender, self._encoder, state.url, reporter is not None
         )
         events = self._on_camera_event
         host = Host(
@@ -411,7 +411,7 @@ class Agent:
         try:
             try:
                 if not self._bus.local:
-                    await asyncio.sleep(WORD_AHEAD)
+                    await asyncio.sleep(END_NOTICE_DELAY)
             finally:
                 token.close()
                 running.cancel()
@@ -442,23 +442,23 @@ class Agent:
 
     async def wait_first_attempts(self) -> None:
         """Wait until the first attempt with each camera has ended; bounded."""
-        end = asyncio.get_running_loop().time() + FIRST_TRY
+        end = asyncio.get_running_loop().time() + FIRST_ATTEMPT_TIMEOUT
         for host in tuple(self.hosts.values()):
             await host.tried(max(0.0, end - asyncio.get_running_loop().time()))
 
     def begin(self, work: Any, name: str) -> asyncio.Task[None]:
         """Run a coroutine in a task, which ends with the agent."""
         task = asyncio.get_running_loop().create_task(work, name=name)
-        self._own(task)
+        self._add_task(task)
         return task
 
-    def _own(self, task: asyncio.Task[None]) -> None:
+    def _add_task(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     def _end(self, call: asyncio.Task[None]) -> None:
         """Cancel a call's task, and keep the task until it has ended."""
-        self._own(call)
+        self._add_task(call)
         call.cancel()
 
     @property
@@ -474,28 +474,28 @@ class Agent:
 
     def _on_program(self, key: str, present: bool) -> None:
         token = self._keys.tail(key, "presence/program")[-1]
-        who = ProgramName.of(token)
-        if not who.genuine:
+        name = ProgramName.of(token)
+        if not name.genuine:
             return
-        there, guest = self._present[who.role], self._programs.get(who.name)
+        names_present, guest = self._present[name.role], self._programs.get(name.name)
         if not present:
-            there.discard(token)
-        elif len(there) < MAX_PROGRAMS_PER_ROLE:
-            there.add(token)
-        if guest is None or guest.who != who:
+            names_present.discard(token)
+        elif len(names_present) < MAX_PROGRAMS_PER_ROLE:
+            names_present.add(token)
+        if guest is None or guest.program != name:
             return
         guest.present = present
         if not present:
-            self._forget(who.name)
+            self._forget(name.name)
 
     def _forget(self, program: str, *, going_back: bool = True) -> None:
         """End the calls and reservations of a lost program."""
         guest = self._programs.pop(program, None)
         if guest is None:
             return
-        role = guest.who.role
+        role = guest.program.role
         self._of_role[role] -= 1
-        gone = self._gone[role]
+        gone = self._counts_of_removed[role]
         gone[program] = guest.last
         if len(gone) > MAX_PROGRAMS_PER_ROLE:
             del gone[next(iter(gone))]
@@ -509,23 +509,23 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _known(self, who: ProgramName) -> Guest | None:
+    def _known_calls(self, name: ProgramName) -> Guest | None:
         """Return a known program; None also if another one uses its name."""
-        guest = self._programs.get(who.name)
-        return guest if guest is not None and guest.who == who else None
+        guest = self._programs.get(name.name)
+        return guest if guest is not None and guest.program == name else None
 
-    def _guest(self, who: ProgramName, call: int) -> Guest | None:
+    def _guest(self, name: ProgramName, call: int) -> Guest | None:
         """Return the program that sent a hello; None if the program has left since then."""
-        known, role = self._known(who), who.role
-        left = self._gone[role].get(who.name, 0)
+        known, role = self._known_calls(name), name.role
+        left = self._counts_of_removed[role].get(name.name, 0)
         if known is None and call > left:
             if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
                 raise LocalProtocolError(
                     f"{self.name}: {MAX_PROGRAMS_PER_ROLE} programs of role {role} are here already"
                 )
-            present = who.token in self._present[role]
+            present = name.token in self._present[role]
             numbers = CallNumbers(left), CallNumbers(left)
-            known = self._programs[who.name] = Guest(who, self.next_program(), present, *numbers)
+            known = self._programs[name.name] = Guest(name, self.next_program(), present, *numbers)
             self._of_role[role] += 1
             if not present:
                 loop = asyncio.get_running_loop()
@@ -534,9 +534,9 @@ class Agent:
 
     def _expect_present(self, guest: Guest) -> None:
         """Forget a program whose presence was not seen in time."""
-        if not guest.present and self._programs.get(guest.who.name) is guest:
-            logger.warning("%s ! %s is not present: forgotten", self.name, guest.who.name)
-            self._forget(guest.who.name)
+        if not guest.present and self._programs.get(guest.program.name) is guest:
+            logger.warning("%s ! %s is not present: forgotten", self.name, guest.program.name)
+            self._forget(guest.program.name)
 
     def next_program(self) -> int:
         """Return the number for a new program, which marks the results of its triggers."""
@@ -546,17 +546,17 @@ class Agent:
     # ------------------------------------------------------------------ calls
 
     def _calls_of(self, role: str | None, camera: str) -> str:
-        """Return the key of the questions of a role; with None that of commands."""
+        """Return the key of the questions of a role; with None the key of commands."""
         keys = self._keys
         return (
             keys.command(self.name, camera) if role is None else keys.ask(role, self.name, camera)
         )
 
-    def _hears(self, role: str | None) -> Callable[[str, bytes], None]:
+    def _call_handler(self, role: str | None) -> Callable[[str, bytes], None]:
         """Return the callback for calls of one kind: a role's questions, or with None commands."""
         root, command = self._calls_of(role, ""), role is None
 
-        def hear(key: str, payload: bytes) -> None:
+        def on_call(key: str, payload: bytes) -> None:
             name = key.removeprefix(root)
             try:
                 host, order = self.hosts[name], decode_order(payload, "a call")
@@ -569,44 +569,53 @@ class Agent:
             except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
                 logger.warning("%s ! a call that cannot be read: %s", name, exc)
 
-        return hear
+        return on_call
 
-    def _who(self, token: str, role: str | None) -> ProgramName:
+    def _caller(self, token: str, role: str | None) -> ProgramName:
         """Return the name of the calling program.
 
         Raises:
             ProtocolError: the program uses another's name, or a key for another role than its own.
         """
-        who = ProgramName.of(token)
-        if not who.genuine or role not in {None, who.role}:
-            raise ProtocolError(f"{self.name}: a call as {who.name:.80}, by another program")
-        return who
+        program = ProgramName.of(token)
+        if not program.genuine or role not in {None, program.role}:
+            raise ProtocolError(f"{self.name}: a call as {program.name:.80}, by another program")
+        return program
 
     def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
-        who, number = self._who(str(fields["program"]), role), int(fields["call"])
+        program, number = self._caller(str(fields["program"]), role), int(fields["call"])
         if "come" in fields:
-            self._sender.come(who.name, number, fields["come"])
+            self._sender.come(program.name, number, fields["come"])
             return
         if "cancel" in fields:
-            self._cancel(host, who.name, int(fields["cancel"]), command)
-            self._reply(who.name, number, {"answer": {}})
+            self._cancel(host, program.name, int(fields["cancel"]), command)
+            self._reply(program.name, number, {"answer": {}})
             return
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(who, number) if action == "hello" else self._known(who)
+        guest = self._guest(program, number) if action == "hello" else self._known_calls(program)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
         left = self._admit(
-            host, guest, who.name, number, epoch, action, deadline, timeout, command, reservation
+            host,
+            guest,
+            program.name,
+            number,
+            epoch,
+            action,
+            deadline,
+            timeout,
+            command,
+            reservation,
         )
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
             blobs, entered = message.blobs, guest.entered
             call = ProgramCall(
-                host, who.name, owner, arguments, blobs, left, entered, None, reservation
+                host, program.name, owner, arguments, blobs, left, entered, None, reservation
             )
             self._start(action, call, guest, command)
 
@@ -614,8 +623,8 @@ class Agent:
         number, action = order.call, "trigger"
         program, _, secret = token.partition(".")
         guest = self._programs.get(program)
-        if guest is None or guest.who.secret != secret:
-            guest, program = None, self._who(token, None).name
+        if guest is None or guest.program.secret != secret:
+            guest, program = None, self._caller(token, None).name
         epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
         reservation = order.reservation
         left = self._admit(
@@ -679,9 +688,9 @@ class Agent:
         if left < 0:
             return late(action, f"{host.name}: {action} came after its deadline; it was not done")
         cameras = len(self.hosts)
-        if not command and self._questions[guest.who.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
+        if not command and self._questions[guest.program.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
             return LocalProtocolError(
-                f"{host.name}: too many questions of role {guest.who.role} are under way"
+                f"{host.name}: too many questions of role {guest.program.role} are under way"
             )
         if guest.under_way[command] >= MAX_CALLS_PER_PROGRAM * cameras:
             kind = "commands" if command else "questions"
@@ -696,8 +705,8 @@ class Agent:
         )
         guest.begin(command, call.owner.call, task)
         if not command:
-            self._questions[guest.who.role] += 1
-            task.add_done_callback(partial(self._answered, guest.who.role))
+            self._questions[guest.program.role] += 1
+            task.add_done_callback(partial(self._answered, guest.program.role))
 
     def _answered(self, role: str, _: object) -> None:
         self._questions[role] -= 1
@@ -715,7 +724,7 @@ class Agent:
             return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
-        if entered is not None:  # it was carried out, which its program does not know
+        if entered is not None:  # the call was carried out, which its program does not know
             camera, before = entered
             camera.leave(before)
 

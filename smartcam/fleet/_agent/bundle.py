@@ -24,7 +24,7 @@ BUNDLE_INTERVAL = 0.005
 FULL_BUNDLE_BYTES = 1 << 15
 """Bytes of results with which a bundle is sent at once."""
 
-REMINDERS = (0.05, 0.2, 1.0, 5.0)
+REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
 """Seconds after the last bundle until the next number is sent again."""
 
 _HEAD = struct.Struct("<4sQQQI")
@@ -48,11 +48,11 @@ class Bundled(NamedTuple):
     parts: list[tuple[str, bytes]]
 
 
-def decode_bundle(payload: bytes, what: str) -> Bundled:
+def decode_bundle(payload: bytes, label: str) -> Bundled:
     """Return the bundle in ``payload``.
 
     Raises:
-        RemoteProtocolError: the payload is not valid; the text names ``what``.
+        RemoteProtocolError: the payload is not valid; the text names ``label``.
     """
     try:
         magic, epoch, number, following, count = _HEAD.unpack_from(payload)
@@ -69,7 +69,7 @@ def decode_bundle(payload: bytes, what: str) -> Bundled:
         if place != len(payload):
             raise ValueError(f"{len(payload) - place} bytes are left over")
     except (ValueError, struct.error) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     return Bundled(epoch, number, following, parts)
 
 
@@ -94,7 +94,7 @@ class AgentBundle:
 
     def open(self) -> None:
         """Start to check for subscribers."""
-        self._out = self._bus.publisher(self._key, self._on_heard)
+        self._out = self._bus.publisher(self._key, self._on_subscribers)
 
     def close(self) -> None:
         """Send the results that are left, and stop sending. Idempotent."""
@@ -105,12 +105,12 @@ class AgentBundle:
             out.close()
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the bundles have a subscriber."""
-        return self._out is not None and self._out.heard
+        return self._out is not None and self._out.has_subscribers
 
     def add(self, camera: str, runs: bytes) -> None:
-        """Add a camera's results, which are sent soon with those of others."""
+        """Add a camera's results, which are sent soon with results of other cameras."""
         name = camera.encode()
         self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
         self._count += 1
@@ -142,8 +142,8 @@ class AgentBundle:
             head = _HEAD.pack(_MAGIC, self._epoch, number, self._number, count)
             self._out.put(b"".join((head, *parts)))
 
-    def _on_heard(self, heard: bool) -> None:
-        if heard:
+    def _on_subscribers(self, has_subscribers: bool) -> None:
+        if has_subscribers:
             self._remind(0)
 
     def _end_reminding(self) -> None:
@@ -154,12 +154,12 @@ class AgentBundle:
     def _remind(self, step: int) -> None:
         """Send the next number again later; stop after the last reminder."""
         self._end_reminding()
-        if step < len(REMINDERS):
+        if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
 
-    def _say_number(self, step: int) -> None:
+    def _send_number(self, step: int) -> None:
         self._reminder = None
-        if self.heard:
+        if self.has_subscribers:
             self._put(self._number, 0, [])
             self._remind(step)

@@ -77,7 +77,7 @@ class ProgramCall(NamedTuple):
             ConfigurationError: the value is not valid.
         """
         value = self.arguments.get(name)
-        return None if value is None else check(value, name, *bounds, who=self.host.name)
+        return None if value is None else check(value, name, *bounds, caller=self.host.name)
 
     def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
         """Return a required argument."""
@@ -87,17 +87,17 @@ class ProgramCall(NamedTuple):
         return value
 
 
-def _check_layouts(value: object, what: str, who: str) -> Any:
+def _check_layouts(value: object, name: str, caller: str) -> Any:
     """Return the layouts that have a number: one, or one for each application."""
     if not isinstance(value, dict):
-        return check_text(value, what, who)
+        return check_text(value, name, caller)
     try:
         return {
-            int(key): check_text(text, what, who)
+            int(key): check_text(text, name, caller)
             for key, text in cast("dict[str, object]", value).items()
         }
     except ValueError as exc:
-        raise wrong_argument(what, "layouts by application id", value, who) from exc
+        raise wrong_argument(name, "layouts by application id", value, caller) from exc
 
 
 _PLAIN = Carrier()
@@ -273,13 +273,13 @@ def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
         bitrate=call.argument("bitrate", check_integer, MIN_BITRATE, MAX_BITRATE),
         stream=stream,
     )
-    rest = min(MAX_FRAME_INTERVAL, call.argument("rest", check_age) or 0.0)
+    min_interval = min(MAX_FRAME_INTERVAL, call.argument("rest", check_age) or 0.0)
     have = call.argument("have", check_integer, 0) or 0
-    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, rest, have)
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, min_interval, have)
 
 
 async def _frame(call: ProgramCall) -> Answer:
-    return await call.host.frames.one(
+    return await call.host.frames.frame(
         _frame_order(call),
         max_age=call.argument("max_age", check_age),
         after=call.argument("after", check_moment),

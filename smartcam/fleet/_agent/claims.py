@@ -1,14 +1,14 @@
-"""Decide which agent of a fleet has a name and a camera, and let one that stands by take over.
+"""Decide which agent of a fleet has a name and a camera, and when a standby agent takes over.
 
 Two agents of one name see each other's starts. The earlier start keeps the name; the later agent
 gives up its cameras, and logs that.
 
 An agent announces a camera by a presence. Another agent with the same camera either refuses to
-start, or stands by: without a session, until that presence ends. If two agents share one camera
-after a split of the network, the camera decides, which serves the newcomer: the agent that has lost
-its session and sees the other's presence asks the other, and leaves the camera to it. Both may give
-up at the same time; so an agent that gave the camera up, and sees that the other does not have it
-any more, stands by again.
+start, or stands by: it has no session until that presence ends. If two agents share one camera
+after a split of the network, the camera decides, since it serves the newest client: the agent that
+has lost its session and sees the other's presence asks the other, and leaves the camera to it. Both
+may give up at the same time. So an agent that gave up the camera stands by again when the other no
+longer has it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-HOLD_OFF = 0.2
-"""Seconds per step of preference until an agent that stands by takes a camera without agent."""
+HOLD_OFF_DELAY = 0.2
+"""Seconds per step of preference until a standby agent takes a camera that has no agent."""
 
 ASK_TIMEOUT = 0.5
 """Seconds for another agent's answer, and between two checks of its cameras."""
@@ -50,19 +50,19 @@ RESOLVE_TIMEOUT = 2.0
 """Seconds of the timeout for the addresses of a host's name."""
 
 RETURN_WAIT = 4.0
-"""Seconds for others to return to a bus that was lost, before their cameras are taken over."""
+"""Seconds for other agents to return after a loss of the bus, before their cameras are taken."""
 
 CONTESTED_SECONDS = 30.0
-"""Seconds after another agent with the same camera came or went, in which that agent may be the one
-that takes the camera."""
+"""Seconds after another agent with the same camera appeared or disappeared, in which it is the
+probable taker of the camera."""
 
 TAKE_ONCE_SECONDS = 600.0
-"""Seconds in which a camera that another client took is not taken back a second time: a client that
-is not an agent would take it again, too."""
+"""Seconds in which a camera that another client took is taken back at most once: otherwise two
+clients would take it from each other again and again."""
 
 
 class Claims:
-    """The cameras that an agent has, or stands by for.
+    """The cameras that an agent shares or stands by for.
 
     Args:
         agent: the agent.
@@ -71,15 +71,17 @@ class Claims:
         standby: settings of standing by; None: the agent does not stand by.
 
     Attributes:
-        given_up: errors for cameras that another agent has now, by the camera's name.
+        given_up: errors for cameras that were left to another agent, by the camera's name.
     """
 
     def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:
         self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
         self._wanted: dict[str, CameraSettings] = {}
         self._others: dict[str, set[str]] = {}  # other agents with a camera of this agent
-        self._contested: dict[str, float] = {}  # time until which one of them may take it
-        self._calm: dict[str, float] = {}  # time until which this is excluded
+        self._contested: dict[
+            str, float
+        ] = {}  # loop time until which another agent may take the camera
+        self._calm: dict[str, float] = {}  # loop time until which a takeover is excluded
         self._settling: set[str] = set()
         self._again: set[str] = set()
         self._back: dict[str, asyncio.Event] = {}  # awaited presences of other agents
@@ -89,11 +91,11 @@ class Claims:
         self._name: list[Handle] = []
 
     async def refuse_namesake(self, timeout: float) -> None:
-        """Raise if there is another agent of this name; before using the name on the bus.
+        """Raise if another agent has the name; called before the name is used on the bus.
 
         Raises:
-            ConfigurationError: there is another agent, whose presence stays for longer than that of
-                a dead one.
+            ConfigurationError: there is another agent: its presence lasts longer than the presence
+                of an agent that has died.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         patience = loop.time() + LEASE_TIME + 1.0
@@ -119,7 +121,7 @@ class Claims:
         self._name.append(bus.watch(keys.start(name, "*"), self._on_namesake))
 
     def _is_earlier(self, key: str) -> bool:
-        """Return True if another start of this name is earlier; there are no ties."""
+        """Return True if another agent of this name was started earlier; there are no ties."""
         return _order(self._keys.tail(key, "presence/start")[-1]) < _order(self._start)
 
     def _namesake(self) -> ConfigurationError:
@@ -138,14 +140,14 @@ class Claims:
             )
         elif not present:
             for host in self._agent.hosts.values():
-                host.camera.take_again()  # the camera that it took
+                host.camera.take_again()  # take back the camera that the other agent took
 
     async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
         """Share the cameras that no other agent has.
 
         Raises:
-            ConfigurationError: another agent has a camera, and neither stands by; then nothing is
-                shared. Or an option of a camera is wrong.
+            ConfigurationError: another agent has a camera and neither stands by, or an option of a
+                camera is wrong; nothing is shared.
         """
         self._wanted = dict(cameras)
         keys, bus = self._keys, self._bus
@@ -154,7 +156,9 @@ class Claims:
         self._watch = bus.watch(keys.camera("*", "**"), self._on_presence)
         if self._standby is None:
             await self._refuse()
-        await self.refuse_taken({n: one for n, one in cameras.items() if not self._others.get(n)})
+        await self.refuse_taken(
+            {n: camera for n, camera in cameras.items() if not self._others.get(n)}
+        )
         for name, settings in cameras.items():
             if self._others.get(name):
                 self._consider(name)
@@ -187,17 +191,17 @@ class Claims:
             )
 
     async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
-        """Raise if the fleet has one of these cameras under another name: it serves one client.
+        """Raise if the fleet has one of these cameras under another name.
 
-        There is no await between the last check of this agent's own cameras and the return. Two
-        agents that check at the same time do not see each other.
+        A camera serves one client. There is no await between the check of this agent's own cameras
+        and the return. Two agents that check at the same time do not see each other.
 
         Raises:
             ConfigurationError: one of the addresses is taken; the text names it and its agent.
         """
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
-        ports = {one.address.port for one in cameras.values()}
+        ports = {camera.address.port for camera in cameras.values()}
         listed_cameras: list[tuple[str, str, Address]] = []
         for _, payload in answers:
             try:
@@ -207,13 +211,13 @@ class Claims:
                     listed_cameras.append((str(listed["camera"]), str(listed["agent"]), address))
             except (ValueError, TypeError, KeyError, SmartCamError) as exc:
                 logger.warning("! an agent's message about a camera cannot be read: %s", exc)
-        hosts = {one.address.host for one in cameras.values()}
+        hosts = {camera.address.host for camera in cameras.values()}
         hosts |= {address.host for _, _, address in listed_cameras}
-        hosts |= {one.settings.address.host for one in self._agent.hosts.values()}
+        hosts |= {host.settings.address.host for host in self._agent.hosts.values()}
         addresses = await _places_of(hosts)
         listed_cameras += [
-            (name, self._agent.name, one.settings.address)
-            for name, one in self._agent.hosts.items()
+            (name, self._agent.name, host.settings.address)
+            for name, host in self._agent.hosts.items()
         ]
         taken: dict[tuple[str, int], list[tuple[str, str]]] = {}
         for camera, agent, address in listed_cameras:
@@ -250,8 +254,8 @@ class Claims:
     async def _refuse(self) -> None:
         """Raise if another agent has a camera of this agent, and neither stands by.
 
-        An agent that does not answer while its presence stays may have died a moment ago: the
-        presence ends with the engine's lease.
+        An agent that does not answer may have died a moment ago: its presence ends only with the
+        engine's lease.
         """
         loop = asyncio.get_running_loop()
         patience = loop.time() + LEASE_TIME + 1.0
@@ -260,15 +264,15 @@ class Claims:
             if not contested:
                 return
             standby_of = {
-                (one.summary.camera, one.summary.agent): one.standby
+                (answer.summary.camera, answer.summary.agent): answer.standby
                 for agent in sorted({agent for _, agent in contested})
-                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
+                for answer in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
-            if all(standby_of.get(one) for one in contested):
+            if all(standby_of.get(camera) for camera in contested):
                 return
             silent = not contested & standby_of.keys()
             if not silent or loop.time() > patience:
-                name, agent = min(one for one in contested if not standby_of.get(one))
+                name, agent = min(camera for camera in contested if not standby_of.get(camera))
                 more = f", and {len(contested) - 1} more cameras" if len(contested) > 1 else ""
                 says = ", which does not answer" if silent else ""
                 raise ConfigurationError(
@@ -281,7 +285,7 @@ class Claims:
     # ------------------------------------------------------------------ other agents
 
     def _note(self, key: str, present: bool) -> str:
-        """Note another agent's presence at a camera; return the camera, "" for other cameras."""
+        """Note another agent's presence; return its camera, "" if this agent does not have it."""
         agent, *chunks = self._keys.tail(key, "presence/camera")
         name = "/".join(chunks)
         if agent == self._agent.name or name not in self._wanted:
@@ -307,12 +311,12 @@ class Claims:
                 self._consider(name)
 
     def _is_contested(self, name: str) -> bool:
-        """Return True if another agent has a camera of this agent, or had it a moment ago."""
+        """Return True if another agent announces a camera of this agent, or did a moment ago."""
         now = asyncio.get_running_loop().time()
         return bool(self._others.get(name)) or now < self._contested.get(name, now)
 
     def _consider(self, name: str) -> None:
-        """Decide about a camera in a task; one at a time for each."""
+        """Decide in a task which agent gets a camera; one task at a time for each camera."""
         self._again.add(name)
         if name not in self._settling:
             self._settling.add(name)
@@ -330,11 +334,11 @@ class Claims:
             self._settling.discard(name)
 
     async def _stand_by(self, name: str) -> None:
-        """Take over a camera without agent."""
+        """Take over a camera that no agent has."""
         if self._standby is None or self._others.get(name):
             return
-        away = not self._bus.reached  # this agent was cut off, not the others
-        await asyncio.sleep(HOLD_OFF * self._standby.preference)
+        away = not self._bus.reached  # only this agent was cut off, not the others
+        await asyncio.sleep(HOLD_OFF_DELAY * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
                 if await self._appears(name, RETURN_WAIT):
@@ -375,10 +379,10 @@ class Claims:
             del self._back[name]
 
     async def _defend(self, name: str) -> None:
-        """Decide about a camera of this agent that has no session.
+        """Decide whether this agent keeps a camera without a session.
 
-        Another agent that announces the camera, too, keeps it if it has a session. If no other
-        agent announces it, and a client took the camera, this agent stands by.
+        Another agent that also announces the camera keeps it if it has a session. If no other agent
+        announces it, and another client took the camera, this agent stands by.
         """
         agent, away = self._agent, False
         while (host := agent.hosts.get(name)) and not host.connected:  # a later loss is an event
@@ -405,9 +409,9 @@ class Claims:
                 return
 
     async def _yields(self, host: Host, other: str) -> bool:
-        """Return True if this agent, without a session, leaves a camera to another agent.
+        """Return True if this agent, which has no session, leaves a camera to another agent.
 
-        Of two agents without a session the first one by name continues.
+        Of two agents without a session the first by name keeps the camera.
         """
         agent, name = self._agent, host.name
         cameras = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
@@ -427,21 +431,21 @@ class Claims:
 
 
 def _order(start: str) -> tuple[int, str]:
-    """Return the sort key of agents' starts: their time, then a random word."""
+    """Return the sort key of agents' starts: time, then a random word."""
     epoch, _, chance = start.partition("-")
     return int(epoch) if epoch.isdecimal() else 0, chance
 
 
 async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
     """Return the addresses of each host, or its name if it has none; bounded."""
-    found: dict[str, set[str]] = {}
+    places: dict[str, set[str]] = {}
     names: list[str] = []
     for host in hosts:
         try:
-            found[host] = {ipaddress.ip_address(host).compressed}
+            places[host] = {ipaddress.ip_address(host).compressed}
         except ValueError:
             names.append(host)
-            found[host] = {host.lower()}
+            places[host] = {host.lower()}
 
     async def resolve(host: str) -> None:
         loop = asyncio.get_running_loop()
@@ -449,16 +453,16 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
             addresses = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             return  # the client reports an unknown host
-        found[host] |= {str(one[4][0]) for one in addresses}
+        places[host] |= {str(address[4][0]) for address in addresses}
 
     if names:
-        tasks = [asyncio.create_task(resolve(one)) for one in names]
+        tasks = [asyncio.create_task(resolve(name)) for name in names]
         try:
             await asyncio.wait(tasks, timeout=RESOLVE_TIMEOUT)
         finally:
             for task in tasks:
                 task.cancel()
-    return found
+    return places
 
 
 def _is_taken(host: Host) -> bool:

@@ -1,4 +1,4 @@
-"""Let commands pass to a camera: those of all programs, or of the one that has reserved it."""
+"""Let commands pass to a camera: from all programs, or only from the one that reserved it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Change = Literal["Reserved", "Released", "ReservationLost"]
 
 @dataclass(eq=False, slots=True)
 class InLine:
-    """A waiting command or reservation.
+    """A command or reservation in the line.
 
     Attributes:
         program: name of the waiting program.
@@ -31,7 +31,7 @@ class InLine:
     wake: asyncio.Future[None] | None = None
 
 
-def _tell_nobody(change: Change, program: str) -> None:
+def _report_nothing(change: Change, program: str) -> None:
     """Report nothing."""
 
 
@@ -44,14 +44,14 @@ class Gate:
         holder: program that has reserved the camera; None if none has.
     """
 
-    on_change: Callable[[Change, str], None] = _tell_nobody
+    on_change: Callable[[Change, str], None] = _report_nothing
     holder: str | None = None
     _reservations: set[Hashable] = field(default_factory=set["Hashable"])
     _active: collections.Counter[str] = field(default_factory=collections.Counter[str])
     _line: collections.deque[InLine] = field(default_factory=collections.deque["InLine"])
 
     async def enter(self, program: str, timeout: float) -> None:
-        """Let a command of ``program`` begin; it ends with :meth:`leave`.
+        """Wait for the turn of a command of ``program``, which ends with :meth:`leave`.
 
         Raises:
             TimeoutError: the turn did not come within ``timeout`` seconds.
@@ -60,14 +60,14 @@ class Gate:
             await self._pass(program, None, timeout)
 
     def goes_in(self, program: str) -> bool:
-        """Let a command begin if it need not wait; return whether it began."""
+        """Begin a command if it need not wait; return whether it began."""
         if self._line or (self.holder is not None and self.holder != program):
             return False
         self._active[program] += 1
         return True
 
     def leave(self, program: str) -> None:
-        """Count a command of ``program`` as ended; programs without commands are not kept."""
+        """Count a command of ``program`` as ended."""
         left = self._active[program] - 1
         if left:
             self._active[program] = left
@@ -82,7 +82,7 @@ class Gate:
         return len(self._line)
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
-        """Keep the commands of others out; wait for those that are running.
+        """Keep the commands of other programs out, and wait until their running commands end.
 
         A program may reserve the camera again; each reservation is released separately.
 
@@ -99,11 +99,11 @@ class Gate:
         self._grant()
 
     def holds(self, reservation: Hashable) -> bool:
-        """Return True if a reservation was made and has not ended; no key is used twice."""
+        """Return True if a reservation was made and has not ended."""
         return reservation in self._reservations
 
     def forget(self, program: str) -> None:
-        """End all reservations of a program, which has not released them: they are lost."""
+        """End the reservations that a program has not released; report them as lost."""
         if self.holder == program:
             self._reservations.clear()
             self._free("ReservationLost")
@@ -127,7 +127,7 @@ class Gate:
             raise
 
     def line_up(self, program: str, reservation: Hashable | None) -> InLine:
-        """Add a command or a reservation to the line; its turn may have come already."""
+        """Add a command or a reservation to the line, and grant its turn if none is before it."""
         waiting = InLine(program, reservation)
         if not self._line or self.holder == program:
             self._line.appendleft(waiting)
@@ -137,7 +137,7 @@ class Gate:
         return waiting
 
     def give_up(self, waiting: InLine) -> None:
-        """Take a waiting caller out of the line, or take back its granted turn."""
+        """Remove an entry from the line, or end its turn if it was granted."""
         if waiting in self._line:
             self._line.remove(waiting)
         elif waiting.reservation is not None:

@@ -1,4 +1,4 @@
-"""Hold an agent's camera: its session, its last state, and the right to command it."""
+"""Manage one camera of an agent: its session, its last state, and the right to command it."""
 
 from __future__ import annotations
 
@@ -51,23 +51,22 @@ if TYPE_CHECKING:
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
 STATUS_DELAY = 0.005
-"""Seconds that a status may wait for others, so that one message carries them. The program that
-triggered gets it with the reply."""
+"""Seconds that a status may wait for others, to be sent in one message. The program that triggered
+gets the status with the reply."""
 
-CATCH_UP = 0.2
-"""Seconds after such a reply until the number of the next state is sent, if no state was: otherwise
-a lost reply would stay unnoticed."""
+CATCH_UP_DELAY = 0.2
+"""Seconds after a reply with a status until the number of the next state is sent, if no state was:
+otherwise a lost reply would stay unnoticed."""
 
 RESULTS_INTERVAL = 0.002
-"""Seconds that must pass between two messages with results: those that come faster are sent
-together."""
+"""Least seconds between two messages with results: faster results are sent together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
 """Results of this many bytes are sent at once, without RESULTS_INTERVAL."""
 
-REMINDERS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds after the last results until their numbers are sent again: otherwise a loss of the last
-ones would stay unnoticed."""
+REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
+"""Seconds after the last results at which their numbers are sent again: otherwise a loss of these
+results would stay unnoticed."""
 
 
 class Host:
@@ -88,16 +87,16 @@ class Host:
 
     Attributes:
         epoch: number of the agent's start, or of its current hold of the camera.
-        began: number of the first result since then.
-        final: whether no other agent takes the camera over after the last session.
+        began: number of the first result of this epoch.
+        final: whether no other agent will take over the camera after the last session.
         gate: gate that decides which program's commands may pass.
         results: the last results.
         states: the last states of the camera.
-        outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
+        outcomes: runs of running triggers, by owner; only for owners that have added a list.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: reason why there is no session yet, None if there is or was one.
-        triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
+        failure: reason why there was no session yet; None if there was one.
+        triggers: numbers of programs' triggers, by outcome (a word of ``OUTCOMES``).
     """
 
     def __init__(
@@ -142,7 +141,7 @@ class Host:
         self._opened = asyncio.Event()
         self._over = False  # whether no further session will come
         self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
-        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_subscribers)
 
     @property
     def camera(self) -> SharedCamera:
@@ -177,7 +176,7 @@ class Host:
     # ------------------------------------------------------------------ life
 
     async def run(self) -> None:
-        """Keep a session once there is a camera; return after the last one."""
+        """Keep a session with the camera; return after the last session."""
         backoff = self.settings.reconnect
         delays = iter(()) if backoff is None else backoff.delays()
         try:
@@ -207,7 +206,7 @@ class Host:
 
     async def close(self) -> None:
         """End the session with Disconnect; bounded."""
-        self._opened.clear()  # later messages bring nothing new
+        self._opened.clear()  # later messages have no further effect
         try:
             await self.frames.close()
         finally:
@@ -256,7 +255,7 @@ class Host:
                 self.triggers[outcome] += 1
 
     async def enter(self, program: str, action: str, timeout: float) -> None:
-        """Let a command of ``program`` begin, as :meth:`Gate.enter` does.
+        """Wait for the turn of a command of ``program``, like :meth:`Gate.enter`.
 
         Raises:
             ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
@@ -268,12 +267,12 @@ class Host:
             raise self._not_granted(action, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
-        """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
+        """Keep the commands of other programs out, like :meth:`Gate.reserve`.
 
-        If another agent may take the camera over, only the agent that has it can reserve it.
+        If another agent may take over the camera, it can be reserved only during a session.
 
         Raises:
-            ResponseTimeoutError: another program has it for ``timeout`` seconds more.
+            ResponseTimeoutError: another program holds it for longer than ``timeout`` seconds.
             LinkError: there is no session, and another agent may have one.
         """
         try:
@@ -291,7 +290,7 @@ class Host:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
-            ReservationLostError: the reservation has ended, or was kept by another agent.
+            ReservationLostError: the reservation has ended, or another agent granted it.
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(
@@ -301,10 +300,10 @@ class Host:
             )
 
     async def keeps(self, reservation: Hashable, timeout: float) -> bool:
-        """Return True if a reservation still holds and no other agent has the camera by now.
+        """Return True if a reservation still holds, and this agent still has the camera.
 
-        If another agent may take over, the camera is asked: it serves one client, so that an agent
-        that gets an answer still has the camera.
+        If another agent may take over, a request is sent to the camera. The camera serves one
+        client, so an answer shows that this agent still has it.
 
         Raises:
             SmartCamError: the camera does not answer.
@@ -315,7 +314,7 @@ class Host:
         return self.gate.holds(reservation)
 
     def lose_reservation(self) -> None:
-        """End a reservation, if there is one, before its holder releases it."""
+        """End a reservation that its holder has not released, if there is one."""
         if self.gate.holder is not None:
             self.gate.forget(self.gate.holder)
 
@@ -327,16 +326,21 @@ class Host:
             self.topics.on_state()
 
     def _not_granted(self, action: str, timeout: float) -> SmartCamError:
-        """Return the error for a program that waited in vain for others to let go of the camera."""
+        """Return the error for a program whose wait for other programs timed out."""
         holder = self.gate.holder
-        who = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
-        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {action} was not done"
+        holder_text = (
+            "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
+        )
+        text = (
+            f"{self.name}: {holder_text} did not let go within {timeout:.3g} s; "
+            f"{action} was not done"
+        )
         return late(action, text)
 
     # ------------------------------------------------------------------ what the camera is
 
     def state(self) -> dict[str, Any]:
-        """Return the camera's fields of every state message."""
+        """Return the fields of a state message."""
         camera = self._camera
         try:
             status: int | None = int(camera.status)
@@ -357,7 +361,7 @@ class Host:
         return fields
 
     def known(self) -> tuple[bool, int | None, int | None, str | None]:
-        """Return the presence of a session, its status and application, or why there is none."""
+        """Return the presence of a session, its status and application, or the reason for none."""
         camera, trouble = self._camera, self.failure or self._camera.trouble
         try:
             status: int | None = int(camera.status)
@@ -367,7 +371,7 @@ class Host:
         return trouble is None, status, camera.active_application, why
 
     def about(self) -> dict[str, Any]:
-        """Return the fields of the camera that stay the same for a whole session."""
+        """Return the fields of the camera that do not change during a session."""
         camera, settings = self._camera, self.settings
         fields: dict[str, Any] = {
             "camera": self.name,
@@ -406,7 +410,7 @@ class Host:
             state["about"] = self.about()
         self._publish_state(state)
         if isinstance(event, Disconnected) and not (event.expected or self.final):
-            self.lose_reservation()  # another agent may have the camera meanwhile
+            self.lose_reservation()  # another agent may have taken the camera
 
     def _on_end(self) -> None:
         if self._opened.is_set() and self.failure is None:
@@ -419,11 +423,11 @@ class Host:
         self._publish_state({"kind": "Removed", "why": why})
 
     def _on_taken(self) -> None:
-        """Announce that another client has the camera, which is tried again at intervals."""
+        """Announce that another client has the camera; sessions are tried at intervals."""
         self._publish_state({"kind": "Taken"})
 
     def _publish_state(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
-        """Send an event with the camera's state, within ``hold`` seconds or with the next event."""
+        """Send the camera's state with an event: after ``hold`` seconds, or with the next event."""
         clock = asyncio.get_running_loop().time()
         state = {**fields, **self.state(), "number": self.states.following, "clock": clock}
         self._add_state(encode_state(state), clock, hold)
@@ -438,7 +442,7 @@ class Host:
         self.topics.on_state()
 
     def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
-        """Keep results that came together, and send them soon, with those that come meanwhile."""
+        """Keep results that arrived together, and send them soon with later ones."""
         first = results[0]
         owner = first.value.owner
         flags = (CURRENT if current else 0) | (LATE if late else 0)
@@ -457,7 +461,7 @@ class Host:
                 first.received_at.timestamp(),
                 timestamp(first.triggered_at),
                 timestamp(None) if first.latency is None else first.latency,
-                [one.raw for one in results],
+                [result.raw for result in results],
                 cells,
             ),
         )
@@ -466,7 +470,7 @@ class Host:
         outcomes = self.outcomes.get(owner)
         if outcomes is not None:
             outcomes.append(data)
-        if self._results_out.heard or self._bundle.heard:
+        if self._results_out.has_subscribers or self._bundle.has_subscribers:
             self._fresh.append(data)
             self._fresh_bytes += len(data)
             if self._fresh_bytes >= FULL_MESSAGE_BYTES:
@@ -487,7 +491,7 @@ class Host:
         """Drop the states that were not sent yet, since all their receivers have them."""
         self._held.clear()
         self._fresh_states.clear()
-        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP)
+        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP_DELAY)
 
     def flush(self, *, states: bool = True) -> None:
         """Send the results and, with ``states``, the states that were not sent yet."""
@@ -515,14 +519,14 @@ class Host:
             self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
             payload = encode_runs(self.epoch, self.results.following, fresh)
-            if self._bundle.heard:
+            if self._bundle.has_subscribers:
                 self._bundle.add(self.name, payload)
-            if self._results_out.heard:
+            if self._results_out.has_subscribers:
                 self._results_out.put(payload)
                 self._remind(0)
 
-    def _on_heard(self, heard: bool) -> None:
-        if heard:
+    def _on_subscribers(self, has_subscribers: bool) -> None:
+        if has_subscribers:
             self._remind(0)
 
     def _remind(self, step: int) -> None:
@@ -530,12 +534,12 @@ class Host:
         if self._reminder is not None:
             self._reminder.cancel()
             self._reminder = None
-        if step < len(REMINDERS):
+        if step < len(REMINDER_DELAYS):
             loop = asyncio.get_running_loop()
-            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+            self._reminder = loop.call_later(REMINDER_DELAYS[step], self._send_number, step + 1)
 
-    def _say_number(self, step: int) -> None:
+    def _send_number(self, step: int) -> None:
         self._reminder = None
-        if self._results_out.heard:
+        if self._results_out.has_subscribers:
             self._results_out.put(encode_runs(self.epoch, self.results.following, []))
             self._remind(step)

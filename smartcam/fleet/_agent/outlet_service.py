@@ -175,7 +175,10 @@ class OutletService:
                 raise error
             request = validated(StoredRequest, given or {}, "outlets: results")
             stored = await self._stored(request)
-            outcome = {"error": "", "stores": {name: _bounded(one) for name, one in stored.items()}}
+            outcome = {
+                "error": "",
+                "stores": {name: _bounded(value) for name, value in stored.items()},
+            }
         except SmartCamError as exc:
             outcome = failure(exc)
         finally:
@@ -225,7 +228,7 @@ async def _ask(
             answers += await asyncio.to_thread(read, answer)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as exc:
             logger.warning("%s ! an agent's answer cannot be read: %r", key, exc)
-    return sorted(answers, key=lambda one: one[:2])
+    return sorted(answers, key=lambda row: row[:2])
 
 
 def _accounts(answer: bytes) -> list[ReportedOutlet]:
@@ -234,13 +237,13 @@ def _accounts(answer: bytes) -> list[ReportedOutlet]:
         ReportedOutlet(
             str(report["agent"]),
             str(name),
-            int(one["results"]),
-            int(one["delivered"]),
-            int(one["spooled"]),
-            {str(why): int(count) for why, count in one["dropped"].items()},
-            str(one["trouble"]),
+            int(counts["results"]),
+            int(counts["delivered"]),
+            int(counts["spooled"]),
+            {str(why): int(count) for why, count in counts["dropped"].items()},
+            str(counts["trouble"]),
         )
-        for name, one in report["outlets"].items()
+        for name, counts in report["outlets"].items()
     ]
 
 
@@ -253,13 +256,13 @@ def _stores(answer: bytes) -> list[ReportedStore]:
         ReportedStore(
             agent,
             str(name),
-            [dict(row) for row in one["rows"]],
-            total=int(one["total"]),
-            failed=int(one["failed"]),
-            errors=int(one["errors"]),
-            gaps=int(one["gaps"]),
-            lost=int(one["lost"]),
-            at_least=bool(one["at_least"]),
+            [dict(row) for row in store["rows"]],
+            total=int(store["total"]),
+            failed=int(store["failed"]),
+            errors=int(store["errors"]),
+            gaps=int(store["gaps"]),
+            lost=int(store["lost"]),
+            at_least=bool(store["at_least"]),
         )
-        for name, one in report["stores"].items()
+        for name, store in report["stores"].items()
     ]

@@ -33,7 +33,7 @@ REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet
 """Reasons why a reload ends a camera, for the camera's programs."""
 
 READ_TIMEOUT = 10.0
-"""Seconds for reading a file and those that it names; they may be on a network drive."""
+"""Seconds for reading a file and the files that it names; they may be on a network drive."""
 
 LIVE = frozenset({"cameras"})
 """Fields of a fleet file that are changed while the agent runs; the others need a restart."""
@@ -59,14 +59,14 @@ class FleetChanges:
 
     def __str__(self) -> str:
         parts = [
-            f"{len(names)} {what} ({_some(names)})"
-            for what in ("added", "removed", "changed")
-            if (names := getattr(self, what))
+            f"{len(names)} {change} ({_shortened(names)})"
+            for change in ("added", "removed", "changed")
+            if (names := getattr(self, change))
         ]
         return ", ".join([*parts, f"{self.kept} kept"])
 
 
-def _some(names: tuple[str, ...], most: int = 5) -> str:
+def _shortened(names: tuple[str, ...], most: int = 5) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -128,7 +128,7 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
         files.append(None if emulated is None else emulated.scenario)
         files.append(None if entry.frames is None else entry.frames.camera_info)
         files += _files_in(entry.software, folder)
-        return entry, planned.nth, [digest(one) for one in files]
+        return entry, planned.nth, [digest(file) for file in files]
 
     return LoadedFleet(file, plan, {name: mark(planned) for name, planned in plan.items()})
 
@@ -136,9 +136,9 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
 def _files_in(given: object, folder: Path) -> list[str | None]:
     """Return the texts in a camera's programs that are names of files."""
     if isinstance(given, dict):
-        return [one for part in given.values() for one in _files_in(part, folder)]
+        return [path for part in given.values() for path in _files_in(part, folder)]
     if isinstance(given, list):
-        return [one for part in given for one in _files_in(part, folder)]
+        return [path for part in given for path in _files_in(part, folder)]
     try:
         return [given] if isinstance(given, str) and (folder / given).is_file() else []
     except (OSError, ValueError):  # not the name of a file
@@ -173,7 +173,7 @@ class Reloader:
         self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
         self.on_reload: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
         self._folder, self._make = folder, make
-        self._one = asyncio.Lock()
+        self._reload_lock = asyncio.Lock()
         self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
         self._applying: asyncio.Task[None] | None = None
         self._closed = False
@@ -186,7 +186,7 @@ class Reloader:
 
     async def reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
         """Apply ``file`` to a running agent, like :meth:`FleetServer.reload`."""
-        async with self._one:
+        async with self._reload_lock:
             self.on_reload(None)
             try:
                 changes = await self._typed(agent, file)
@@ -222,7 +222,7 @@ class Reloader:
             raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
 
     async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
-        if self._applying is not None:  # its caller was cancelled
+        if self._applying is not None:  # the reload's caller was cancelled
             await asyncio.wait({self._applying})
         folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
         new, changes = await self._read(file, folder, agent.name)
@@ -247,7 +247,7 @@ class Reloader:
         self, file: str | Path | FleetFile, folder: Path, agent: str
     ) -> tuple[LoadedFleet, FleetChanges]:
         """Read and check a file, and find its changes, in a thread."""
-        if self._reading is not None:  # its caller was cancelled, or timed out
+        if self._reading is not None:  # the reload's caller was cancelled, or timed out
             _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
             if late:
                 raise ConfigurationError(
@@ -320,7 +320,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
                 f"{', '.join(sorted(LIVE))} can be changed while it runs"
             )
     for name, planned in new.plan.items():
-        if old.file.ros2 is not None and _seen(old.plan.get(name)) != _seen(planned):
+        if old.file.ros2 is not None and _ros_entry(old.plan.get(name)) != _ros_entry(planned):
             raise ConfigurationError(
                 f"cameras.{name}.ros2: it was changed, which wants a restart of the agent {agent}"
             )
@@ -336,7 +336,7 @@ def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
 
 
 def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
-    """Refuse cameras whose names are those of cameras that programs have added.
+    """Refuse cameras with the name of a camera that a program has added.
 
     Raises:
         ConfigurationError: a program has added a camera of the same name.
@@ -349,7 +349,7 @@ def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
             )
 
 
-def _seen(planned: Planned | None) -> RosCamera:
+def _ros_entry(planned: Planned | None) -> RosCamera:
     """Return a camera's entry for ROS; for a camera that is new, the entry's defaults."""
     return RosCamera.model_validate({}) if planned is None else planned.entry.ros2
 

@@ -66,7 +66,7 @@ class FleetServer(Server):
 
     Args:
         file: path of a fleet file, or the contents of one.
-        bus: end of a bus to use instead of the one that the file describes.
+        bus: end of a bus to use instead of the bus in the file.
         folder: folder of the file's relative paths, if ``file`` is not a path itself.
         restore: whether application and run state of a camera are restored after a reconnect, if
             its entry does not set that; None: if ``ros2`` in the file has nodes that become active
@@ -97,7 +97,7 @@ class FleetServer(Server):
         self._given_frames = _frames or {}
         if not isinstance(file, (Path, FleetFile)):
             file = check_text(file, "fleet file", least=1)
-        self._given = file
+        self._given_file = file
         self.observers: list[Observer] = []
         self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
         self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = _nothing
@@ -120,7 +120,7 @@ class FleetServer(Server):
         section = self.file.ros2
         self._restore = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # settings of cameras for ROS, also of those that a reload adds
+        # settings of cameras for ROS, also of cameras that a reload adds
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
@@ -176,13 +176,13 @@ class FleetServer(Server):
                 self._bus,
                 Keys(file.fleet),
                 lambda: self.outlet_states(),
-                lambda asked: self.stored_results(asked),
+                lambda request: self.stored_results(request),
             )
             stack.callback(outlets.close)
             stack.push_async_callback(self._leave_ros)
             await self._enter_ros()
             if isinstance(self._bus, ZenohEnd):
-                ports = frozenset(int(one.rpartition(":")[2]) for one in self._listen)
+                ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in self._listen)
                 door = Door(ports, self._bus.linked)
                 door.open()
                 stack.callback(door.close)
@@ -289,10 +289,12 @@ class FleetServer(Server):
     def _ros_fleet(self, bus: ZenohEnd) -> RosFleet:
         with from_part("ros2", '"ros2:" in a fleet file needs'):
             from smartcam.fleet._ros import RosFleet
-        file, own = self.file, self.file.agent_name
+        file, own_name = self.file, self.file.agent_name
         cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        calibrations = {name: one.load_calibration(self.folder) for name, one in cameras.items()}
-        hand_eyes = {name: one.load_hand_eye(self.folder) for name, one in cameras.items()}
+        calibrations = {
+            name: camera.load_calibration(self.folder) for name, camera in cameras.items()
+        }
+        hand_eyes = {name: camera.load_hand_eye(self.folder) for name, camera in cameras.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -302,9 +304,15 @@ class FleetServer(Server):
             settings=self._settings,
             frames=self._ros_frames,
             controls=self._controls,
-            calibrations={name: one for name, one in calibrations.items() if one is not None},
-            hand_eyes={name: one for name, one in hand_eyes.items() if one is not None},
-            wanted=lambda agent, _camera: agent == own,
+            calibrations={
+                name: calibration
+                for name, calibration in calibrations.items()
+                if calibration is not None
+            },
+            hand_eyes={
+                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
+            },
+            wanted=lambda agent, _camera: agent == own_name,
             desks=self.calibrations,
         )
 
@@ -343,7 +351,7 @@ class FleetServer(Server):
         """
         if self._agent is None:
             raise ConnectionClosedError("the agent is not started: there is nothing to reload")
-        return await self.reloads.reload(self._agent, self._given if file is None else file)
+        return await self.reloads.reload(self._agent, self._given_file if file is None else file)
 
     async def _source(self, planned: Planned, folder: Path) -> CameraSource:
         """Return the source of a camera's session; start an emulated camera for it.
@@ -358,9 +366,11 @@ class FleetServer(Server):
             if entry.software is not None:
                 device, frames = await self._start_software_camera(planned, folder, stack)
                 url = device.url
-                names = {one.name: number for number, one in device.camera.programs.items()}
+                names = {program.name: number for number, program in device.camera.programs.items()}
                 defaults = {"interpret_as": device.interpret_as, "application_names": names}
-                update = {name: one for name, one in defaults.items() if not getattr(entry, name)}
+                update = {
+                    name: default for name, default in defaults.items() if not getattr(entry, name)
+                }
                 entry = entry.model_copy(update=update)
             else:
                 url = entry.url or await self._emulate(planned, stack)
@@ -546,9 +556,9 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    # with roles each program needs a certificate of its own: that of the agent may not command
-    own = scheme == "fleet+tls" and file.access == "any-certificate"
-    certificates = file.certificates if own else None
+    # with roles each program needs a certificate of its own: the agent's own may not command
+    own_authority = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if own_authority else None
     # a router of several agents may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

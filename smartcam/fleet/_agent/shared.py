@@ -173,7 +173,7 @@ class SharedCamera(SmartCamera[Carried]):
         settings = self.settings
         return CameraState(settings.name, settings.application, self._listeners, shared=True)
 
-    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+    def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         return Carrier()
 
     @property

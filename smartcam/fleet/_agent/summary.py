@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-IN_A_TURN = 50
+CAMERAS_PER_TURN = 50
 """Number of cameras that are written, or read, in one turn of the event loop."""
 
 MAX_PATTERN_BYTES = 4096
@@ -102,9 +102,9 @@ class Summaries:
         """Answer in parts, so that a thousand cameras do not block the event loop."""
         key = self._keys.summary(self._agent.name)
         try:
-            hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
-            for begin in range(0, len(hosts), IN_A_TURN):
-                cameras = [_row(one) for one in hosts[begin : begin + IN_A_TURN]]
+            hosts = [host for host in self._agent.hosts.values() if meets(pattern, host.name)]
+            for begin in range(0, len(hosts), CAMERAS_PER_TURN):
+                cameras = [_row(host) for host in hosts[begin : begin + CAMERAS_PER_TURN]]
                 summary = {
                     "agent": self._agent.name,
                     "standby": self._agent.stands_by,
@@ -168,9 +168,9 @@ def by_name(
     cameras: Iterable[ReportedCamera], better: Callable[[ReportedCamera], Any]
 ) -> dict[str, Any]:
     """Return one camera for each name: if two agents have it for a moment, the better one."""
-    found: dict[str, ReportedCamera] = {}
-    for one in cameras:
-        known = found.get(one.summary.camera)
-        if known is None or better(one) > better(known):
-            found[one.summary.camera] = one
-    return found
+    reported: dict[str, ReportedCamera] = {}
+    for camera in cameras:
+        known = reported.get(camera.summary.camera)
+        if known is None or better(camera) > better(known):
+            reported[camera.summary.camera] = camera
+    return reported

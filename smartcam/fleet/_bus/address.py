@@ -33,30 +33,32 @@ _WORD = re.compile(CHUNK)
 _PARAMETERS = ("fleet", "certificates", "program")
 
 
-def check_name(name: str, what: str = "camera") -> str:
+def check_name(name: str, label: str = "camera") -> str:
     """Return a camera's name.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    name = check_text(name, what)
+    name = check_text(name, label)
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name):
         raise ConfigurationError(
-            f"{what} {name!r:.120}: expected a name such as line1/cam3: one to {MAX_CHUNKS} parts "
+            f"{label} {name!r:.120}: expected a name such as line1/cam3: one to {MAX_CHUNKS} parts "
             f"of a-z, 0-9, _ and -, with / between them, {MAX_NAME_CHARACTERS} characters at most"
         )
     return name
 
 
-def check_word(word: str, what: str) -> str:
+def check_word(word: str, label: str) -> str:
     """Return the name of a fleet or an agent.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    word = check_text(word, what)
+    word = check_text(word, label)
     if len(word) > MAX_NAME_CHARACTERS or not _WORD.fullmatch(word):
-        raise ConfigurationError(f"{what} {word!r:.120}: expected a-z, 0-9, _ and -, such as plant")
+        raise ConfigurationError(
+            f"{label} {word!r:.120}: expected a-z, 0-9, _ and -, such as plant"
+        )
     return word
 
 
@@ -92,7 +94,7 @@ class FleetAddress(NamedTuple):
         fleet: name of the fleet; None: the only one.
         camera: name of the camera; empty for the fleet.
         certificates: folder with the certificates of this program, for ``fleet+tls``.
-        program: name of this program for people, such as ``robot1``; None: that of its script.
+        program: name of this program for people, such as ``robot1``; None: the script's name.
     """
 
     scheme: str
@@ -112,53 +114,53 @@ class FleetAddress(NamedTuple):
         """
         url = check_text(url, "fleet address", least=1)
         shown = masked(url)
-        what = f"fleet address {shown!r:.200}"
+        name = f"fleet address {shown!r:.200}"
         try:
             parts = urlsplit(url.strip())
             port = parts.port if parts.port is not None else DEFAULT_PORT
         except ValueError as exc:
             if shown != url:  # the error may quote the password
-                raise ConfigurationError(f"{what} is no URL") from None
-            raise ConfigurationError(f"{what}: {exc}") from exc
+                raise ConfigurationError(f"{name} is no URL") from None
+            raise ConfigurationError(f"{name}: {exc}") from exc
         if parts.scheme not in FLEET_SCHEMES:
             raise ConfigurationError(
-                f"{what}: expected fleet://HOST[:PORT][/CAMERA], got scheme {parts.scheme!r}"
+                f"{name}: expected fleet://HOST[:PORT][/CAMERA], got scheme {parts.scheme!r}"
                 f"{did_you_mean(parts.scheme, FLEET_SCHEMES)}"
             )
         if not parts.hostname:
             raise ConfigurationError(
-                f"{what} has no host: expected fleet://HOST[:PORT][/CAMERA] with the host of the "
+                f"{name} has no host: expected fleet://HOST[:PORT][/CAMERA] with the host of the "
                 "fleet's agent; on this computer it is localhost"
             )
         if not _HOST.fullmatch(parts.hostname):
-            raise ConfigurationError(f"{what}: {parts.hostname!r:.80} is no host")
+            raise ConfigurationError(f"{name}: {parts.hostname!r:.80} is no host")
         wrong = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
         for part, present in wrong.items():
             if present:
-                raise ConfigurationError(f"{what} has {part}, which means nothing")
+                raise ConfigurationError(f"{name} has {part}, which means nothing")
         query: dict[str, str] = {}
         for key, value in parse_qsl(parts.query, keep_blank_values=True):
             if key not in _PARAMETERS:
                 raise ConfigurationError(
-                    f"{what}: unknown {key!r}; known are {', '.join(map(repr, _PARAMETERS))}"
+                    f"{name}: unknown {key!r}; known are {', '.join(map(repr, _PARAMETERS))}"
                     f"{did_you_mean(key, _PARAMETERS)}"
                 )
             if key in query:
-                raise ConfigurationError(f"{what} names two {key}")
+                raise ConfigurationError(f"{name} names two {key}")
             query[key] = value
         camera = parts.path.strip("/")
         if camera:
-            check_name(camera, f"{what}: camera")
-        fleet = check_word(query["fleet"], f"{what}: fleet") if "fleet" in query else None
-        called = check_word(query["program"], f"{what}: program") if "program" in query else None
+            check_name(camera, f"{name}: camera")
+        fleet = check_word(query["fleet"], f"{name}: fleet") if "fleet" in query else None
+        called = check_word(query["program"], f"{name}: program") if "program" in query else None
         tls = parts.scheme == "fleet+tls"
         certificates = query.get("certificates") or (os.environ.get(CERTIFICATES) if tls else None)
         if tls and not certificates:
             raise ConfigurationError(
-                f"{what}: expected certificates: ?certificates=DIR, or the variable {CERTIFICATES}"
+                f"{name}: expected certificates: ?certificates=DIR, or the variable {CERTIFICATES}"
             )
         if "certificates" in query and not tls:
-            raise ConfigurationError(f"{what}: certificates are for fleet+tls://")
+            raise ConfigurationError(f"{name}: certificates are for fleet+tls://")
         return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates, called)
 
     @property

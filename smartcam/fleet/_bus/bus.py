@@ -48,10 +48,10 @@ class Publisher(Handle):
     """An end that publishes under one key.
 
     Attributes:
-        heard: whether the publisher has a known subscriber.
+        has_subscribers: whether the publisher has a known subscriber.
     """
 
-    heard: bool = False
+    has_subscribers: bool = False
 
     @abc.abstractmethod
     def put(self, payload: bytes) -> None:
@@ -78,7 +78,7 @@ class Bus(abc.ABC):
     @property
     @abc.abstractmethod
     def reached(self) -> bool:
-        """True if this end is on the bus now, as far as it knows: open, and not cut off."""
+        """True if this end is open, and no loss of the bus is known."""
 
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
@@ -104,30 +104,34 @@ class Bus(abc.ABC):
         """
 
     @abc.abstractmethod
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        """Call ``hear(key, head, data)`` for parts that are sent under ``pattern``."""
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        """Call ``on_part(key, head, data)`` for parts that are sent under ``pattern``."""
 
     @abc.abstractmethod
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
         """Return a publisher of messages under ``key``.
 
         Args:
             key: key of the messages.
-            on_heard: callback for whether the key has subscribers, when that changes.
-            urgent: whether messages wait in one line with those of :meth:`put`; else after them.
+            on_subscribers: callback for whether the key has subscribers, when that changes.
+            urgent: whether messages wait in one line with messages of :meth:`put`; else after them.
         """
 
     @abc.abstractmethod
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        """Call ``hear(key, payload)`` for messages under ``pattern``.
+        """Call ``on_message(key, payload)`` for messages under ``pattern``.
 
         Args:
             pattern: pattern of the keys.
-            hear: the callback.
+            on_message: the callback.
             patient: whether messages wait after all others, with a bound of their own.
         """
 
@@ -161,8 +165,8 @@ class Bus(abc.ABC):
         """Return the keys of the present ends that become known within ``timeout`` seconds."""
 
     @abc.abstractmethod
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        """Call ``see(key, present)`` for present ends, and for those that come and go."""
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
+        """Call ``on_presence(key, present)`` for present ends, and for later changes."""
 
 
 class BusQuestion(abc.ABC):
@@ -224,19 +228,21 @@ class _ByPattern(Generic[P]):
         for same in (*self._exact.values(), self._wild):
             yield from tuple(same)
 
-    def __contains__(self, one: P) -> bool:
-        return one in self._wild or one in self._exact.get(one.pattern, ())
+    def __contains__(self, declared: P) -> bool:
+        return declared in self._wild or declared in self._exact.get(declared.pattern, ())
 
-    def add(self, one: P) -> None:
-        same = self._wild if "*" in one.pattern else self._exact.setdefault(one.pattern, {})
-        same[one] = None
+    def add(self, declared: P) -> None:
+        same = (
+            self._wild if "*" in declared.pattern else self._exact.setdefault(declared.pattern, {})
+        )
+        same[declared] = None
 
-    def remove(self, one: P) -> None:
-        self._wild.pop(one, None)
-        same = self._exact.get(one.pattern, {})
-        same.pop(one, None)
+    def remove(self, declared: P) -> None:
+        self._wild.pop(declared, None)
+        same = self._exact.get(declared.pattern, {})
+        same.pop(declared, None)
         if not same:
-            self._exact.pop(one.pattern, None)
+            self._exact.pop(declared.pattern, None)
 
     def clear(self) -> None:
         self._exact.clear()
@@ -245,8 +251,8 @@ class _ByPattern(Generic[P]):
     def meeting(self, pattern: str) -> list[P]:
         """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
-            return [one for one in self if meets(one.pattern, pattern)]
-        wild = [one for one in self._wild if meets(one.pattern, pattern)]
+            return [declared for declared in self if meets(declared.pattern, pattern)]
+        wild = [declared for declared in self._wild if meets(declared.pattern, pattern)]
         return [*self._exact.get(pattern, ()), *wild]
 
 
@@ -285,8 +291,8 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard_parts: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
-        self.heard: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.part_subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
+        self.subscriptions: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.answered: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.watched: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
         self.present_here: _ByPattern[_MemoryDeclared] = _ByPattern[_MemoryDeclared]()
@@ -308,7 +314,13 @@ class MemoryEnd(Bus):
 
     async def close(self) -> None:
         self.detach()
-        places = (self.heard, self.heard_parts, self.answered, self.watched, self.present_here)
+        places = (
+            self.subscriptions,
+            self.part_subscriptions,
+            self.answered,
+            self.watched,
+            self.present_here,
+        )
         for place in places:
             place.clear()
 
@@ -316,40 +328,44 @@ class MemoryEnd(Bus):
         """Join the bus, or join it again."""
         if not self.attached:
             self._bus.ends.append(self)
-            self._tell_presence(True)
-            self._tell_heard("**")
+            self._report_presences(True)
+            self._check_subscribers("**")
 
     def detach(self) -> None:
         """Leave the bus like after a broken cable: both sides lose each other."""
         if self.attached:
-            self._tell_presence(False)
+            self._report_presences(False)
             self._bus.ends.remove(self)
-            self._tell_heard("**")
+            self._check_subscribers("**")
 
     def put(self, key: str, payload: bytes) -> None:
         for end in self._others():
-            for one in end.heard.meeting(key):
-                self._loop.call_soon(_call, one, key, payload)
+            for subscription in end.subscriptions.meeting(key):
+                self._loop.call_soon(_call, subscription, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         for end in self._others():
-            for one in end.heard_parts.meeting(key):
-                self._loop.call_soon(_call, one, key, head, data)
+            for subscription in end.part_subscriptions.meeting(key):
+                self._loop.call_soon(_call, subscription, key, head, data)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        return _MemoryDeclared(self.heard_parts, pattern, hear)
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        return _MemoryDeclared(self.part_subscriptions, pattern, on_part)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return _MemoryPublisher(self, self.publishers, key, on_heard)
+        return _MemoryPublisher(self, self.publishers, key, on_subscribers)
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
-        made = _MemoryDeclared(self.heard, pattern, hear)
-        self._tell_heard(pattern)
-        return made.then(lambda: self._tell_heard(pattern))
+        made = _MemoryDeclared(self.subscriptions, pattern, on_message)
+        self._check_subscribers(pattern)
+        return made.then(lambda: self._check_subscribers(pattern))
 
     def answer(
         self,
@@ -362,12 +378,12 @@ class MemoryEnd(Bus):
 
     async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
         questions = [
-            (one, _MemoryQuestion(pattern, payload))
+            (answerer, _MemoryQuestion(pattern, payload))
             for end in self._others()
-            for one in end.answered.meeting(pattern)
+            for answerer in end.answered.meeting(pattern)
         ]
-        for one, question in questions:
-            self._loop.call_soon(_call, one, question)
+        for answerer, question in questions:
+            self._loop.call_soon(_call, answerer, question)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 for _, question in questions:
@@ -376,17 +392,19 @@ class MemoryEnd(Bus):
 
     def be_present(self, key: str) -> Handle:
         made = _MemoryDeclared(self.present_here, key, _nothing)
-        self._tell(key, True)
-        return made.then(lambda: self._tell(key, False))
+        self._report_presence(key, True)
+        return made.then(lambda: self._report_presence(key, False))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        return [one.pattern for end in self._others() for one in end.present_here.meeting(pattern)]
+        return [
+            token.pattern for end in self._others() for token in end.present_here.meeting(pattern)
+        ]
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
-        made = _MemoryDeclared(self.watched, pattern, see)
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
+        made = _MemoryDeclared(self.watched, pattern, on_presence)
         for end in self._others():
-            for one in end.present_here.meeting(pattern):
-                self._loop.call_soon(_call, made, one.pattern, True)
+            for token in end.present_here.meeting(pattern):
+                self._loop.call_soon(_call, made, token.pattern, True)
         return made
 
     # ------------------------------------------------------------------ among ends
@@ -395,30 +413,30 @@ class MemoryEnd(Bus):
         """Return the ends that receive from this one: all on the bus, including itself."""
         return list(self._bus.ends) if self.attached else []
 
-    def _tell_presence(self, present: bool) -> None:
+    def _report_presences(self, present: bool) -> None:
         """Report this end's presences to all ends, and theirs to this one."""
         for end in self._others():
-            for one in end.present_here:
+            for watcher in end.present_here:
                 if end is not self:
-                    for watch in self.watched.meeting(one.pattern):
-                        self._loop.call_soon(_call, watch, one.pattern, present)
-        for one in self.present_here:
-            self._tell(one.pattern, present)
+                    for watch in self.watched.meeting(watcher.pattern):
+                        self._loop.call_soon(_call, watch, watcher.pattern, present)
+        for token in self.present_here:
+            self._report_presence(token.pattern, present)
 
-    def _tell(self, key: str, present: bool) -> None:
+    def _report_presence(self, key: str, present: bool) -> None:
         for end in self._others():
-            for one in end.watched.meeting(key):
-                self._loop.call_soon(_call, one, key, present)
+            for watcher in end.watched.meeting(key):
+                self._loop.call_soon(_call, watcher, key, present)
 
-    def _tell_heard(self, pattern: str) -> None:
+    def _check_subscribers(self, pattern: str) -> None:
         """Make the publishers under a pattern check for subscribers."""
         for end in self._bus.ends:
-            for one in end.publishers.meeting(pattern):
-                one.look()
+            for publisher in end.publishers.meeting(pattern):
+                publisher.look()
 
-    def is_heard(self, key: str) -> bool:
+    def has_subscribers(self, key: str) -> bool:
         """Return True if this end's messages under ``key`` have a subscriber."""
-        return any(end.heard.meeting(key) for end in self._others())
+        return any(end.subscriptions.meeting(key) for end in self._others())
 
 
 class _MemoryPublisher(Publisher):
@@ -427,21 +445,21 @@ class _MemoryPublisher(Publisher):
         end: MemoryEnd,
         place: _ByPattern[_MemoryPublisher],
         key: str,
-        on_heard: Callable[[bool], None] | None,
+        on_subscribers: Callable[[bool], None] | None,
     ) -> None:
         self.pattern = key
         self._end, self._place = end, place
-        self._on_heard = on_heard
+        self._on_subscribers = on_subscribers
         place.add(self)
         self.look()
 
     def look(self) -> None:
         """Check for subscribers, and report a change."""
-        heard = self._end.is_heard(self.pattern)
-        if heard != self.heard:
-            self.heard = heard
-            if self._on_heard is not None:
-                self._on_heard(heard)
+        has_subscribers = self._end.has_subscribers(self.pattern)
+        if has_subscribers != self.has_subscribers:
+            self.has_subscribers = has_subscribers
+            if self._on_subscribers is not None:
+                self._on_subscribers(has_subscribers)
 
     def put(self, payload: bytes) -> None:
         self._end.put(self.pattern, payload)
@@ -464,10 +482,10 @@ class _MemoryQuestion(BusQuestion):
         self.done.set()
 
 
-def _call(one: _MemoryDeclared, *arguments: object) -> None:
+def _call(declared: _MemoryDeclared, *arguments: object) -> None:
     """Call a callback of an open declaration; log its error."""
-    if not one.closed:
-        one.call(*arguments)
+    if not declared.closed:
+        declared.call(*arguments)
 
 
 def _nothing(*_: object) -> None:

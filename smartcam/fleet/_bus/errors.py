@@ -31,8 +31,8 @@ def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
         # the text of a KeyError is its argument in quotes
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         fields = {"kind": known, "text": str(text)}
-    own = vars(error) if isinstance(error, SmartCamError) else {}
-    attributes = {name: _as_json(value) for name, value in own.items() if name[0] != "_"}
+    values = vars(error) if isinstance(error, SmartCamError) else {}
+    attributes = {name: _as_json(value) for name, value in values.items() if name[0] != "_"}
     if attributes:
         fields["attributes"] = attributes
     if error.__cause__ is not None and depth:

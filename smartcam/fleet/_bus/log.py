@@ -110,15 +110,15 @@ class AgentLog:
         An entry that contains ``first`` is returned completely.
         """
         begin = max(first, self.first)
-        found: list[bytes] = []
+        parts: list[bytes] = []
         for _, following, _, data in self._entries:
             if following <= begin:
                 continue
             most_bytes -= len(data)
-            if found and most_bytes < 0:
+            if parts and most_bytes < 0:
                 break
-            found.append(data)
-        return LogPart(begin, found, self.following)
+            parts.append(data)
+        return LogPart(begin, parts, self.following)
 
     def first_since(self, clock: float) -> int:
         """Return the number of the first message at ``clock`` or later."""
@@ -233,7 +233,7 @@ class Feed(Generic[NumberedT]):
                 self._hold(epoch, thing)
 
     def fill(self, epoch: int, first: int, following: int, things: list[NumberedT]) -> None:
-        """Take messages that were requested: all that the agent has from ``first`` on, or some."""
+        """Take requested messages: all messages of the agent from ``first`` on, or some."""
         if epoch != self.epoch or not self.expected:
             return  # a newer epoch starts with begin(), or the feed is stopped
         held = self._now_held()
@@ -283,7 +283,7 @@ class Feed(Generic[NumberedT]):
             self._lacks()
 
     def _now_held(self) -> collections.deque[NumberedT]:
-        """Return the messages held for this epoch; those of the next one wait for begin()."""
+        """Return the messages held for this epoch; messages of the next epoch wait for begin()."""
         return self._held if self._held_epoch == self.epoch else collections.deque()
 
     def _hold(self, epoch: int, thing: NumberedT) -> None:

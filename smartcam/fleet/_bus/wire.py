@@ -88,16 +88,16 @@ def decode_state(data: bytes) -> dict[str, Any]:
 def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
     """Return a message as bytes."""
     if blobs:
-        fields = {**fields, "blobs": [len(one) for one in blobs]}
+        fields = {**fields, "blobs": [len(blob) for blob in blobs]}
     head = _as_json(fields).encode()
     return b"".join((_LENGTH.pack(len(head)), head, *blobs))
 
 
-def decode(payload: bytes, what: str) -> BusMessage:
+def decode(payload: bytes, label: str) -> BusMessage:
     """Return the message in ``payload``.
 
     Raises:
-        RemoteProtocolError: the payload is not a message; the text names ``what``.
+        RemoteProtocolError: the payload is not a message; the text names ``label``.
     """
     try:
         (size,) = _LENGTH.unpack_from(payload)
@@ -117,7 +117,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
         if end != len(payload):
             raise ValueError(f"{len(payload) - end} bytes are left over")
     except (ValueError, TypeError, struct.error, RecursionError) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     return BusMessage(known, blobs)
 
 
@@ -227,11 +227,11 @@ class Batch(NamedTuple):
     runs: list[ResultRun]
 
 
-def decode_runs(payload: bytes, what: str) -> Batch:
+def decode_runs(payload: bytes, label: str) -> Batch:
     """Return the runs in ``payload``.
 
     Raises:
-        RemoteProtocolError: the payload is broken; ``what`` names it.
+        RemoteProtocolError: the payload is broken; ``label`` names it.
     """
     try:
         magic, epoch, following, count = _BATCH.unpack_from(payload)
@@ -245,7 +245,7 @@ def decode_runs(payload: bytes, what: str) -> Batch:
         if place != len(payload):
             raise ValueError(f"{len(payload) - place} bytes are left over")
     except (ValueError, struct.error, OverflowError) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     batch: Batch = new_tuple(Batch, (epoch, following, runs))
     return batch
 
@@ -366,11 +366,11 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
     return encode(fields, () if data is None else (data,))
 
 
-def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
+def decode_order(payload: bytes, label: str) -> tuple[str, TriggerOrder] | None:
     """Return the program and its call in ``payload``; None if it is a JSON message.
 
     Raises:
-        RemoteProtocolError: the payload is broken; ``what`` names it.
+        RemoteProtocolError: the payload is broken; ``label`` names it.
     """
     if payload[:4] != _IS_ORDER:
         return None
@@ -386,7 +386,7 @@ def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
         if len(payload) < end or (len(payload) > end and not flags & _INPUT):
             raise ValueError(f"{len(payload)} bytes came, {end} were expected")
     except (ValueError, struct.error) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
     order: TriggerOrder = new_tuple(
         TriggerOrder,
         (
@@ -437,11 +437,11 @@ def encode_outcome(
     return b"".join((head, lengths, *new_states, runs))
 
 
-def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
+def decode_outcome(payload: bytes, label: str) -> TriggerReply | None:
     """Return the reply to a trigger in ``payload``; None if it is a JSON message.
 
     Raises:
-        RemoteProtocolError: the payload is broken; ``what`` names it.
+        RemoteProtocolError: the payload is broken; ``label`` names it.
     """
     if payload[:4] != _IS_OUTCOME:
         return None
@@ -457,8 +457,8 @@ def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
         if place > len(payload):
             raise ValueError(f"{place} bytes were announced, {len(payload)} came")
     except (ValueError, struct.error) as exc:
-        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
-    batch = decode_runs(payload[place:], what)
+        raise RemoteProtocolError(f"{label} is broken: {exc}") from exc
+    batch = decode_runs(payload[place:], label)
     fields = (call, epoch, clock, states, new_states, batch)
     reply: TriggerReply = new_tuple(TriggerReply, fields)
     return reply

@@ -31,7 +31,7 @@ from smartcam._zenoh import (
 )
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle, Publisher, never
-from smartcam.fleet._security.certificates import LOOK_TIMEOUT, read_identity, shake_hands
+from smartcam.fleet._security.certificates import DIAGNOSIS_TIMEOUT, read_identity, shake_hands
 from smartcam.fleet._security.door import plain_host
 
 if TYPE_CHECKING:
@@ -90,10 +90,14 @@ class ZenohEnd(ZenohSession, Bus):
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
             {
-                express: {"priority": priority, "express": express, "congestion_control": one}
+                express: {
+                    "priority": priority,
+                    "express": express,
+                    "congestion_control": congestion,
+                }
                 for express in (False, True)
             }
-            for one in (control.DROP, control.BLOCK)
+            for congestion in (control.DROP, control.BLOCK)
         )
         self._behind_all = {
             "priority": zenoh.Priority.DATA_LOW,
@@ -122,7 +126,7 @@ class ZenohEnd(ZenohSession, Bus):
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
-            await super().open(timeout - min(LOOK_TIMEOUT, timeout / 3))  # the rest: to find causes
+            await super().open(timeout - min(DIAGNOSIS_TIMEOUT, timeout / 3))
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
@@ -177,14 +181,14 @@ class ZenohEnd(ZenohSession, Bus):
 
     async def _why_refused(self, folder: Path, left: float) -> str:
         """Return one endpoint's error of a handshake; empty if there is none."""
-        each = max(0.0, min(LOOK_TIMEOUT, left / len(self._link.connect)))
+        each = max(0.0, min(DIAGNOSIS_TIMEOUT, left / len(self._link.connect)))
         for endpoint in self._link.connect:
             kind, _, place = endpoint.partition("/")
             host, _, port = place.rpartition(":")
             if kind == "tls":
-                found = await shake_hands(host.strip("[]"), int(port), folder, each)
-                if found.trouble:
-                    return found.trouble
+                refusal = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if refusal.trouble:
+                    return refusal.trouble
         return ""
 
     @property
@@ -199,8 +203,8 @@ class ZenohEnd(ZenohSession, Bus):
         """Return the addresses of connected ends; None while they are not known."""
         if self._session is None:
             return None
-        found = (place_of(str(link.dst)) for link in self._session.info.links())
-        return {place for place in found if place is not None}
+        places = (place_of(str(link.dst)) for link in self._session.info.links())
+        return {place for place in places if place is not None}
 
     # ------------------------------------------------------------------ sending
 
@@ -219,8 +223,8 @@ class ZenohEnd(ZenohSession, Bus):
         # a single message is sent at once, a burst together: there is not room for many
         express = self._burst_messages <= MAX_EXPRESS_MESSAGES
         waits = len(payload) > MAX_DIRECT_BYTES or self._doubtful
-        if waits or (self._behind and self._way(key) in self._behind):
-            self._hand_over(self._way(key), session, key, payload, express)
+        if waits or (self._behind and self._queue_of(key) in self._behind):
+            self._hand_over(self._queue_of(key), session, key, payload, express)
             return
         try:
             publisher = self._publisher_of(key, begun) if express else None
@@ -228,12 +232,12 @@ class ZenohEnd(ZenohSession, Bus):
                 session.put(key, payload, **self._dropping[express])
             else:
                 publisher.put(payload)
-        except self._zenoh.ZError as exc:  # it ends meanwhile
+        except self._zenoh.ZError as exc:  # the session ends meanwhile
             logger.debug("the fleet's bus: %s", exc)
         if self._loop.time() - begun >= ROOM_TIMEOUT:
-            self._hand_over(self._way(key), session, key, payload, express, doubtful=True)
+            self._hand_over(self._queue_of(key), session, key, payload, express, doubtful=True)
 
-    def _way(self, key: str) -> str:
+    def _queue_of(self, key: str) -> str:
         """Return the name of the queue in which a message is sent in order."""
         # a router, and a peer, has one to each who listens
         return "" if self._link.mode == "client" else key
@@ -264,20 +268,20 @@ class ZenohEnd(ZenohSession, Bus):
             payload = bytes(data) if isinstance(data, memoryview) else data
             quietly(self._session.put, key, payload, attachment=head, **self._behind_all)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
         def on_sample(sample: Any) -> None:
             head = sample.attachment
             data = sample.payload.to_bytes()
             if head is not None and not self.full(len(data)):
                 part_head, key = head.to_bytes(), str(sample.key_expr)
-                self.in_loop(declared.call, len(data), hear, key, part_head, data)
+                self.in_loop(declared.call, len(data), on_part, key, part_head, data)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
 
     def _hand_over(
         self,
-        way: str,
+        method: str,
         session: Any,
         key: str,
         payload: bytes,
@@ -288,7 +292,7 @@ class ZenohEnd(ZenohSession, Bus):
         """Let a thread send a message, which waits for room; and later ones of the same way.
 
         Args:
-            way: key of messages that are sent in order.
+            method: key of messages that are sent in order.
             session: the engine's session.
             key: key of the message.
             payload: the message.
@@ -304,7 +308,7 @@ class ZenohEnd(ZenohSession, Bus):
                 "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
             )
             return
-        lane = hash(way) % SENDERS
+        lane = hash(method) % SENDERS
         sender = self._senders.get(lane)
         if sender is None:
             sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
@@ -317,23 +321,27 @@ class ZenohEnd(ZenohSession, Bus):
                 with self._lock:
                     self._sending -= size
                     self._doubtful -= doubtful
-                    self._behind[way] -= 1
-                    if not self._behind[way]:
-                        del self._behind[way]
+                    self._behind[method] -= 1
+                    if not self._behind[method]:
+                        del self._behind[method]
 
         with self._lock:
             self._sending += size
             self._doubtful += doubtful
-            self._behind[way] += 1
+            self._behind[method] += 1
         sender.submit(send)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return _ZenohPublisher(self, key, on_heard, urgent=urgent)
+        return _ZenohPublisher(self, key, on_subscribers, urgent=urgent)
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
         in_loop = self.in_loop_patiently if patient else self.in_loop
         full = functools.partial(self.full, patient=True) if patient else self.full
@@ -344,7 +352,7 @@ class ZenohEnd(ZenohSession, Bus):
             payload = sample.payload.to_bytes()
             if not full(len(payload)):
                 key_text = key or str(sample.key_expr)
-                in_loop(declared.call, len(payload), hear, key_text, payload)
+                in_loop(declared.call, len(payload), on_message, key_text, payload)
 
         declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
@@ -419,29 +427,29 @@ class ZenohEnd(ZenohSession, Bus):
         return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        found = await self._answers(
+        answers = await self._answers(
             lambda session, hear: session.liveliness().get(pattern, hear, timeout=timeout), timeout
         )
-        return [key for key, _ in found]
+        return [key for key, _ in answers]
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
-        there: dict[str, None] = {}
+        names_present: dict[str, None] = {}
 
-        def on_presence(key: str, present: bool) -> None:
+        def note_presence(key: str, present: bool) -> None:
             if present:
-                there[key] = None
+                names_present[key] = None
             else:
-                there.pop(key, None)
-            see(key, present)
+                names_present.pop(key, None)
+            on_presence(key, present)
 
         def lost() -> None:  # a new session does not report ends that have gone meanwhile
-            for key in [*there]:
-                on_presence(key, False)
+            for key in [*names_present]:
+                note_presence(key, False)
 
         def on_sample(sample: Any) -> None:
-            self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
+            self.in_loop(declared.call, 0, note_presence, str(sample.key_expr), sample.kind == put)
 
         declared = _OnBus(self).when_lost(lost)
         return declared.of(
@@ -458,7 +466,7 @@ class ZenohEnd(ZenohSession, Bus):
         Args:
             publisher: the engine's publisher; None while its session is not open yet.
             payload: the message.
-            urgent_key: key of the message if it waits in one line with those of :meth:`put`.
+            urgent_key: key of the message if it waits in one line with messages of :meth:`put`.
         """
         session = self._session
         if publisher is None or session is None:
@@ -467,7 +475,7 @@ class ZenohEnd(ZenohSession, Bus):
         quietly(publisher.put, payload)
         if urgent_key is not None and self._loop.time() - begun >= ROOM_TIMEOUT:
             self._hand_over(
-                self._way(urgent_key), session, urgent_key, payload, False, doubtful=True
+                self._queue_of(urgent_key), session, urgent_key, payload, False, doubtful=True
             )
 
 
@@ -500,16 +508,21 @@ class _FrequentKey(_OnBus):
         if not self._declares:
             self._declares = True
             self.of(lambda session: session.declare_publisher(self._key, **self._options))
-        return self._it
+        return self._declaration
 
 
 class _ZenohPublisher(Publisher):
     def __init__(
-        self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None, *, urgent: bool
+        self,
+        end: ZenohEnd,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None,
+        *,
+        urgent: bool,
     ) -> None:
         zenoh = end.engine
         self._end = end
-        self._on_change = on_heard
+        self._on_change = on_subscribers
         self._urgent_key = key if urgent else None
 
         def declare(session: Any) -> Any:
@@ -521,7 +534,7 @@ class _ZenohPublisher(Publisher):
             )
 
         def on_matching(status: Any) -> None:
-            end.later(self._declared.call, self._on_heard, status.matching)
+            end.later(self._declared.call, self._on_subscribers, status.matching)
 
         self._declared = _OnBus(end)
         self._publisher: Any = None
@@ -530,17 +543,17 @@ class _ZenohPublisher(Publisher):
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
         again, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
-        heard = bool(publisher.matching_status.matching)
+        has_subscribers = bool(publisher.matching_status.matching)
         if again:
-            self._end.later(self._declared.call, self._on_heard, heard)
+            self._end.later(self._declared.call, self._on_subscribers, has_subscribers)
         else:
-            self.heard = heard
+            self.has_subscribers = has_subscribers
         return publisher
 
-    def _on_heard(self, heard: bool) -> None:
-        self.heard = heard
+    def _on_subscribers(self, has_subscribers: bool) -> None:
+        self.has_subscribers = has_subscribers
         if self._on_change is not None:
-            self._on_change(heard)
+            self._on_change(has_subscribers)
 
     def put(self, payload: bytes) -> None:
         self._end.publish(self._publisher, payload, self._urgent_key)
@@ -569,8 +582,8 @@ class _ZenohQuestion(BusQuestion):
 
 def place_of(text: str) -> tuple[str, int] | None:
     """Return address and port in the engine's text; None if there are none."""
-    there = LINK.match(text)
-    return None if there is None else (plain_host(there["host"]), int(there["port"]))
+    match = LINK.match(text)
+    return None if match is None else (plain_host(match["host"]), int(match["port"]))
 
 
 def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:

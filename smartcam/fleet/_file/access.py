@@ -20,14 +20,16 @@ Mistake = tuple[tuple[str, ...], str]
 
 def access_of(given: Access | None, listen: Sequence[str]) -> Access | None:
     """Return the effective access: with TLS roles, or any certificate could command."""
-    tls = any(one.startswith("tls/") for one in listen)
+    tls = any(endpoint.startswith("tls/") for endpoint in listen)
     return given or ("roles" if tls else None)
 
 
 def access_mistakes(given: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
     """Yield the mistakes in the access of a fleet file."""
-    plain = [one for one in listen if not one.startswith("tls/")]
-    open_to_all = [one for one in plain if not is_loopback(one[4:].rpartition(":")[0])]
+    plain = [endpoint for endpoint in listen if not endpoint.startswith("tls/")]
+    open_to_all = [
+        endpoint for endpoint in plain if not is_loopback(endpoint[4:].rpartition(":")[0])
+    ]
     access = access_of(given, listen)
     if access == "roles" and plain:
         yield (

@@ -81,15 +81,16 @@ def _endpoints(least_port: int) -> Any:
     def checked(given: object) -> list[str] | None:
         if given is None:
             return None
-        found: list[str] = []
-        for one in cast("list[object]", given) if isinstance(given, list) else [given]:
-            parts = _ENDPOINT.fullmatch(one) if isinstance(one, str) else None
+        problems: list[str] = []
+        for endpoint in cast("list[object]", given) if isinstance(given, list) else [given]:
+            parts = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
             if parts is None or not least_port <= int(parts[3]) <= 0xFFFF:
                 raise ValueError(
-                    f"expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; got {one!r:.80}"
+                    f"expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; "
+                    f"got {endpoint!r:.80}"
                 )
-            found.append(parts[0])
-        return found
+            problems.append(parts[0])
+        return problems
 
     return PlainValidator(checked)
 
@@ -292,8 +293,8 @@ class CameraEntry(Fields):
     def _one_of(self) -> CameraEntry:
         given = [name for name in _SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
-            got = " and ".join(given) or "none of them"
-            raise ValueError(f"expected one of {', '.join(_SOURCES)}; got {got}")
+            given_names = " and ".join(given) or "none of them"
+            raise ValueError(f"expected one of {', '.join(_SOURCES)}; got {given_names}")
         return self
 
     def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
@@ -312,8 +313,8 @@ class CameraEntry(Fields):
         Raises:
             ConfigurationError: an option is wrong.
         """
-        own = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
-        options: dict[str, Any] = self.model_dump(exclude=own)
+        own_settings = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
+        options: dict[str, Any] = self.model_dump(exclude=own_settings)
         reconnect = None if self.reconnect is None else self.reconnect.backoff()
         options["restore"] = restore if self.restore is None else self.restore
         return CameraSettings.make(
@@ -427,10 +428,11 @@ class FleetFile(Fields):
         if self.agent is not None:
             return self.agent
         host = socket.gethostname().partition(".")[0].lower()
-        kept = "".join(
-            one if one.isascii() and (one.isalnum() or one in "_-") else "_" for one in host
+        name = "".join(
+            character if character.isascii() and (character.isalnum() or character in "_-") else "_"
+            for character in host
         )
-        return f"{kept or 'agent'}-{os.getpid()}"
+        return f"{name or 'agent'}-{os.getpid()}"
 
     def plan(self) -> list[Planned]:
         """Return the cameras of the file.
@@ -438,21 +440,21 @@ class FleetFile(Fields):
         Raises:
             ValueError: a name is not valid, or comes twice; or there are too many.
         """
-        found: dict[str, Planned] = {}
+        planned: dict[str, Planned] = {}
         for name, entry in self.cameras.items():
-            _add(found, name, entry)
-        return [*found.values()]
+            _add(planned, name, entry)
+        return [*planned.values()]
 
 
-def _add(found: dict[str, Planned], name: str, entry: CameraEntry) -> None:
+def _add(planned_cameras: dict[str, Planned], name: str, entry: CameraEntry) -> None:
     """Add the cameras of an entry to the cameras so far."""
     for planned in _planned(name, entry):
-        if planned.name in found:
+        if planned.name in planned_cameras:
             raise ValueError(f"there is a camera {planned.name} already")
-        found[planned.name] = planned
-    if len(found) > MAX_CAMERAS_PER_AGENT:
+        planned_cameras[planned.name] = planned
+    if len(planned_cameras) > MAX_CAMERAS_PER_AGENT:
         raise ValueError(
-            f"{len(found)} cameras up to here, expected {MAX_CAMERAS_PER_AGENT} at most"
+            f"{len(planned_cameras)} cameras up to here, expected {MAX_CAMERAS_PER_AGENT} at most"
         )
 
 
@@ -490,7 +492,7 @@ def load_fleet(path: str | Path) -> FleetFile:
     path = check_path(path, "path", "fleet")
     folder = path.parent
     file = read_model(
-        path, "fleet", FleetFile, "cameras", lambda found: next(_mistakes(found, folder), None)
+        path, "fleet", FleetFile, "cameras", lambda file: next(_mistakes(file, folder), None)
     )
     if file.certificates is None:
         return file
@@ -526,36 +528,36 @@ def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
         text = "an agent without cameras is a router for others: expected listen, which it lacks"
         yield ("cameras",), text
     if file.record is not None:
-        seeing = [name for name, one in file.cameras.items() if one.frames or one.software]
+        seeing = [name for name, camera in file.cameras.items() if camera.frames or camera.software]
         yield from mistakes_of(file.record, folder, seeing)
     if file.outlets is not None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
             from smartcam.outlets._inside import mistakes_of as outlet_mistakes
         yield from outlet_mistakes(file.outlets)
-    found: dict[str, Planned] = {}
+    planned: dict[str, Planned] = {}
     taken: dict[tuple[str, int], str] = {}
     for name, entry in file.cameras.items():
         place = ("cameras", name)
         try:
-            _add(found, name, entry)
+            _add(planned, name, entry)
         except ValueError as exc:
             yield place, str(exc)
         for where, text in _of_entry(name, entry, taken, folder):
             yield (*place, *where), text
     if file.ros2 is not None:
-        yield from _of_ros(found)
+        yield from _of_ros(planned)
 
 
-def _of_ros(found: dict[str, Planned]) -> Iterator[Mistake]:
+def _of_ros(planned: dict[str, Planned]) -> Iterator[Mistake]:
     try:
-        node_names([*found])
+        node_names([*planned])
     except ValueError as exc:
         yield ("cameras",), str(exc)
 
 
 def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     listen, connect = file.endpoints
-    tls = [one for one in (*listen, *connect) if one.startswith("tls/")]
+    tls = [endpoint for endpoint in (*listen, *connect) if endpoint.startswith("tls/")]
     if file.certificates is None:
         if tls:
             yield ("listen" if tls[0] in listen else "connect",), f"{tls[0]} wants certificates"

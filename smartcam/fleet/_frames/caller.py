@@ -45,8 +45,8 @@ class StreamCounts:
     def __init__(self) -> None:
         self._last: tuple[int, int, int, int] | None = None
 
-    def since(self, reply: dict[str, Any], came: int = 1) -> tuple[int, int]:
-        """Return the numbers of skipped and lost frames since the last reply; ``came`` came."""
+    def since(self, reply: dict[str, Any], received: int = 1) -> tuple[int, int]:
+        """Return the numbers of skipped and lost frames since the last reply; ``received`` came."""
         now = int(reply["stream"]), int(reply["sent"]), int(reply["skipped"]), int(reply["lost"])
         last, self._last = self._last, now
         if last is None or last[0] != now[0]:  # the first reply, or of a new stream at the agent
@@ -54,7 +54,7 @@ class StreamCounts:
         sent, skipped, lost = (
             max(0, new - old) for new, old in zip(now[1:], last[1:], strict=True)
         )
-        return skipped, lost + max(0, sent - came)  # frames that were sent and did not come
+        return skipped, lost + max(0, sent - received)  # frames that were sent and did not come
 
 
 class FrameCaller:
@@ -85,7 +85,7 @@ class FrameCaller:
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"{self.name}: invalid format of frames: {exc!r}") from exc
 
-    async def one(
+    async def frame(
         self,
         encoding: FrameForm,
         timeout: float,
@@ -194,7 +194,7 @@ class FrameCaller:
             fields = answer.get("frame")
             if fields is None:
                 return answer, []
-            data = await incoming.whole(int(fields["size"]))
+            data = await incoming.complete_data(int(fields["size"]))
             if data is None:
                 return answer, []
             caller.bound(float(answer["came"]), sent_at)

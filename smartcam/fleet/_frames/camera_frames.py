@@ -1,9 +1,9 @@
 """Share a camera's frames at its agent: one source for all programs.
 
-A program that wants a stream asks for one frame after the other: the next request is here before
-the next frame, so nothing is late, and a program that stops asking gets nothing. Between two
-requests the agent keeps a reader for the program, which skips and counts like any other. It ends
-with its program, or after a while without a request; with the last reader the device stops.
+A program with a stream requests one frame after the other. The request arrives before the next
+frame, so it costs no time; a program that stops requesting gets no frames. Between two requests the
+agent keeps a reader for the program, which skips and counts frames like any reader. The reader is
+closed with its program, or after a time without a request; the device stops with the last reader.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ MAX_STREAMS_PER_PROGRAM = 16
 """Largest number of streams of one camera that one program may have."""
 
 MAX_FRAME_CALLS_PER_PROGRAM = 16
-"""Largest number of calls for frames of one camera that one program may have pending: each may keep
+"""Largest number of calls for frames of one camera that one program may have pending: each may hold
 a frame."""
 
 MAX_ENCODINGS = 16
-"""Number of encodings whose last frame is kept, for viewers that want the same."""
+"""Number of encodings whose last frame is kept for other viewers with the same encoding."""
 
 MAX_VIDEO_SETTINGS = 4
 """Largest number of settings of H.264 that are encoded at one time."""
@@ -153,7 +153,7 @@ class SharedFrames:
         return None if self._source is None else self._source.statistics()
 
     def forget(self, program: str) -> None:
-        """Drop the streams of a program that is gone."""
+        """Drop the streams of a program that has left the bus."""
         for key in [key for key in self._viewers if key[0] == program]:
             self._viewers.pop(key).close()
 
@@ -164,7 +164,7 @@ class SharedFrames:
             UnsupportedError: the camera has none.
             FrameSourceError: the source cannot be opened; the next one tries again.
 
-        Cancellation: it is opened nevertheless, for the next viewer.
+        Cancellation: the source is opened nevertheless, for the next viewer.
         """
         if self._source is not None:
             return self._source
@@ -198,19 +198,19 @@ class SharedFrames:
             "rates": list(made.rates),
         }
 
-    async def one(
+    async def frame(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> dict[str, Any]:
-        """Send one frame, as :meth:`get` has it."""
-        came = asyncio.get_running_loop().time()
+        """Send the frame that :meth:`get` returns."""
+        asked_at = asyncio.get_running_loop().time()
         frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
         self._send([frame], order)
-        return {"came": came, "frame": self._frame_fields(frame, took)}
+        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
 
     async def get(
         self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
     ) -> tuple[Frame, float]:
-        """Return one frame, and the seconds that it took to encode it.
+        """Return one frame, and the seconds of its encoding.
 
         Args:
             order: the asking program, and the form of the frame.
@@ -232,13 +232,13 @@ class SharedFrames:
 
     async def trigger(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
         """Trigger the device, and send the picture that this trigger caused."""
-        came = asyncio.get_running_loop().time()
+        asked_at = asyncio.get_running_loop().time()
         frame, took = await self.triggered(order, wait=wait)
         self._send([frame], order)
-        return {"came": came, "frame": self._frame_fields(frame, took)}
+        return {"came": asked_at, "frame": self._frame_fields(frame, took)}
 
     async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
-        """Trigger the device; return its picture, and the seconds that it took to encode it."""
+        """Trigger the device; return its picture, and the seconds of its encoding."""
         loop = asyncio.get_running_loop()
         end = loop.time() + order.timeout
         with self._counted(order):
@@ -258,15 +258,15 @@ class SharedFrames:
         if names_only:
             return {"names": await features.names(timeout=timeout)}
         if name is None:
-            found = [*(await features.describe(timeout=timeout)).values()]
+            descriptions = [*(await features.describe(timeout=timeout)).values()]
         elif value_only:
             return {"value": await features[name].get(timeout=timeout)}
         else:
-            found = [await features[name].describe(timeout=timeout)]
-        return {"features": [feature_fields(one) for one in found]}
+            descriptions = [await features[name].describe(timeout=timeout)]
+        return {"features": [feature_fields(feature) for feature in descriptions]}
 
     async def set_feature(self, name: str, value: Any, timeout: float) -> dict[str, Any]:
-        """Set a feature; return the value that the device has then."""
+        """Set a feature; return the value that the device accepted."""
         source = await self._soon(timeout)
         return {"value": await source.features[name].set(value, timeout=timeout)}
 
@@ -281,8 +281,8 @@ class SharedFrames:
                 return await self.source()
 
     async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
-        """Send the new frames of a stream; after a while without any, send that there are none."""
-        came = asyncio.get_running_loop().time()
+        """Send the new frames of a stream; an empty list after a time without a frame."""
+        asked_at = asyncio.get_running_loop().time()
         key = order.program, stream
         with self._counted(order):
             viewer = self._viewers.get(key)
@@ -298,18 +298,23 @@ class SharedFrames:
             except FrameTimeoutError:
                 raise
             except TimeoutError:
-                return {"came": came}
+                return {"came": asked_at}
             except StopAsyncIteration:
                 self._leave(key, viewer)
-                return {"came": came, "ended": True}
+                return {"came": asked_at, "ended": True}
             except Exception:
                 self._leave(key, viewer)
                 raise
             finally:
                 if self._viewers.get(key) is viewer:
-                    viewer.rest(lambda: self._leave(key, viewer))
-        self._send([one.frame for one in taken], order)
-        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_fields(taken)}
+                    viewer.mark_idle(lambda: self._leave(key, viewer))
+        self._send([picture.frame for picture in taken], order)
+        return {
+            "came": asked_at,
+            "stream": viewer.number,
+            **viewer.counts(),
+            **self._all_fields(taken),
+        }
 
     async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
         """Begin a stream."""
@@ -318,13 +323,14 @@ class SharedFrames:
                 source = await self.source()
         if key in self._viewers:
             return self._viewers[key]
-        theirs = sum(program == key[0] for program, _ in self._viewers)
+        streams_of_program = sum(program == key[0] for program, _ in self._viewers)
         role = role_of(key[0])
         like = sum(role_of(program) == role for program, _ in self._viewers)
-        if like >= MAX_STREAMS_PER_ROLE or theirs >= MAX_STREAMS_PER_PROGRAM:
+        if like >= MAX_STREAMS_PER_ROLE or streams_of_program >= MAX_STREAMS_PER_PROGRAM:
             raise LocalProtocolError(
-                f"{self.name}: {like} streams of frames of role {role}, {theirs} of them this "
-                "program's; no more are possible"
+                f"{self.name}: {like} streams of frames of role {role}, "
+                f"{streams_of_program} of them "
+                "this program's; no more are possible"
             )
         number = next(self._numbers)
         viewer: FrameStream
@@ -353,11 +359,13 @@ class SharedFrames:
         return video
 
     def _leave_video(self, video: SharedVideo) -> None:
-        """Take one viewer from an H.264 stream, and end a stream without viewers."""
+        """Remove a viewer of an H.264 stream; end the stream with its last viewer."""
         video.viewers -= 1
         if video.viewers:
             return
-        for form in [form for form, one in self._videos.items() if one is video]:
+        for form in [
+            form for form, video_of_form in self._videos.items() if video_of_form is video
+        ]:
             del self._videos[form]
         ending = video.end()
         self._tasks.add(ending)
@@ -395,7 +403,7 @@ class SharedFrames:
                 f"{self.name}: a frame of {size} bytes, expected {MAX_FRAME_BYTES} at most",
                 source=self.name,
             )
-        data = frames[0].data if len(frames) == 1 else b"".join(one.data for one in frames)
+        data = frames[0].data if len(frames) == 1 else b"".join(frame.data for frame in frames)
         self.sender.send(order.program, order.call, data)
 
     def _frame_fields(self, frame: Frame, took: float) -> dict[str, Any]:
@@ -403,10 +411,13 @@ class SharedFrames:
         return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
 
     def _all_fields(self, taken: list[TakenFrame]) -> dict[str, Any]:
-        """Return the fields that describe all frames that go together."""
+        """Return the fields that describe the frames of one reply."""
         if not taken[-1].number:
             return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
-        units = [{**self._frame_fields(one.frame, one.took), "number": one.number} for one in taken]
+        units = [
+            {**self._frame_fields(picture.frame, picture.took), "number": picture.number}
+            for picture in taken
+        ]
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 
     async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
@@ -425,10 +436,10 @@ class SharedFrames:
         made = await asyncio.shield(last.task)
         return made, 0.0 if made is frame else time.perf_counter() - began
 
-    def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
-        """Start work for tasks that wait for it; it ends with the agent."""
+    def _begin(self, work: Coroutine[Any, Any, T], name: str) -> asyncio.Task[T]:
+        """Start a task that other tasks await; it ends with the agent at the latest."""
         task = asyncio.get_running_loop().create_task(
-            work, name=f"smartcam.fleet.{self.name}.{what}"
+            work, name=f"smartcam.fleet.{self.name}.{name}"
         )
         self._tasks.add(task)
         task.add_done_callback(self._done)
@@ -470,13 +481,13 @@ class SharedFrames:
                 del self._asking[order.program]
 
     @contextlib.contextmanager
-    def _within(self, seconds: float, what: str) -> Iterator[None]:
-        """Make a timeout name what it waited for."""
+    def _within(self, seconds: float, operation: str) -> Iterator[None]:
+        """Raise a timeout in the block as an error that names the operation."""
         try:
             yield
         except TimeoutError as exc:
             if isinstance(exc, FrameTimeoutError):
                 raise
             raise FrameTimeoutError(
-                f"{self.name}: waited {seconds:.3g} s for {what}, in vain", source=self.name
+                f"{self.name}: waited {seconds:.3g} s for {operation}, in vain", source=self.name
             ) from None

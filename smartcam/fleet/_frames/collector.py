@@ -65,7 +65,7 @@ class Incoming:
         """True once the frame is complete."""
         return self._total is not None and len(self._data) == self._total
 
-    async def whole(self, size: int) -> Data | None:
+    async def complete_data(self, size: int) -> Data | None:
         """Return the frame's bytes; None if some were lost, or do not come in time.
 
         Args:

@@ -23,8 +23,8 @@ _NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
 class FleetFrameDriver(SharedFrameDriver):
     """Frames of a fleet's camera: ``fleet://HOST/CAMERA?encoding=jpeg&quality=15``.
 
-    ``bitrate`` and ``latency`` are those of :meth:`smartcam.Camera.frames`. The other parameters
-    are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
+    ``bitrate`` and ``latency`` have the meaning of :meth:`smartcam.Camera.frames`. The other
+    parameters are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -70,6 +70,6 @@ def _split(url: str) -> tuple[str, dict[str, str]]:
     """Return a fleet URL, and the options for frames from its query."""
     parts = urlsplit(url)
     pairs = parse_qsl(parts.query, keep_blank_values=True)
-    own = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
-    query = urlencode([(key, value) for key, value in pairs if key not in own])
-    return urlunsplit(parts._replace(query=query)), own
+    own_options = {key: value for key, value in pairs if key in {"encoding", *_NUMBERS}}
+    query = urlencode([(key, value) for key, value in pairs if key not in own_options])
+    return urlunsplit(parts._replace(query=query)), own_options

@@ -31,7 +31,7 @@ def feature_fields(feature: Feature) -> dict[str, Any]:
     }
 
 
-def read_feature(data: object, who: str) -> Feature:
+def read_feature(data: object, caller: str) -> Feature:
     """Return the feature in an agent's fields.
 
     Raises:
@@ -43,7 +43,7 @@ def read_feature(data: object, who: str) -> Feature:
         if kind not in _KINDS or access not in _ACCESS:
             raise ValueError(f"kind {kind!r:.40}, access {access!r:.40}")
         if value is not None:
-            value = read_value(value, who)
+            value = read_value(value, caller)
         read: dict[str, Any] = {"kind": kind, "access": access, "value": value}
         for name in ("minimum", "maximum", "step"):
             read[name] = None if fields[name] is None else _number(fields[name])
@@ -53,10 +53,10 @@ def read_feature(data: object, who: str) -> Feature:
             read[name] = tuple(map(str, fields[name]))
         return Feature(**read)
     except (KeyError, TypeError, ValueError) as exc:
-        raise RemoteProtocolError(f"{who}: the agent's feature is not valid: {exc!r}") from exc
+        raise RemoteProtocolError(f"{caller}: the agent's feature is not valid: {exc!r}") from exc
 
 
-def read_value(value: object, who: str) -> FeatureValue:
+def read_value(value: object, caller: str) -> FeatureValue:
     """Return a value in an agent's reply.
 
     Raises:
@@ -64,7 +64,9 @@ def read_value(value: object, who: str) -> FeatureValue:
     """
     if isinstance(value, (bool, int, float, str)):
         return value
-    raise RemoteProtocolError(f"{who}: the agent's value of a feature is not valid: {value!r:.80}")
+    raise RemoteProtocolError(
+        f"{caller}: the agent's value of a feature is not valid: {value!r:.80}"
+    )
 
 
 def _number(value: object) -> float:
@@ -92,11 +94,11 @@ class FleetFeatures(DeviceFeatures):
     async def names(self) -> list[str]:
         """Return the names of all features."""
         answer = await self._call("features", names_only=True)
-        return [str(one) for one in self._list(answer, "names")]
+        return [str(name) for name in self._list(answer, "names")]
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
-        return {one.name: one for one in await self._described()}
+        return {feature.name: feature for feature in await self._described()}
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
@@ -107,7 +109,7 @@ class FleetFeatures(DeviceFeatures):
 
     async def _described(self, **arguments: Any) -> list[Feature]:
         answer = await self._call("features", **arguments)
-        return [read_feature(one, self._name) for one in self._list(answer, "features")]
+        return [read_feature(feature, self._name) for feature in self._list(answer, "features")]
 
     def _list(self, answer: dict[str, Any], name: str) -> list[Any]:
         """Return the items of an agent's list.
@@ -115,10 +117,10 @@ class FleetFeatures(DeviceFeatures):
         Raises:
             RemoteProtocolError: the list is not valid, or has too many items.
         """
-        found = answer.get(name)
-        if not isinstance(found, list) or len(found) > MAX_FEATURES:
+        entries = answer.get(name)
+        if not isinstance(entries, list) or len(entries) > MAX_FEATURES:
             raise RemoteProtocolError(f"{self._name}: the agent's list of {name} is not valid")
-        return found
+        return entries
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""

@@ -1,8 +1,8 @@
-"""Choose the next frame of a stream: one that has not waited for the link.
+"""Choose the next frame of a stream, so that frames do not wait for the link.
 
-A frame that came while the link was busy is up to a period old before it can be sent. So the next
-one is sent instead, as soon as it is there: that costs a part of the frame rate, but each frame
-arrives only as late as its own transfer takes.
+A frame that arrives while the link is busy is up to a period old before it can be sent. So the
+following frame is sent instead, as soon as it arrives. That costs a part of the frame rate, but the
+delay of each frame is only the duration of its own transfer.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 
 MAX_WAIT_SHARE = 0.04
-"""A frame may have waited before for this share of its time on the way."""
+"""Largest wait of a frame before it is sent, as a share of its transfer time."""
 
 MIN_WAIT_SECONDS = 0.002
-"""A frame may have waited this many seconds in any case."""
+"""Wait of a frame before it is sent that is allowed in any case, seconds."""
 
 MAX_WAIT_PERIODS = 1.25
-"""Number of periods to wait for the next frame; then the older one is sent after all."""
+"""Number of periods to wait for the next frame; afterwards the older one is sent."""
 
 
 class FramePace:
@@ -24,29 +24,31 @@ class FramePace:
 
     def __init__(self) -> None:
         self._given_at: float | None = None
-        self._transit_times = (0.0, 0.0)  # seconds on the way of the last two frames
+        self._transit_times = (0.0, 0.0)  # transfer times of the last two frames, seconds
         self._last: tuple[float, int] | None = None
         self._period = 0.0  # period of the source; 0: unknown
         self._due = -math.inf
-        self._rest = 0.0
+        self._least_interval = 0.0
 
-    def window(self, now: float, arrived_at: float, rest: float = 0.0) -> tuple[float, float]:
-        """Return the time after which the next frame must have come, and the end of the wait.
+    def window(
+        self, now: float, arrived_at: float, min_interval: float = 0.0
+    ) -> tuple[float, float]:
+        """Return the earliest arrival time of the next frame to send, and the end of the wait.
 
         Args:
             now: time of the request for the next frame, when the last one has arrived.
             arrived_at: time at which the newest frame arrived.
-            rest: least number of seconds from one frame to the next.
+            min_interval: least number of seconds from one frame to the next.
         """
         if self._given_at is not None:
             self._transit_times = (self._transit_times[1], now - self._given_at)
             self._given_at = None
-        self._rest = rest
-        way = min(self._transit_times)
-        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
-        if 0 < self._period <= way:  # otherwise the link is free before the next frame comes
+        self._least_interval = min_interval
+        least = min(self._transit_times)
+        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * least), now
+        if 0 < self._period <= least:  # the link is busy for a period or more
             until = arrived_at + MAX_WAIT_PERIODS * self._period
-        if rest and now < self._due:
+        if min_interval and now < self._due:
             since = max(since, self._due - self._period / 2)
             until = max(until, self._due + MAX_WAIT_PERIODS * self._period)
         return since, until
@@ -61,7 +63,7 @@ class FramePace:
         if self._last is not None and offered > self._last[1]:
             self._period = (arrived_at - self._last[0]) / (offered - self._last[1])
         self._last = arrived_at, offered
-        self._due = max(self._due, arrived_at - self._rest) + self._rest
+        self._due = max(self._due, arrived_at - self._least_interval) + self._least_interval
 
     def note_sent(self, now: float) -> None:
         """Note that the frame is sent now."""

@@ -64,11 +64,11 @@ class _Window:
 
     @property
     def under_way(self) -> int:
-        return sum(one.under_way for one in self.transfers.values())
+        return sum(transfer.under_way for transfer in self.transfers.values())
 
     @property
     def waiting(self) -> int:
-        return sum(len(one.data) for one in self.transfers.values())
+        return sum(len(transfer.data) for transfer in self.transfers.values())
 
 
 class FrameSender:
@@ -101,11 +101,11 @@ class FrameSender:
             return
         window = self._windows.setdefault(program, _Window())
         now = asyncio.get_running_loop().time()
-        for one in [*window.transfers.values()]:
+        for transfer in [*window.transfers.values()]:
             # a frame that was begun stays, unless it is old
-            full = window.waiting + total > MAX_WAITING_BYTES and not one.under_way
-            if full or now - one.moved_at > STALE_AFTER:
-                del window.transfers[one.call]
+            full = window.waiting + total > MAX_WAITING_BYTES and not transfer.under_way
+            if full or now - transfer.moved_at > STALE_AFTER:
+                del window.transfers[transfer.call]
         window.transfers[call] = _Transfer(call, memoryview(data), now)
         self._push(program, window)
 
@@ -135,14 +135,16 @@ class FrameSender:
     def _push(self, program: str, window: _Window) -> None:
         """Send parts while there is room, the oldest frame's first."""
         room = WINDOW_BYTES - window.under_way
-        for one in window.transfers.values():
-            while one.sent < len(one.data):
-                part = one.data[one.sent : one.sent + PART_BYTES]
+        for transfer in window.transfers.values():
+            while transfer.sent < len(transfer.data):
+                part = transfer.data[transfer.sent : transfer.sent + PART_BYTES]
                 if len(part) > room:
                     return
                 room -= len(part)
-                self._put(program, FramePart(one.call, one.sent, len(one.data)), part)
-                one.sent += len(part)
+                self._put(
+                    program, FramePart(transfer.call, transfer.sent, len(transfer.data)), part
+                )
+                transfer.sent += len(part)
 
     def _put(self, program: str, part: FramePart, data: Data) -> None:
         self._bus.put_part(self._keys.frames(program), encode_part(part), data)

@@ -206,7 +206,7 @@ class SharedFrameDriver(FrameDriver):
             return
         frame, rate = frames[-1], self._request.rate
         if rate is not None:
-            here, age = frame.age, float(answer["frame"]["age"])
-            rate.sent(len(frame.data), frame.captured + age, here - age, age=age)
+            age_here, age = frame.age, float(answer["frame"]["age"])
+            rate.sent(len(frame.data), frame.captured + age, age_here - age, age=age)
             frame = replace(frame, rate=rate.statistics())
         sink.frame(frame)

@@ -31,7 +31,7 @@ class FrameOrder(NamedTuple):
         call: number of the program's call.
         encoding: form of the frame.
         timeout: seconds of the call's timeout.
-        rest: least seconds from one frame of a stream to the next.
+        min_interval: least seconds from one frame of a stream to the next.
         have: number, for H.264, of the last encoded frame that the program has; 0 for none.
     """
 
@@ -39,7 +39,7 @@ class FrameOrder(NamedTuple):
     call: int
     encoding: FrameForm
     timeout: float
-    rest: float = 0.0
+    min_interval: float = 0.0
     have: int = 0
 
 
@@ -70,7 +70,7 @@ class FrameStream(ABC):
     idle: asyncio.TimerHandle | None = field(default=None, kw_only=True)
     busy: bool = field(default=False, kw_only=True)
 
-    def rest(self, close: Callable[[], None]) -> None:
+    def mark_idle(self, close: Callable[[], None]) -> None:
         """Count the stream as idle; ``close`` is called if it stays so."""
         self.busy = False
         self.idle = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, close)
@@ -116,7 +116,7 @@ class PictureStream(FrameStream):
 
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
-        since, until = self.pace.window(loop.time(), reader.last_arrival, order.rest)
+        since, until = self.pace.window(loop.time(), reader.last_arrival, order.min_interval)
         async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
             await reader.fresh(since, until)
             frame = await anext(reader)
@@ -137,7 +137,7 @@ class PictureStream(FrameStream):
 
 @dataclass(eq=False)
 class VideoStream(FrameStream):
-    """A stream of H.264: all encoded frames after those that the program has.
+    """A stream of H.264: all encoded frames after the frames that the program has.
 
     Args:
         video: the encoder's stream, shared with other viewers.

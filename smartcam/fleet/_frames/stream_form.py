@@ -30,30 +30,30 @@ class StreamForm(NamedTuple):
         quality: int | None,
         bitrate: float | None,
         latency: float | None,
-        who: str,
+        caller: str,
         *,
         decode: bool = True,
     ) -> StreamForm:
-        """Return a checked request of ``who``, with arguments of :meth:`smartcam.Camera.frames`.
+        """Return a checked request of ``caller``, with arguments of :meth:`smartcam.Camera.frames`.
 
         Raises:
             ConfigurationError: the arguments do not fit together, or one is out of range.
         """
         if bitrate is None and latency is None:
-            return cls(FrameForm.checked(encoding, quality, who, stream=True), None, decode)
+            return cls(FrameForm.checked(encoding, quality, caller, stream=True), None, decode)
         if encoding == VIDEO and latency is None and bitrate is not None:
-            form = FrameForm.checked(VIDEO, quality, who, bitrate=round(bitrate), stream=True)
+            form = FrameForm.checked(VIDEO, quality, caller, bitrate=round(bitrate), stream=True)
             return cls(form, None, decode)
         if encoding != "jpeg":
-            what = "latency" if bitrate is None or encoding == VIDEO else "bitrate"
+            option = "latency" if bitrate is None or encoding == VIDEO else "bitrate"
             raise ConfigurationError(
-                f"{who}: {what}: {encoding!r:.40} cannot hold one; jpeg can"
-                + (f", and {VIDEO}" if what == "bitrate" else "")
+                f"{caller}: {option}: {encoding!r:.40} cannot hold one; jpeg can"
+                + (f", and {VIDEO}" if option == "bitrate" else "")
             )
         if quality is not None:
             raise ConfigurationError(
-                f"{who}: quality: expected none beside a bit rate or a latency, which set it, got "
-                f"{quality!r:.40}"
+                f"{caller}: quality: expected none beside a bit rate or a latency, which set it, "
+                f"got {quality!r:.40}"
             )
         return cls(FrameForm("jpeg"), RateControl(bitrate, latency), decode)
 

@@ -44,7 +44,7 @@ class VideoUnits:
         await self._codecs.close()
 
     async def give(self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]) -> None:
-        """Give received frames in order; those that cannot be decoded count as lost.
+        """Give received frames in order; frames that cannot be decoded count as lost.
 
         Raises:
             RemoteProtocolError: the agent's numbers of the frames are not valid.

@@ -32,7 +32,7 @@ class VideoUnit(NamedTuple):
     """An encoded frame.
 
     Attributes:
-        number: number of the unit, one more than that of the unit before.
+        number: number of the unit, one more than the number of the unit before.
         frame: the encoded frame.
         took: seconds to encode it.
         key: whether the unit can be decoded without the units before it.
@@ -62,7 +62,7 @@ class SharedVideo:
     def __init__(self, source: FrameSource, encoder: H264Encoder, name: str) -> None:
         self._encoder = encoder
         self._reader = source.reader(timeout=None)
-        self._kept: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
+        self._units: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
         self._stirred = asyncio.Event()
         self._over: tuple[Exception | None] | None = None
         self._name = name
@@ -79,7 +79,7 @@ class SharedVideo:
         if self._over is None:
             self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
         self._reader.close()
-        self._kept.clear()
+        self._units.clear()
         self._stirred.set()
 
     @property
@@ -112,8 +112,8 @@ class SharedVideo:
             StopAsyncIteration: the video ended.
         """
         while True:
-            if found := self._following(have):
-                return found
+            if following := self._following(have):
+                return following
             if self._over is not None:
                 if self._over[0] is not None:
                     raise self._over[0]
@@ -122,12 +122,12 @@ class SharedVideo:
             await self._stirred.wait()
 
     def _following(self, have: int) -> list[VideoUnit]:
-        kept = self._kept
-        if not kept or kept[-1].number == have:
+        pictures_kept = self._units
+        if not pictures_kept or pictures_kept[-1].number == have:
             return []
         fresh = asyncio.get_running_loop().time() - LATE_SECONDS
         units: list[VideoUnit] = []
-        for unit in reversed(kept):
+        for unit in reversed(pictures_kept):
             if unit.made < fresh and units:
                 break  # the reader is too late for all of these
             units.append(unit)
@@ -159,7 +159,7 @@ class SharedVideo:
         key, _ = entry_point(bytes(made.data))
         if key:
             self._last_key, self._key_wanted = loop.time(), False
-        number = self._kept[-1].number + 1 if self._kept else secrets.randbits(31) + 1
+        number = self._units[-1].number + 1 if self._units else secrets.randbits(31) + 1
         unit = VideoUnit(number, made, took, key, loop.time(), offered, lost)
-        self._kept.append(unit)
+        self._units.append(unit)
         self._stirred.set()

@@ -53,7 +53,7 @@ class FrameForm(NamedTuple):
         cls,
         name: object,
         quality: object,
-        who: str,
+        caller: str,
         *,
         bitrate: object = None,
         stream: bool = False,
@@ -63,7 +63,7 @@ class FrameForm(NamedTuple):
         Args:
             name: the encoding.
             quality: quality of a JPEG; None: not given.
-            who: name of the caller, for error texts.
+            caller: name of the caller, for error texts.
             bitrate: bits per second; None: not given.
             stream: whether the request is for a stream; only streams may have :data:`VIDEO`.
 
@@ -74,20 +74,20 @@ class FrameForm(NamedTuple):
         if name not in known:
             why = ": it is for streams only, since its frames depend on each other"
             raise ConfigurationError(
-                f"{who}: encoding: expected {', '.join(known)}, got {name!r:.40}"
+                f"{caller}: encoding: expected {', '.join(known)}, got {name!r:.40}"
                 f"{why if name == VIDEO else ''}"
             )
-        for what, value, of, least, most in (
+        for option, value, of, least, most in (
             ("quality", quality, "jpeg", 1, 100),
             ("bitrate", bitrate, VIDEO, MIN_BITRATE, MAX_BITRATE),
         ):
             if value is None:
                 continue
             if name != of:
-                raise ConfigurationError(f"{who}: {what}: {name} has none, got {value!r:.40}")
+                raise ConfigurationError(f"{caller}: {option}: {name} has none, got {value!r:.40}")
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise ConfigurationError(
-                    f"{who}: {what}: expected {least} to {most}, got {value!r:.40}"
+                    f"{caller}: {option}: expected {least} to {most}, got {value!r:.40}"
                 )
         return cls(str(name), cast("int | None", quality), cast("int | None", bitrate))
 
@@ -161,7 +161,7 @@ def _more(frame: Frame, ahead: float) -> dict[str, Any]:
     return more
 
 
-def _read_more(fields: dict[str, Any], captured: float, who: str) -> dict[str, Any]:
+def _read_more(fields: dict[str, Any], captured: float, caller: str) -> dict[str, Any]:
     """Return the fields from :func:`_more`, by this side's clock."""
     chunks, remark, trigger = (
         fields.get("chunks", {}),
@@ -172,7 +172,7 @@ def _read_more(fields: dict[str, Any], captured: float, who: str) -> dict[str, A
         raise TypeError("its chunks are not valid")
     read: dict[str, Any] = {
         "chunks": {
-            str(name): read_value(value, who)
+            str(name): read_value(value, caller)
             for name, value in cast("dict[str, Any]", chunks).items()
         },
         "remark": str(remark),

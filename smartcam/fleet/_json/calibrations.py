@@ -125,8 +125,8 @@ def _on_bus(name: str) -> Service:
 
     async def do(work: Work) -> dict[str, Any]:
         call = CalibrationCall(JsonCalibrationFace(work), work.request, work.timeout)
-        found = {key: plain(value) for key, value in (await five.do(call)).items()}
-        return {**found, "kind": "CalibrationError"} if found.get("error") else found
+        fields = {key: plain(value) for key, value in (await five.do(call)).items()}
+        return {**fields, "kind": "CalibrationError"} if fields.get("error") else fields
 
     nothing: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
     # a trigger waits by itself for the end of a reservation, and abort needs no wait

@@ -69,10 +69,10 @@ MAX_CAMERAS_ADDED = 100
 CANCEL_GRACE = 0.5
 """Seconds beyond a service's timeout after which its task is cancelled."""
 
-FIRST_TRY = 600.0
+SETUP_WAIT = 600.0
 """Seconds for which Setup waits for a camera; its own timeout is shorter."""
 
-LOOK_TIMEOUT = 2.0
+PRESENCE_TIMEOUT = 2.0
 """Seconds of the timeout for a question about presences on the bus."""
 
 
@@ -191,7 +191,7 @@ class Plain:
         self._numbers = 0
         # running calls by camera, and whether only operators may make them
         self._under_way: collections.Counter[tuple[str, bool]] = collections.Counter()
-        self._known = {operates: _KnownAnswers() for operates in (True, False)}
+        self._known_answers = {operates: _KnownAnswers() for operates in (True, False)}
         self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
 
     def open(self) -> None:
@@ -281,7 +281,7 @@ class Plain:
         try:
             check_name(order.camera)
         except ConfigurationError as error:
-            _reply(question, order.failed(error))  # every agent says the same
+            _reply(question, order.failed(error))  # every agent gives the same answer
             return
         if self._is_full(question, order):
             return
@@ -337,12 +337,14 @@ class Plain:
     async def _speaks_for_all(self, camera: str) -> bool:
         """Return True if no other agent has a camera and this agent is the first by its name."""
         keys, bus = self._keys, self._bus
-        having, there = await asyncio.gather(
-            bus.present(keys.camera("*", camera), LOOK_TIMEOUT),
-            bus.present(keys.agent("*"), LOOK_TIMEOUT),
+        having, agents_present = await asyncio.gather(
+            bus.present(keys.camera("*", camera), PRESENCE_TIMEOUT),
+            bus.present(keys.agent("*"), PRESENCE_TIMEOUT),
         )
         owners = {keys.tail(key, "presence/camera")[0] for key in having} - {self._agent.name}
-        agents = {keys.tail(key, "presence/agent")[0] for key in there} | {self._agent.name}
+        agents = {keys.tail(key, "presence/agent")[0] for key in agents_present} | {
+            self._agent.name
+        }
         return not owners and min(agents) == self._agent.name
 
     # ------------------------------------------------------------------ calls
@@ -370,7 +372,7 @@ class Plain:
             if not self._is_full(question, order):
                 call = _PlainCall(order.what(request), [question])
                 if request.id is not None:
-                    self._known[order.operates].begin(request, call)
+                    self._known_answers[order.operates].begin(request, call)
                 self._start(self._do(order, request, call), order)
         elif call.answer is None:
             call.waiting.append(question)
@@ -379,7 +381,7 @@ class Plain:
             question.close()
 
     def _known_call(self, order: _Order, request: PlainRequest) -> _PlainCall | None:
-        known = self._known[order.operates].of(request)
+        known = self._known_answers[order.operates].of(request)
         if known is not None and known.what != order.what(request):
             raise LocalProtocolError(
                 f"{order.camera}: id {request.id!r} was another call's; {order.name} was not done"
@@ -409,7 +411,7 @@ class Plain:
                 question.reply(question.key, call.answer)
                 question.close()
             if request.id is not None:
-                self._known[order.operates].end(call.answer)
+                self._known_answers[order.operates].end(call.answer)
 
     async def _bounded(self, order: _Order, request: PlainRequest) -> dict[str, Any]:
         """Carry out a call within its timeout.
@@ -483,11 +485,11 @@ class Plain:
     # ------------------------------------------------------------------ cameras that Setup adds
 
     async def _host(self, order: _Order, request: PlainRequest) -> Host:
-        """Return the camera; Setup adds one that no agent has."""
+        """Return the camera; Setup adds a camera that no agent has."""
         host = self._agent.hosts.get(order.camera)
         if host is not None:
             if isinstance(request, SetupRequest):
-                await host.tried(FIRST_TRY)
+                await host.tried(SETUP_WAIT)
             return host
         if not isinstance(request, SetupRequest):
             raise ConnectionClosedError(f"{order.camera}: the camera was stopped meanwhile")
@@ -500,7 +502,7 @@ class Plain:
         self._added[order.camera] = request
         try:
             host = self._agent.share(order.camera, settings)
-            await host.tried(FIRST_TRY)
+            await host.tried(SETUP_WAIT)
             host.require()
         except BaseException:
             await self._take_back(order.camera, request)

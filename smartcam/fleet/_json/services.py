@@ -205,7 +205,7 @@ async def triggered(
     layouts = interpretation.numbered_layouts() if interpretation is not None else None
     request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
     runs = await outcomes(work.host, work.owner, request, application, work.timeout)
-    return [one for run in runs for one in singles(decode_own_run(run))]
+    return [single for run in runs for single in singles(decode_own_run(run))]
 
 
 async def _trigger(work: Work) -> dict[str, Any]:
@@ -225,9 +225,9 @@ async def _trigger(work: Work) -> dict[str, Any]:
     answer: dict[str, Any] = {"result": results[0]}
     if request.results_per_trigger is not None:
         answer = {"results": results}
-    for one in results:
-        if one["error"]:
-            return {**answer, "error": one["error"], "kind": one["kind"]}
+    for result in results:
+        if result["error"]:
+            return {**answer, "error": result["error"], "kind": result["kind"]}
     return answer
 
 
@@ -241,23 +241,25 @@ def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
 
     async def service(work: Work) -> dict[str, Any]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
-        blobs = [bytes.fromhex(arguments.pop(one)) for one in ("input",) if one in arguments]
+        blobs = [bytes.fromhex(arguments.pop(name)) for name in ("input",) if name in arguments]
         call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
-        fields, found = await ACTIONS[do](call)
+        fields, answer = await ACTIONS[do](call)
         if "status" in fields:
             fields["status_names"] = Status(fields["status"]).names
-        return {**fields, "image": base64.b64encode(found[0]).decode()} if found else fields
+        return {**fields, "image": base64.b64encode(answer[0]).decode()} if answer else fields
 
     return service
 
 
 async def _results(work: Work) -> dict[str, Any]:
-    kept, most = work.host.results, work.request.most
-    first = max(1, kept.following - most) if work.request.first is None else work.request.first
-    part = kept.part(first, MAX_REPLY_BYTES)
+    kept_results, most = work.host.results, work.request.most
+    first = (
+        max(1, kept_results.following - most) if work.request.first is None else work.request.first
+    )
+    part = kept_results.part(first, MAX_REPLY_BYTES)
     runs = map(decode_own_run, part.data)
-    found = (one for run in runs for one in singles(run) if one.number >= part.first)
-    results = [work.topics.result(one) for one in itertools.islice(found, most)]
+    matching = (single for run in runs for single in singles(run) if single.number >= part.first)
+    results = [work.topics.result(single) for single in itertools.islice(matching, most)]
     return {"first": part.first, "next_result": part.following, "results": results}
 
 
@@ -288,10 +290,12 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
             source=host.name,
         )
     fields = to_fields(frame, 0.0, took, 0)
-    own = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
-    if "trigger" in own:  # its time is by the agent's clock
-        own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
-    return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
+    own_fields = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
+    if "trigger" in own_fields:  # times of the event are by the agent's clock
+        own_fields["trigger"] = {
+            name: own_fields["trigger"][name] for name in ("number", "evidence")
+        }
+    return {"frame": {**own_fields, "data": base64.b64encode(frame.data).decode()}}
 
 
 async def _unknown(work: Work) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class Topics:
     """
 
     def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:
-        self.who: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
+        self.identity: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
         self.keys: Keys = keys
         self.bus: Bus = bus
         self._any: dict[Kind, Publisher] = {}
@@ -71,15 +71,15 @@ class Topics:
         for handle in handles:
             handle.close()
 
-    def heard(self, kind: Kind, camera: str) -> Publisher | None:
+    def subscribed(self, kind: Kind, camera: str) -> Publisher | None:
         """Return the publisher of one kind of a camera's messages; None without a subscriber."""
         everyone = self._any.get(kind)
-        if everyone is None or not everyone.heard:
+        if everyone is None or not everyone.has_subscribers:
             return None
         made = self._made.get((kind, camera))
         if made is None:
             made = self._made[kind, camera] = self.bus.publisher(self.keys.topic(kind, camera))
-        return made if made.heard else None
+        return made if made.has_subscribers else None
 
     def forget(self, camera: str) -> None:
         """Close the publishers of a camera that is no longer shared."""
@@ -106,7 +106,7 @@ class Publication:
 
     def offer(self, runs: Iterable[ResultRun], topics: CameraTopics) -> None:
         """Queue results, each as its own run."""
-        if not self.publisher.heard:
+        if not self.publisher.has_subscribers:
             return
         for run in runs:
             self._queue.append(run)
@@ -224,7 +224,7 @@ class CameraTopics:
     def result(self, run: ResultRun) -> dict[str, Any]:
         """Return a result; ``run`` has one container."""
         fields = result_fields(run, self.interpretation, self._host.name)
-        return {**self._topics.who, **fields}
+        return {**self._topics.identity, **fields}
 
     def state(self) -> dict[str, Any]:
         """Return the fields of the camera's current state."""
@@ -233,7 +233,7 @@ class CameraTopics:
         word: int | None = state["status"]
         return {
             "camera": host.name,
-            **self._topics.who,
+            **self._topics.identity,
             "connected": state["connected"],
             "failure": str(host.failure or self.trouble),
             "status": word,
@@ -270,36 +270,36 @@ class CameraTopics:
 
     def on_run(self, run: ResultRun) -> None:
         """Publish received containers."""
-        out = self._topics.heard("results", self._host.name)
+        out = self._topics.subscribed("results", self._host.name)
         if out is not None:
-            for one in singles(run):
-                out.put(as_json(self.result(one)))
+            for single in singles(run):
+                out.put(as_json(self.result(single)))
         if self.results_out is not None:
             self.results_out.offer(singles(run), self)
 
     def on_state(self) -> None:
         """Number the camera's state, and publish it if there is a subscriber."""
         number, self.statuses = self.statuses, self.statuses + 1
-        out = self._topics.heard("status", self._host.name)
+        out = self._topics.subscribed("status", self._host.name)
         if out is None and self.status_out is None:
             return
         outs = [out, self.status_out]
-        hearing = [one for one in outs if one is not None and one.heard]
-        if hearing:
+        subscribed = [topic for topic in outs if topic is not None and topic.has_subscribers]
+        if subscribed:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})
-            for one in hearing:
-                one.put(data)
+            for topic in subscribed:
+                topic.put(data)
 
     def on_status(self, status: Status) -> None:
         """Handle a status of the camera; publish its change as an event."""
         before, self._before = self._before, status
         if status != before:
             number, self.events = self.events, self.events + 1
-            if self._topics.heard("events", self._host.name) is not None:
+            if self._topics.subscribed("events", self._host.name) is not None:
                 at, name = datetime.now(UTC), self._host.name
                 changed = StatusChanged(camera=name, at=at, status=status, previous=before)
-                self._say_event(changed, number)
+                self._publish_event(changed, number)
 
     def on_event(self, event: CameraEvent) -> None:
         """Publish an event of the camera."""
@@ -308,7 +308,7 @@ class CameraTopics:
             self.trouble = event.reason
         elif isinstance(event, (Connected, Reconnected)):
             self.trouble = ""
-        self._say_event(event, number)
+        self._publish_event(event, number)
 
     def on_reservation(self, change: Change, program: str) -> None:
         """Publish that a program has reserved the camera, or no longer has."""
@@ -317,11 +317,11 @@ class CameraTopics:
         fields["by"] = in_words(program)
         self._put_event(change, fields, number)
 
-    def _say_event(self, event: CameraEvent, number: int) -> None:
-        if self._topics.heard("events", self._host.name) is not None:
+    def _publish_event(self, event: CameraEvent, number: int) -> None:
+        if self._topics.subscribed("events", self._host.name) is not None:
             self._put_event(type(event).__name__, jsonable(event), number)
 
     def _put_event(self, kind: str, fields: dict[str, Any], number: int) -> None:
-        out = self._topics.heard("events", self._host.name)
+        out = self._topics.subscribed("events", self._host.name)
         if out is not None:
-            out.put(as_json({**self._topics.who, "number": number, "event": kind, **fields}))
+            out.put(as_json({**self._topics.identity, "number": number, "event": kind, **fields}))

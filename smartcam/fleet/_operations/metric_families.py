@@ -69,7 +69,7 @@ async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes
             parts.append(_text(client, family))
             await asyncio.sleep(0)
         for kind in _KINDS if each else (*_KINDS[:-1], _SUMMARY):
-            chosen = [one for one in numbers.cameras if kind.chosen(one)]
+            chosen = [camera for camera in numbers.cameras if kind.chosen(camera)]
             size = max(1, MAX_LINES_PER_TURN // kind.lines)
             for begin in range(0, len(chosen), size):
                 family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
@@ -117,9 +117,9 @@ def _of_process(client: Any) -> bytes:
 
 
 def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    own = [numbers.agent]
+    rows = [numbers.agent]
     family = core.InfoMetricFamily("smartcam_agent", "The agent of a fleet", labels=["agent"])
-    family.add_metric(own, {"fleet": numbers.fleet, "version": _version()})
+    family.add_metric(rows, {"fleet": numbers.fleet, "version": _version()})
     yield family
     gauges = [(name, text, numbers.gauges[key]) for name, key, text in _GAUGES]
     gauges += [
@@ -132,24 +132,24 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     ]
     for name, text, value in gauges:
         family = core.GaugeMetricFamily(name, text, labels=["agent"])
-        family.add_metric(own, value)
+        family.add_metric(rows, value)
         yield family
     labels = ["agent", "state"]
     family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
-    connected = sum(one.connected for one in numbers.cameras)
-    family.add_metric([*own, "connected"], connected)
-    family.add_metric([*own, "not_connected"], len(numbers.cameras) - connected)
+    connected = sum(camera.connected for camera in numbers.cameras)
+    family.add_metric([*rows, "connected"], connected)
+    family.add_metric([*rows, "not_connected"], len(numbers.cameras) - connected)
     yield family
     labels = ["agent", "outcome"]
     family = core.CounterMetricFamily("smartcam_reloads", "Readings of the file", labels=labels)
     for outcome, count in numbers.reloads.items():
-        family.add_metric([*own, outcome], count)
+        family.add_metric([*rows, outcome], count)
     yield family
     yield from _of_outlets(core, numbers)
     for key in SUMS:
         name, text = _SUMS[key]
         family = core.CounterMetricFamily(name, text, labels=["agent"])
-        family.add_metric(own, numbers.totals.counts[key])
+        family.add_metric(rows, numbers.totals.counts[key])
         yield family
     for name, text, histogram in (
         (
@@ -164,7 +164,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         ),
     ):
         family = core.HistogramMetricFamily(name, text, labels=["agent"])
-        family.add_metric(own, cumulative(histogram), histogram.total)
+        family.add_metric(rows, cumulative(histogram), histogram.total)
         yield family
 
 
@@ -173,7 +173,9 @@ def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     if not numbers.outlets:
         return
     labels = ["agent", "outlet"]
-    came = core.CounterMetricFamily("smartcam_outlet_results", "Results that came", labels=labels)
+    received = core.CounterMetricFamily(
+        "smartcam_outlet_results", "Results that came", labels=labels
+    )
     delivered = core.CounterMetricFamily(
         "smartcam_outlet_delivered", "Results that the far end took", labels=labels
     )
@@ -187,14 +189,14 @@ def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]
     )
     for name, state in numbers.outlets.items():
-        own, account = [numbers.agent, name], state.account
-        came.add_metric(own, account.results)
-        delivered.add_metric(own, account.delivered)
-        spooled.add_metric(own, account.spooled)
-        well.add_metric(own, float(not state.trouble))
+        rows, account = [numbers.agent, name], state.account
+        received.add_metric(rows, account.results)
+        delivered.add_metric(rows, account.delivered)
+        spooled.add_metric(rows, account.spooled)
+        well.add_metric(rows, float(not state.trouble))
         for reason, count in account.dropped.items():
-            dropped.add_metric([*own, reason], count)
-    yield from (came, delivered, spooled, well, dropped)
+            dropped.add_metric([*rows, reason], count)
+    yield from (received, delivered, spooled, well, dropped)
 
 
 # ---------------------------------------------------------------------- of its cameras
@@ -225,14 +227,14 @@ class _MetricKind(NamedTuple):
         """Return the family of some cameras."""
         kind = getattr(core, f"{self.type}MetricFamily")
         family = kind(self.name, self.text, labels=["agent", "camera", *self.labels])
-        for one in cameras:
-            for labels, number in self.values(one):
-                family.add_metric([agent, one.name, *labels], *number)
+        for camera in cameras:
+            for labels, number in self.values(camera):
+                family.add_metric([agent, camera.name, *labels], *number)
         return family
 
 
-def _has_frames(one: CameraNumbers) -> bool:
-    return one.frames is not None
+def _has_frames(numbers: CameraNumbers) -> bool:
+    return numbers.frames is not None
 
 
 _LATENCY = ("smartcam_camera_trigger_latency_seconds", "From a trigger to its result, by camera")
@@ -241,7 +243,7 @@ _SUMMARY = _MetricKind(
     "Summary",
     *_LATENCY,
     (),
-    lambda one: [((), (one.account.processing.count, one.account.processing.total))],
+    lambda numbers: [((), (numbers.account.processing.count, numbers.account.processing.total))],
     2,
 )
 
@@ -251,7 +253,7 @@ _KINDS = (
         "smartcam_connected",
         "Whether there is a session",
         (),
-        lambda one: [((), (float(one.connected),))],
+        lambda numbers: [((), (float(numbers.connected),))],
         1,
     ),
     _MetricKind(
@@ -259,7 +261,7 @@ _KINDS = (
         "smartcam_taken",
         "Whether another client has the camera",
         (),
-        lambda one: [((), (float(one.taken),))],
+        lambda numbers: [((), (float(numbers.taken),))],
         1,
     ),
     _MetricKind(
@@ -267,7 +269,7 @@ _KINDS = (
         "smartcam_sessions",
         "Sessions that were made",
         (),
-        lambda one: [((), (one.account.sessions,))],
+        lambda numbers: [((), (numbers.account.sessions,))],
         1,
     ),
     _MetricKind(
@@ -275,7 +277,7 @@ _KINDS = (
         "smartcam_results",
         "Results by fate",
         ("fate",),
-        lambda one: [((fate,), (getattr(one.account, fate),)) for fate in FATES],
+        lambda numbers: [((fate,), (getattr(numbers.account, fate),)) for fate in FATES],
         6,
     ),
     _MetricKind(
@@ -283,7 +285,7 @@ _KINDS = (
         "smartcam_triggers",
         "Triggers of programs by outcome",
         ("outcome",),
-        lambda one: [((word,), (n,)) for word, n in {RESULT: 0, **one.triggers}.items()],
+        lambda numbers: [((word,), (n,)) for word, n in {RESULT: 0, **numbers.triggers}.items()],
         3,
     ),
     _MetricKind(
@@ -291,7 +293,7 @@ _KINDS = (
         "smartcam_frame_viewers",
         "Streams of frames",
         (),
-        lambda one: [((), (one.viewers,))],
+        lambda numbers: [((), (numbers.viewers,))],
         1,
         _has_frames,
     ),
@@ -300,7 +302,7 @@ _KINDS = (
         "smartcam_frames",
         "Frames that came",
         (),
-        lambda one: [((), (one.frames.frames if one.frames else 0,))],
+        lambda numbers: [((), (numbers.frames.frames if numbers.frames else 0,))],
         1,
         _has_frames,
     ),
@@ -309,7 +311,7 @@ _KINDS = (
         "smartcam_frames_lost",
         "Frames that never came",
         (),
-        lambda one: [((), (one.frames.lost if one.frames else 0,))],
+        lambda numbers: [((), (numbers.frames.lost if numbers.frames else 0,))],
         1,
         _has_frames,
     ),
@@ -317,7 +319,9 @@ _KINDS = (
         "Histogram",
         *_LATENCY,
         (),
-        lambda one: [((), (cumulative(one.account.processing), one.account.processing.total))],
+        lambda numbers: [
+            ((), (cumulative(numbers.account.processing), numbers.account.processing.total))
+        ],
         20,
     ),
 )

@@ -58,12 +58,12 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
         return None
     hosts = [*agent.hosts.values()]
     read: list[tuple[Host, CameraNumbers]] = []
-    kept = kept_bytes = waiting = reserved = 0
+    kept_results = kept_bytes = waiting = reserved = 0
     for begin in range(0, len(hosts), CAMERAS_PER_SLICE):
         for host in hosts[begin : begin + CAMERAS_PER_SLICE]:
-            if agent.hosts.get(host.name) is host:  # it may have been removed meanwhile
+            if agent.hosts.get(host.name) is host:  # the camera may have been removed meanwhile
                 read.append((host, _camera(host)))
-                kept += host.results.kept
+                kept_results += host.results.kept
                 kept_bytes += host.results.kept_bytes
                 waiting += host.gate.waiting
                 reserved += host.gate.holder is not None
@@ -71,7 +71,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     gauges: dict[str, float] = {
         "programs": agent.programs,
         "calls": agent.calls,
-        "kept_results": kept,
+        "kept_results": kept_results,
         "kept_bytes": kept_bytes,
         "waiting_commands": waiting,
         "reserved": reserved,
@@ -79,11 +79,11 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     }
     reloads = server.reloads
     # at the same time, so that each camera counts once, here or among removed ones
-    cameras = [one for host, one in read if agent.hosts.get(host.name) is host]
+    cameras = [numbers for host, numbers in read if agent.hosts.get(host.name) is host]
     totals = Totals(agent.past)
     totals.add(host.camera.statistics() for host in agent.leaving)
     for begin in range(0, len(cameras), 4 * CAMERAS_PER_SLICE):
-        totals.add(one.account for one in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
+        totals.add(camera.account for camera in cameras[begin : begin + 4 * CAMERAS_PER_SLICE])
         await asyncio.sleep(0)
     return AgentNumbers(
         agent.name,

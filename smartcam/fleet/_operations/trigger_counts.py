@@ -81,14 +81,14 @@ class Totals:
         """Add the counts of cameras."""
         given = [*accounts]
         for name in SUMS:
-            self.counts[name] += sum(getattr(one, name) for one in given)
-        self.processing = _sum([self.processing, *(one.processing for one in given)])
-        self.round_trip = _sum([self.round_trip, *(one.round_trip for one in given)])
+            self.counts[name] += sum(getattr(counts, name) for counts in given)
+        self.processing = _sum([self.processing, *(counts.processing for counts in given)])
+        self.round_trip = _sum([self.round_trip, *(counts.round_trip for counts in given)])
 
 
 def _sum(histograms: list[Histogram]) -> Histogram:
-    counts = tuple(map(sum, zip(*(one.counts for one in histograms), strict=True)))
-    return Histogram(HISTOGRAM_BOUNDS, counts, sum(one.total for one in histograms))
+    counts = tuple(map(sum, zip(*(histogram.counts for histogram in histograms), strict=True)))
+    return Histogram(HISTOGRAM_BOUNDS, counts, sum(histogram.total for histogram in histograms))
 
 
 def cumulative(histogram: Histogram) -> list[tuple[str, float]]:

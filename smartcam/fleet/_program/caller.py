@@ -1,4 +1,4 @@
-"""Find and call the agent of a fleet's camera; follow its presence and its clock."""
+"""Find and call the agent of a fleet's camera; track its presence and its clock."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ MAX_DRIFT_RATIO = 1e-4
 """Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
-"""Seconds for the answer to a hello; then it is sent again, as long as the agent is present."""
+"""Seconds for the answer to a hello, which is then sent again while the agent is present."""
 
 
 SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
-"""Names of calls for users, if they differ."""
-LOOK_ELSEWHERE = 0.25
-"""Seconds between two checks for another agent with a session, if the present one has none."""
+"""Names of calls in texts for users, if they differ from the call's own."""
+OTHER_AGENT_INTERVAL = 0.25
+"""Seconds between two searches for another agent with a session, if the current agent has none."""
 
-ASK_ANEW = 5.0
-"""Seconds until the present agent is asked whether it has a session by now: its message may be
-lost, and a camera without triggers causes no further ones."""
+SESSION_QUESTION_INTERVAL = 5.0
+"""Seconds between two questions to an agent without a session whether it has one now: its message
+may be lost, and a camera without triggers causes no further ones."""
 
 MAX_AGENTS_REMEMBERED = 16
 """Largest number of agents of a camera that are remembered."""
 
-INSIST_AFTER = 1.0
-"""Seconds until an unconfirmed message is sent again, since it may have been lost."""
+RESEND_DELAY = 1.0
+"""Seconds until an unconfirmed message, which may be lost, is sent again."""
 
 
 class Met:
@@ -121,7 +121,7 @@ class Caller:
         met: the agent; None while there is none.
         trouble: reason why there is no agent.
         end: reason why there will be no further agent.
-        linked: whether the agent has a session with the camera, as far as is known.
+        linked: whether the agent had a session with the camera when it last reported.
         leases: the reservations whose blocks run, oldest first, by the calls that made them.
         streamed: whether this program takes all results of the camera.
     """
@@ -147,7 +147,7 @@ class Caller:
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
         self.streamed: bool = False
-        self._commands_to = "", ""  # the agent called last, and the key of commands to it
+        self._commands_to = "", ""  # the agent of the last call, and the key of commands to it
         self._epochs: dict[str, int] = {}  # epochs of agents that have answered
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
@@ -156,9 +156,9 @@ class Caller:
         self._task: asyncio.Task[None] | None = None
         self._ahead = 0.0  # least seconds by which the agent's clock is ahead of the loop's
         self._measured = 0.0
-        self._most = math.inf  # largest seconds by which it is ahead
+        self._most = math.inf  # most seconds by which the agent's clock is ahead
         self._bounded = 0.0
-        self._removed = ""  # reason why the present agent no longer shares the camera
+        self._removed = ""  # reason why the current agent no longer shares the camera
         self._insisting: set[asyncio.Task[None]] = set()
 
     # ------------------------------------------------------------------ life
@@ -181,7 +181,8 @@ class Caller:
             task.cancel()
             await asyncio.wait({task})
         if self._insisting:
-            await asyncio.wait(self._insisting)  # calls wait for an answer that has failed
+            # repeated messages wait for answers that have failed
+            await asyncio.wait(self._insisting)
 
     def finish(self, error: LinkError) -> None:
         """End for good: there will be no further agent."""
@@ -196,7 +197,7 @@ class Caller:
         """Return the agent.
 
         Raises:
-            ConnectionLostError: the agent is away.
+            ConnectionLostError: there is no agent now.
             ConnectionClosedError: the caller is not open, or closed.
         """
         if self.met is not None:
@@ -234,7 +235,7 @@ class Caller:
         self._removed = why
 
     def lose(self, why: str) -> None:
-        """End every running call with an unknown outcome, since the agent is gone."""
+        """End every running call with an unknown outcome, since the agent was lost."""
         if self.met is None:
             return
         self.met, self.linked = None, False
@@ -244,12 +245,12 @@ class Caller:
         self._on_lost(error)
 
     async def _attend(self) -> None:
-        """Connect to an agent whenever there is one; of several, to the one with a session."""
+        """Connect to an agent whenever there is one; of several, to the agent with a session."""
         loop, quiet_since = asyncio.get_running_loop(), 0.0
         while True:
             look = None
             if self.met is not None and not self.linked:
-                look = LOOK_ELSEWHERE if len(self._agents) > 1 else ASK_ANEW
+                look = OTHER_AGENT_INTERVAL if len(self._agents) > 1 else SESSION_QUESTION_INTERVAL
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(look):
                     await self._stirred.wait()
@@ -258,7 +259,7 @@ class Caller:
             met = self.met
             if met is not None and self.linked:
                 continue
-            if met is not None and loop.time() - quiet_since >= ASK_ANEW:
+            if met is not None and loop.time() - quiet_since >= SESSION_QUESTION_INTERVAL:
                 quiet_since = loop.time()
                 await self._ask_anew(met)
                 continue
@@ -275,25 +276,25 @@ class Caller:
                         self._stirred.set()
 
     async def _choose(self, agents: list[str], met: Met | None) -> None:
-        """Choose an agent: of several, or instead of another, one that has a session."""
+        """Choose an agent, if possible with a session; it may replace the current one."""
         only_linked = met is not None
-        heard: list[_HelloHeard] = []
+        hellos: list[_HelloHeard] = []
         failed: SmartCamError | None = None
         for agent in agents:
             try:
-                heard.append(await self._say_hello(agent))
+                hellos.append(await self._greet_agent(agent))
             except SmartCamError as error:
                 failed = error
                 continue
-            if heard[-1].hello.get("connected") and not heard[-1].hello.get("trying"):
+            if hellos[-1].hello.get("connected") and not hellos[-1].hello.get("trying"):
                 break  # a camera has one session
         if self.met is not met:
-            return  # the agent came or went meanwhile
-        if not heard:
+            return  # an agent appeared or disappeared
+        if not hellos:
             if failed is not None:
                 raise failed
             return
-        best = heard[-1] if heard[-1].hello.get("connected") else heard[0]
+        best = hellos[-1] if hellos[-1].hello.get("connected") else hellos[0]
         if only_linked and not best.hello.get("connected"):
             return
         if met is not None:
@@ -301,13 +302,13 @@ class Caller:
         self._meet(best)
 
     async def _ask_anew(self, met: Met) -> None:
-        """Ask the agent again, and take its state if it has a session by now."""
+        """Ask the agent again, and take its state if it has a session now."""
         with contextlib.suppress(SmartCamError):
-            heard = await self._say_hello(met.agent)
-            if self.met is met and not self.linked and heard.hello.get("connected"):
-                self._meet(heard)
+            hello = await self._greet_agent(met.agent)
+            if self.met is met and not self.linked and hello.hello.get("connected"):
+                self._meet(hello)
 
-    async def _say_hello(self, agent: str) -> _HelloHeard:
+    async def _greet_agent(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
@@ -319,35 +320,39 @@ class Caller:
             raise RemoteProtocolError(f"the agent {agent} sent an invalid hello: {exc}") from exc
         return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
 
-    def _meet(self, heard: _HelloHeard) -> None:
-        self._ahead, self._measured = heard.clock - heard.at, heard.at
+    def _meet(self, hello: _HelloHeard) -> None:
+        self._ahead, self._measured = hello.clock - hello.at, hello.at
         self._most = math.inf
-        self.bound(heard.clock, heard.begun)
-        if heard.agent in self._agents:
-            self._epochs[heard.agent] = heard.epoch
+        self.bound(hello.clock, hello.begun)
+        if hello.agent in self._agents:
+            self._epochs[hello.agent] = hello.epoch
             if len(self._epochs) > MAX_AGENTS_REMEMBERED:
                 del self._epochs[next(iter(self._epochs))]
-            self.met = Met(heard.agent, heard.epoch, heard.hello)
+            self.met = Met(hello.agent, hello.epoch, hello.hello)
             self._removed = ""
             self.trouble = None
             self._on_met(self.met)
 
     def restarted(self, epoch: int) -> bool:
-        """Return True if an epoch is that of a newer start of the present agent."""
+        """Return True if an epoch is a newer start of the current agent."""
         met = self.met
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
-        return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
+        return all(
+            known_epoch != epoch
+            for agent, known_epoch in self._epochs.items()
+            if agent != met.agent
+        )
 
     def unlink(self) -> None:
-        """Leave an agent without a session: another one may have a session, or this one later."""
+        """Note that the agent has no session, and look for an agent that has one."""
         self.linked = False
         self._stirred.set()
 
     # ------------------------------------------------------------------ the clock
 
     def sample(self, clock: float) -> None:
-        """Use the time of the agent's clock in a message that has just come."""
+        """Use the agent's time in a message that has just arrived for its clock."""
         now = asyncio.get_running_loop().time()
         least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
@@ -383,7 +388,7 @@ class Caller:
         """Return a reservation of this program whose block runs.
 
         Raises:
-            ReservationLostError: the reservation is lost, as far as this program knows.
+            ReservationLostError: the reservation is known to be lost.
         """
         lease, met = self.leases[number], self.met
         if not lease.lost and met is not None and met.epoch != lease.epoch:
@@ -397,15 +402,15 @@ class Caller:
         return lease
 
     def lose_lease(self, number: int, why: str) -> None:
-        """Note that a reservation is lost: no further command of its block is sent."""
+        """Note that a reservation is lost; later commands of its block are refused."""
         self.leases[number].lost = why
         self.report_leases_lost()
 
     def report_leases_lost(self) -> None:
         """Report that this program's reservations are lost, unless that was reported before."""
-        unreported = [one for one in self.leases.values() if not one.reported]
-        for one in unreported:
-            one.reported = True
+        unreported = [lease for lease in self.leases.values() if not lease.reported]
+        for call in unreported:
+            call.reported = True
         if unreported:
             self._on_lease_lost()
 
@@ -416,7 +421,7 @@ class Caller:
                 self.lease(number)
 
     def _fence(self, do: str) -> int | None:
-        """Return the reservation in whose block a call is, the oldest; None if there is none.
+        """Return the oldest reservation whose block makes the call; None without one.
 
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
@@ -449,9 +454,9 @@ class Caller:
             timeout: seconds that the user gave; by default the time until ``deadline``.
 
         Raises:
-            SmartCamError: the agent replied with this error, or is gone or silent.
+            SmartCamError: the agent replied with this error, was lost, or did not answer.
 
-        Cancellation: the agent is told.
+        Cancellation: the agent receives a cancelling message.
         """
         met = self.require()
         reply = await self._exchange(
@@ -512,7 +517,7 @@ class Caller:
         Raises:
             SmartCamError: like :meth:`call`.
 
-        Cancellation: the agent is told.
+        Cancellation: the agent receives a cancelling message.
         """
         met = self.require()
         interpretation = request.interpretation
@@ -551,7 +556,7 @@ class Caller:
         agent: str,
         met: Met | None,
     ) -> Reply:
-        """Send a call, and return the reply; ``deadline`` is that of this side."""
+        """Send a call, and return the reply; ``deadline`` is this side's."""
         self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self, deadline)
@@ -586,7 +591,7 @@ class Caller:
             self._insist(self._key(self.met.agent, do), fields)
 
     def come(self, number: int, offset: int | None) -> None:
-        """Report up to which byte a call's frame has come; None: no further bytes are wanted."""
+        """Report the number of received bytes of a call's frame; None: send no further bytes."""
         if self.met is not None:
             fields = {"call": number, "come": offset}
             self.program.send(self._key(self.met.agent, "frame"), fields)
@@ -595,9 +600,9 @@ class Caller:
         self._insist(key, {"cancel": number})
 
     def _insist(self, key: str, fields: dict[str, Any]) -> None:
-        """Send a message that may come twice, now and again until the agent confirms it.
+        """Send a message now, and repeatedly until the agent confirms it.
 
-        An agent that is gone, or was gone for a time, has already ended everything.
+        A lost agent has already ended the program's work.
         """
         program, met = self.program, self.met
 
@@ -609,7 +614,7 @@ class Caller:
         async def repeat(number: int, answer: Outcome) -> None:
             while True:
                 try:
-                    async with asyncio.timeout(INSIST_AFTER):
+                    async with asyncio.timeout(RESEND_DELAY):
                         await answer
                 except TimeoutError:
                     if self.met is not met or met is None:

@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from smartcam.observers import Observer
     from smartcam.settings import Address, CameraSettings
 
-ASK_AGAIN = 2.0
+QUESTION_TIMEOUT = 2.0
 """Seconds for the answer to a question; then it is asked again until its deadline."""
 
 REACH_TIMEOUT = 0.5
@@ -101,7 +101,7 @@ class FleetCamera(Camera[ValueT]):
     names it. It is then unknown whether a running call was carried out.
 
     Args:
-        settings: validated options; those of the session with the camera are the agent's.
+        settings: validated options; options of the session with the camera are the agent's.
         camera: name of the camera in the fleet.
         program: program with an end of the bus.
         shared: whether other cameras use that end, too; then it is not closed with this camera.
@@ -145,7 +145,7 @@ class FleetCamera(Camera[ValueT]):
             lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
-        self.opening: asyncio.Task[None] | None = None  # its maker waits for its agent
+        self.opening: asyncio.Task[None] | None = None  # the fleet that made it waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
         self._trying = True  # whether the agent's first attempt to connect has not ended
@@ -161,12 +161,12 @@ class FleetCamera(Camera[ValueT]):
     def _make_listeners(self) -> Listeners:
         return FleetListeners(self.settings.name, self._observers)
 
-    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+    def _interpretation(self, spec: object, *, of_camera: bool = False) -> Interpretation:
         if spec is None:
             spec = self._agents_layout
         if self._met:
-            return super()._interpretation(spec, own=own)
-        return self._provisional(spec, own)
+            return super()._interpretation(spec, of_camera=of_camera)
+        return self._provisional(spec, of_camera)
 
     def _provisional(self, spec: object, own: bool) -> Interpretation:
         """Return the interpretation of results until the agent's answer.
@@ -196,9 +196,9 @@ class FleetCamera(Camera[ValueT]):
 
     def _abandoned(self) -> bool:
         # the bus refers to the camera until it is closed; its own bus is dropped with it
-        own = vars(self)
-        opened = own.get("_opened", False) and own.get("_closed") is None
-        return opened and not own.get("_shared", True)
+        attributes = vars(self)
+        opened = attributes.get("_opened", False) and attributes.get("_closed") is None
+        return opened and not attributes.get("_shared", True)
 
     async def open(self) -> Self:
         if self._opened or self._closed is not None:
@@ -318,12 +318,12 @@ class FleetCamera(Camera[ValueT]):
                     left = max(0.0, deadline - loop.time())
                     try:
                         # by then the agent has restored the state, or gone back
-                        await self._do("wait_connected", min(left, ASK_AGAIN))
+                        await self._do("wait_connected", min(left, QUESTION_TIMEOUT))
                     except ConnectionLostError:
                         continue
                     except ResponseTimeoutError as exc:  # or the message was lost on the way
                         why = exc
-                        if left <= ASK_AGAIN:
+                        if left <= QUESTION_TIMEOUT:
                             raise TimeoutError from exc
                     else:
                         return
@@ -402,7 +402,7 @@ class FleetCamera(Camera[ValueT]):
         self._interpretations.clear()
         self._met, self._unreadable = True, None
         try:
-            self._default = self._interpretation(self._default_spec, own=True)
+            self._default = self._interpretation(self._default_spec, of_camera=True)
         except ConfigurationError as exc:
             self._unreadable = exc
 
@@ -414,7 +414,7 @@ class FleetCamera(Camera[ValueT]):
         self._listeners.publish(ReservationLost(camera=self.name, at=at, by=in_words(program)))
 
     def agent_left(self, agent: str) -> None:
-        """End the session, if it is that of an agent that no longer shares the camera."""
+        """End the session of an agent that no longer shares the camera."""
         self._caller.agent_left(agent)
 
     def _on_lost(self, error: LinkError) -> None:
@@ -661,7 +661,7 @@ class FleetCamera(Camera[ValueT]):
             await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
-        own = receiver.own[number] = Own(request.interpretation, expected)
+        own_call = receiver.own_calls[number] = Own(request.interpretation, expected)
         try:
             reply = await self._caller.trigger(
                 request, application, expected, number, deadline, timeout
@@ -669,9 +669,9 @@ class FleetCamera(Camera[ValueT]):
             receiver.take_states(reply)
             if not receiver.has(reply.states, reply.batch.following):
                 await self._reach(reply.states, reply.batch.following, deadline)
-            return receiver.outcomes(own, reply.batch)
+            return receiver.outcomes(own_call, reply.batch)
         finally:
-            del receiver.own[number]
+            del receiver.own_calls[number]
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         self._require_session()
@@ -739,7 +739,7 @@ class FleetCamera(Camera[ValueT]):
         arguments = {"reservation": reservation}
         while True:
             caller.lease(reservation)
-            soon = min(deadline, self._deadline(ASK_AGAIN))
+            soon = min(deadline, self._deadline(QUESTION_TIMEOUT))
             try:
                 reply = await caller.call("reserved", soon, arguments)
             except ResponseTimeoutError as exc:
@@ -854,15 +854,15 @@ class FleetCamera(Camera[ValueT]):
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         age = None if math.isinf(max_age) else max_age
-        return await self.frame_caller.one(wanted, timeout, max_age=age)
+        return await self.frame_caller.frame(wanted, timeout, max_age=age)
 
     async def _frame_after(
         self, moment: float | None, form: FrameRequest, timeout: float
     ) -> FleetFrame:
         wanted = FrameForm.checked(*form, self.name)
         if moment is None:
-            return await self.frame_caller.one(wanted, timeout, fresh=True)
-        return await self.frame_caller.one(wanted, timeout, moment=moment)
+            return await self.frame_caller.frame(wanted, timeout, fresh=True)
+        return await self.frame_caller.frame(wanted, timeout, moment=moment)
 
     async def _get_clock(self, timeout: float) -> datetime:
         reply = await self._do("get_clock", timeout)

@@ -1,8 +1,8 @@
 """Subscribe once for many cameras, instead of once for each.
 
 A camera of a fleet subscribes to its own keys. For many cameras, :meth:`Exchange.cover` declares
-one subscription for all, and the messages are distributed here by their keys; a dictionary costs
-less than the engine's subscription does, on both sides.
+one subscription for all, and this module distributes the messages by their keys: a dictionary
+costs less than a subscription of the engine, on both sides.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-ASK_AGAIN = 0.5
-"""Seconds for an agent's answer about its next numbers; then it is asked again."""
+NUMBERS_TIMEOUT = 0.5
+"""Seconds for an agent's answer with its next numbers, after which the question is repeated."""
 
 MAX_AGENTS_NUMBERED = 1000
 """Largest number of agents whose bundles' numbers are remembered."""
@@ -41,15 +41,15 @@ class _BusPlace(Handle):
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
         self.key, self.call = key, call
         self._exchange = exchange
-        self.own: Handle | None = None
+        self.cover: Handle | None = None
         self.closed = False
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
             self._exchange.drop(self)
-            if self.own is not None:
-                self.own.close()
+            if self.cover is not None:
+                self.cover.close()
 
 
 class Exchange(Bus):
@@ -70,18 +70,18 @@ class Exchange(Bus):
         # epoch and next expected number of each agent
         self._bundles: dict[str, tuple[int, int]] = {}
         # functions that take the presences of all cameras
-        self._seers: list[Callable[[str, bool], None]] = []
+        self._presence_callbacks: list[Callable[[str, bool], None]] = []
         self._lacking: set[str] = set()  # agents with missing bundles
         self._asking: dict[str, asyncio.Task[None]] = {}
 
     # ------------------------------------------------------------------ for many
 
-    def see_all(self, see: Callable[[str, bool], None]) -> None:
-        """Follow all cameras' presences from now on, for watchers of one camera or of all.
+    def see_all(self, on_presence: Callable[[str, bool], None]) -> None:
+        """Watch all cameras' presences from now on, for watchers of one camera or of all.
 
-        ``see(key, present)`` is called for each.
+        ``on_presence(key, present)`` is called for each.
         """
-        self._seers.append(see)
+        self._presence_callbacks.append(on_presence)
         self.cover("presence/camera")
 
     def cover(self, kind: str) -> None:
@@ -97,11 +97,11 @@ class Exchange(Bus):
             made = bus.watch(keys.camera("*", "**"), self._on_presence)
         self._covers[kind] = made
         for places in [*self._places.get(kind, {}).values()]:
-            # a message that comes twice meanwhile is taken once, by its number
+            # a message that arrives twice now is taken once, by its number
             for place in places:
-                own, place.own = place.own, None
-                if own is not None:
-                    own.close()
+                own_handle, place.cover = place.cover, None
+                if own_handle is not None:
+                    own_handle.close()
 
     def _uncover(self, kind: str) -> None:
         self._covers.pop(kind).close()
@@ -110,8 +110,8 @@ class Exchange(Bus):
 
     def _kind(self, key: str) -> str:
         tail = key.removeprefix(f"{self._keys().root}/")
-        first, _, rest = tail.partition("/")
-        return f"{first}/{rest.partition('/')[0]}" if first == "presence" else first
+        first, _, tail_rest = tail.partition("/")
+        return f"{first}/{tail_rest.partition('/')[0]}" if first == "presence" else first
 
     def _enter(
         self, key: str, call: Callable[..., None], declare: Callable[[], Handle]
@@ -120,11 +120,11 @@ class Exchange(Bus):
         place = _BusPlace(self, key, call)
         self._places.setdefault(kind, {}).setdefault(self._name(key), []).append(place)
         if kind not in self._covers:
-            place.own = declare()
+            place.cover = declare()
         return place
 
     def _name(self, key: str) -> str:
-        """Return the name of a receiver's key; for a presence it is that of any agent."""
+        """Return the name in a receiver's key; for a presence, with any agent."""
         return key.split("/", 5)[5] if "/presence/camera/" in key else key
 
     def drop(self, place: _BusPlace) -> None:
@@ -147,8 +147,8 @@ class Exchange(Bus):
         name = self._name(key)
         presences = self._present.setdefault(name, set())
         (presences.add if present else presences.discard)(key)
-        for see in self._seers:
-            see(key, present)
+        for on_presence in self._presence_callbacks:
+            on_presence(key, present)
         for place in tuple(self._places.get("presence/camera", {}).get(name, ())):
             place.call(key, present)
 
@@ -193,31 +193,31 @@ class Exchange(Bus):
         keys, bus = self._keys(), self._bus
         while agent in self._lacking:
             self._lacking.discard(agent)
-            cameras = await ask_cameras(bus, keys, agent, "**", ASK_AGAIN)
-            for one in cameras:
+            cameras = await ask_cameras(bus, keys, agent, "**", NUMBERS_TIMEOUT)
+            for camera in cameras:
                 places = self._places.get("results", {})
-                for place in tuple(places.get(keys.results(one.summary.camera), ())):
-                    place.call(place.key, encode_runs(one.epoch, one.following, []))
-            if not cameras and await bus.present(keys.agent(agent), ASK_AGAIN):
+                for place in tuple(places.get(keys.results(camera.summary.camera), ())):
+                    place.call(place.key, encode_runs(camera.epoch, camera.following, []))
+            if not cameras and await bus.present(keys.agent(agent), NUMBERS_TIMEOUT):
                 self._lacking.add(agent)
-                await asyncio.sleep(ASK_AGAIN)
+                await asyncio.sleep(NUMBERS_TIMEOUT)
 
     # ------------------------------------------------------------------ as a bus
 
     def subscribe(
-        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+        self, pattern: str, on_message: Callable[[str, bytes], None], *, patient: bool = False
     ) -> Handle:
         if "*" in pattern or self._kind(pattern) not in {"states", "results"}:
-            return self._bus.subscribe(pattern, hear, patient=patient)
-        return self._enter(pattern, hear, lambda: self._bus.subscribe(pattern, hear))
+            return self._bus.subscribe(pattern, on_message, patient=patient)
+        return self._enter(pattern, on_message, lambda: self._bus.subscribe(pattern, on_message))
 
-    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+    def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         if self._kind(pattern) != "presence/camera" or "*" in self._name(pattern):
-            return self._bus.watch(pattern, see)
-        place = self._enter(pattern, see, lambda: self._bus.watch(pattern, see))
-        if place.own is None:
+            return self._bus.watch(pattern, on_presence)
+        place = self._enter(pattern, on_presence, lambda: self._bus.watch(pattern, on_presence))
+        if place.cover is None:
             for key in sorted(self._present.get(self._name(pattern), ())):
-                see(key, True)
+                on_presence(key, True)
         return place
 
     @property
@@ -257,13 +257,17 @@ class Exchange(Bus):
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         self._bus.put_part(key, head, data)
 
-    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
-        return self._bus.subscribe_parts(pattern, hear)
+    def subscribe_parts(self, pattern: str, on_part: Callable[[str, bytes, Data], None]) -> Handle:
+        return self._bus.subscribe_parts(pattern, on_part)
 
     def publisher(
-        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+        self,
+        key: str,
+        on_subscribers: Callable[[bool], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> Publisher:
-        return self._bus.publisher(key, on_heard, urgent=urgent)
+        return self._bus.publisher(key, on_subscribers, urgent=urgent)
 
     def answer(
         self,

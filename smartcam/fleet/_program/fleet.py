@@ -1,4 +1,4 @@
-"""A fleet at a program: all its cameras, or those of a pattern."""
+"""A fleet at a program: all its cameras, or the cameras of a pattern."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def _sum(accounts: list[SubscriberStatistics]) -> SubscriberStatistics:
     *_, last = accounts
     counts = ("offered", "taken", "dropped", "queued", "queued_bytes", "missed")
     return dataclasses.replace(
-        last, **{name: sum(getattr(one, name) for one in accounts) for name in counts}
+        last, **{name: sum(getattr(account, name) for account in accounts) for name in counts}
     )
 
 
@@ -337,7 +337,7 @@ class Fleet:
         await asyncio.gather(*self._opening.values(), return_exceptions=True)
         cameras = [*self._cameras.values()]
         for begin in range(0, len(cameras), MAX_CAMERAS_AT_ONCE):
-            await close_all(one.close for one in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
+            await close_all(camera.close for camera in cameras[begin : begin + MAX_CAMERAS_AT_ONCE])
         for results in self._subscribed("**"):
             results.end()
         for stream in self._events:
@@ -381,7 +381,7 @@ class Fleet:
         Raises:
             ConfigurationError: the pattern is not valid.
         """
-        return [self._known(name) for name in self.names(pattern)]
+        return [self._known_camera(name) for name in self.names(pattern)]
 
     def names(self, pattern: str = "**") -> list[str]:
         """Return the names of the cameras that agents share now.
@@ -402,7 +402,7 @@ class Fleet:
         url: str = self._address_of(check_name(name)).url
         return url
 
-    def _known(self, name: str) -> FleetCamera[Any]:
+    def _known_camera(self, name: str) -> FleetCamera[Any]:
         """Return a camera; in a large fleet it is met now, if it was not before."""
         camera = self._cameras.get(name)
         if camera is None:
@@ -435,7 +435,7 @@ class Fleet:
                 f"the fleet has no camera {name!r}; there are {names}"
                 f"{did_you_mean(name, self._agents)}"
             )
-        return self._known(name)
+        return self._known_camera(name)
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self._agents
@@ -460,7 +460,7 @@ class Fleet:
         """
         cameras = self.cameras(pattern)
         self._require_open()
-        meeting = [self._opening[one.name] for one in cameras if one.name in self._opening]
+        meeting = [self._opening[camera.name] for camera in cameras if camera.name in self._opening]
         await self._met(meeting)
         self._require_open()
         return cameras
@@ -493,14 +493,16 @@ class Fleet:
         self._require_open()
         program = self._program
         summaries = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
-        best = by_name(summaries, lambda one: (one.summary.connected, one.summary.agent))
+        best = by_name(
+            summaries, lambda reported: (reported.summary.connected, reported.summary.agent)
+        )
         return {name: best[name].summary for name in sorted(best)}
 
     async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
         """Return the accounts of all agents' outlets, by agent and name.
 
         Args:
-            timeout: seconds for the answers of all agents; those that do not answer are left out.
+            timeout: seconds for the answers of all agents; agents that do not answer are left out.
 
         Raises:
             ConfigurationError: the timeout is not valid.
@@ -528,7 +530,7 @@ class Fleet:
             since: time of the oldest rows to return, with its zone; None: all rows.
             failed: whether rows are only errors, gaps, and results that did not pass.
             most: largest number of rows of each store, which are the newest.
-            timeout: seconds for the answers of all agents; those that do not answer are left out.
+            timeout: seconds for the answers of all agents; agents that do not answer are left out.
 
         Raises:
             ConfigurationError: an argument is not valid.
@@ -536,15 +538,15 @@ class Fleet:
 
         Cancellation: safe.
         """
-        who = "stored_results"
-        at = check_instant(since, "since", who)
+        caller = "stored_results"
+        at = check_instant(since, "since", caller)
         request = StoredRequest(
             since=None if at is None else at.astimezone(UTC).isoformat(),
-            failed=check_flag(failed, "failed", who),
+            failed=check_flag(failed, "failed", caller),
             camera=check_pattern(pattern),
-            most=check_integer(most, "most", 0, MAX_STORED_ROWS, who),
+            most=check_integer(most, "most", 0, MAX_STORED_ROWS, caller),
         )
-        timeout = check_seconds(timeout, "timeout", who)
+        timeout = check_seconds(timeout, "timeout", caller)
         self._require_open()
         return await ask_stores(self._program.bus, self._program.keys, request, timeout)
 
@@ -624,8 +626,8 @@ class Fleet:
         return (self._address or FleetAddress("fleet", "", 0)).of(name)
 
     def _make(self, name: str) -> FleetCamera[Any]:
-        own = {"name": name, "connect_timeout": self._timeout}
-        settings = CameraSettings.of(self._address_of(name), {**self._options, **own})
+        own_options = {"name": name, "connect_timeout": self._timeout}
+        settings = CameraSettings.of(self._address_of(name), {**self._options, **own_options})
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
     def _meet(self, name: str) -> FleetCamera[Any]:
@@ -674,7 +676,7 @@ class Fleet:
 
         Cancellation: cancels each; which cameras were triggered is unknown.
         """
-        return await self._each(pattern, lambda one: one.trigger(timeout=timeout, **options))
+        return await self._each(pattern, lambda camera: camera.trigger(timeout=timeout, **options))
 
     async def reload(
         self, agent: str | None = None, *, timeout: float = 30.0
@@ -725,15 +727,18 @@ class Fleet:
             except SmartCamError as error:
                 return error
 
-        doing = {one.name: do(one) for one in cameras}
+        doing = {camera.name: do(camera) for camera in cameras}
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = {name: group.create_task(outcome(one)) for name, one in doing.items()}
+                tasks = {
+                    name: group.create_task(outcome(doing_of_camera))
+                    for name, doing_of_camera in doing.items()
+                }
         finally:
-            for one in doing.values():
-                one.close()  # its task may never have begun
+            for doing_of_camera in doing.values():
+                doing_of_camera.close()  # the cancelled task may never have begun
         outcomes = {name: task.result() for name, task in tasks.items()}
-        if all(isinstance(one, ConfigurationError) for one in outcomes.values()):
+        if all(isinstance(outcome, ConfigurationError) for outcome in outcomes.values()):
             raise next(iter(outcomes.values()))
         return outcomes
 
@@ -768,13 +773,13 @@ class Fleet:
             return stream
 
         results = FleetResults[Any](subscribe)
-        self._results = [one for one in self._results if one[1]() is not None]
+        self._results = [result for result in self._results if result[1]() is not None]
         self._results.append((pattern, weakref.ref(results)))
         names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):
             self._exchange.cover("results")
         for name in names:
-            results.add(self._known(name))
+            results.add(self._known_camera(name))
         if self._state == "closed":
             results.end()
         return results
@@ -782,4 +787,4 @@ class Fleet:
     def _subscribed(self, name: str) -> list[FleetResults[Any]]:
         """Return the streams whose pattern has a name in common with a name or pattern."""
         streams = [results() for pattern, results in self._results if meets(pattern, name)]
-        return [one for one in streams if one is not None]
+        return [stream for stream in streams if stream is not None]

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 
-LOOK_AGAIN = 0.1
+AGENT_SEARCH_INTERVAL = 0.1
 """Seconds between two checks for an agent."""
 
-LAST_LOOK_TIMEOUT = 1.0
+OTHER_FLEETS_TIMEOUT = 1.0
 """Seconds of the timeout for finding other fleets than the wanted one."""
 
 
@@ -70,7 +70,7 @@ class Program:
 
     Args:
         bus: the program's own end of the bus.
-        fleet: name of the fleet; None for the only one that has the camera.
+        fleet: name of the fleet; None for the only fleet with the camera.
         camera: camera to look for: a name, or a pattern.
         guest: whether another object opens and closes the end.
         called: name of the program for people; None: its script's.
@@ -153,23 +153,23 @@ class Program:
             pattern = keys_of.agent("*")
         while (left := deadline - loop.time()) > 0:
             keys = await self.bus.present(pattern, left)
-            found = sorted({key.split("/")[1] for key in keys})
-            if len(found) == 1:
-                return found[0]
-            if found:
+            agents = sorted({key.split("/")[1] for key in keys})
+            if len(agents) == 1:
+                return agents[0]
+            if agents:
                 raise ConfigurationError(
-                    f"{self._camera}: there are several fleets: {', '.join(found)}; choose one: "
-                    f"?fleet={found[0]}"
+                    f"{self._camera}: there are several fleets: {', '.join(agents)}; choose one: "
+                    f"?fleet={agents[0]}"
                 )
-            await asyncio.sleep(min(LOOK_AGAIN, left))
-        what, meant = "camera", ""
+            await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, left))
+        thing, meant = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK_TIMEOUT)
+            keys = await self.bus.present(Keys("*").camera("*", "**"), OTHER_FLEETS_TIMEOUT)
             meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
-            what = f"camera {self._camera}"
+            thing = f"camera {self._camera}"
         whose = self.bus.identity
         seen = "" if whose is None else f"; or {whose} may not see it"
-        why = f"no agent there has a {what}: none came within {timeout:g} s{meant}{seen}"
+        why = f"no agent there has a {thing}: none came within {timeout:g} s{meant}{seen}"
         raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:

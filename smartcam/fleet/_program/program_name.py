@@ -1,4 +1,4 @@
-"""A program's name, and the secret by which an agent knows that it is that program.
+"""A program's name, and the secret by which an agent recognizes the program.
 
 The name begins with the role of the program's certificate, which the engine's rules check, and ends
 with a digest of the secret. The name is public; the secret is sent only to agents. So no program

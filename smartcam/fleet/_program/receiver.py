@@ -81,7 +81,7 @@ class FleetListeners(Listeners):
 
     def unmarked(self) -> list[asyncio.Future[Result]]:
         """Return the waiters whose start is not known yet."""
-        return [one for one in self._next_results if one not in self._since]
+        return [result for result in self._next_results if result not in self._since]
 
     def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
         """Note that a waiter for the next result needs one from ``clock`` on."""
@@ -89,11 +89,13 @@ class FleetListeners(Listeners):
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
         horizon = self.results.horizon
-        late = [one for one in self._next_results if self._since.get(one, -math.inf) > horizon]
+        late = [
+            result for result in self._next_results if self._since.get(result, -math.inf) > horizon
+        ]
         taken = super()._take_next_results()
         if late:
             self._next_results.update(late)
-            taken = [one for one in taken if one not in late]
+            taken = [result for result in taken if result not in late]
         return taken
 
     def miss(self, count: int, then: ResultRun | None) -> None:
@@ -145,7 +147,7 @@ class Receiver:
         on_state: Callable[[dict[str, Any]], None],
         expected: Callable[[], int | None],
     ) -> None:
-        self.own: dict[int, Own] = {}
+        self.own_calls: dict[int, Own] = {}
         self._name, self._camera, self._caller = name, camera, caller
         self._listeners, self._counters = listeners, counters
         self._interpretation, self._on_state, self._expected = interpretation, on_state, expected
@@ -167,7 +169,7 @@ class Receiver:
         """Subscribe to the camera's states."""
         program = self._caller.program
         key = program.keys.states(self._camera)
-        self._handles["states"] = program.bus.subscribe(key, self._hear_states)
+        self._handles["states"] = program.bus.subscribe(key, self._take_state_message)
 
     async def close(self) -> None:
         """Unsubscribe."""
@@ -222,7 +224,7 @@ class Receiver:
         program = self._caller.program
         key = program.keys.results(self._camera)
         self._since, self._caller.streamed = since, True
-        self._handles["results"] = program.bus.subscribe(key, self._hear_results)
+        self._handles["results"] = program.bus.subscribe(key, self._take_result_message)
         self._begin("find", self._find())
 
     def _leave_results(self) -> None:
@@ -255,8 +257,8 @@ class Receiver:
 
     def has(self, states: int, results: int) -> bool:
         """Return True if all states, and subscribed results, before these numbers were received."""
-        heard = "results" not in self._handles or self._results.expected >= results
-        return heard and self._states.expected >= states
+        enough = "results" not in self._handles or self._results.expected >= results
+        return enough and self._states.expected >= states
 
     def _wake(self, *, everyone: bool = False) -> None:
         if not self._reaching:
@@ -315,18 +317,18 @@ class Receiver:
 
     # ------------------------------------------------------------------ messages
 
-    def _hear_states(self, key: str, payload: bytes) -> None:
-        what = f"the agent's message about {self._camera}"
+    def _take_state_message(self, key: str, payload: bytes) -> None:
+        origin = f"the agent's message about {self._camera}"
         try:
-            message = decode(payload, what)
+            message = decode(payload, origin)
             epoch, following = int(message.fields["epoch"]), int(message.fields["following"])
             self._count(payload)
             known = 0  # states that came with replies
             if epoch == self.epoch:
                 known = max(0, self._states.expected - following + len(message.blobs))
-            states = [state(one) for one in message.blobs[known:]]
+            states = [state(blob) for blob in message.blobs[known:]]
         except (ProtocolError, KeyError, TypeError, ValueError) as exc:
-            logger.warning("%s ! %s: %s", self._name, what, exc)
+            logger.warning("%s ! %s: %s", self._name, origin, exc)
             return
         self._see(epoch)
         self._states.receive(epoch, following, states)
@@ -337,14 +339,14 @@ class Receiver:
         if not reply.new_states:
             return
         try:
-            states = [state(one) for one in reply.new_states]
+            states = [state(reported) for reported in reply.new_states]
         except ValueError as exc:
             logger.warning("%s ! the states in a reply are not valid: %s", self._camera, exc)
             return
         self._states.receive(reply.epoch, reply.states, states)
         self._wake()
 
-    def _hear_results(self, key: str, payload: bytes) -> None:
+    def _take_result_message(self, key: str, payload: bytes) -> None:
         try:
             batch = decode_runs(payload, f"results of {self._camera}")
         except ProtocolError as exc:
@@ -375,45 +377,47 @@ class Receiver:
 
     # ------------------------------------------------------------------ results
 
-    def outcomes(self, own: Own, batch: Batch) -> list[Result]:
+    def outcomes(self, own_call: Own, batch: Batch) -> list[Result]:
         """Return a trigger's results.
 
         Raises:
             InterpretationError: a result cannot be interpreted; the error of the first one.
         """
-        found: list[Result] = []
+        results: list[Result] = []
         error, latency = None, math.nan
         for run in batch.runs:
-            outcome, latency = self._outcome(own, run), run.latency
+            outcome, latency = self._outcome(own_call, run), run.latency
             if not isinstance(outcome, InterpretationError):
-                found.append(outcome)
+                results.append(outcome)
             elif error is None:
                 error = outcome
         if not math.isnan(latency):
             self._counters.processing.add(latency)
         if error is not None:
             raise error
-        return found
+        return results
 
-    def _outcome(self, own: Own, run: ResultRun) -> Result | InterpretationError:
+    def _outcome(self, own_call: Own, run: ResultRun) -> Result | InterpretationError:
         """Return a trigger's result, made and counted once, though it comes in two ways."""
-        known = own.outcomes.get(run.number)
+        known = own_call.outcomes.get(run.number)
         if known is not None:
             return known
         counters = self._counters
         try:
-            if own.expected is not None and run.application != own.expected:
+            if own_call.expected is not None and run.application != own_call.expected:
                 counters.count("wrong_application")
-                raise self._wrong_application(run, own.expected)
+                raise self._wrong_application(run, own_call.expected)
             try:
-                outcome: Result | InterpretationError = self._interpret(run, own.interpretation)
+                outcome: Result | InterpretationError = self._interpret(
+                    run, own_call.interpretation
+                )
             except InterpretationError:
                 counters.count("uninterpretable")
                 raise
             counters.count("triggered")
         except InterpretationError as error:
             outcome = error
-        own.outcomes[run.number] = outcome
+        own_call.outcomes[run.number] = outcome
         return outcome
 
     def _take_run(self, run: ResultRun) -> None:
@@ -422,9 +426,11 @@ class Receiver:
         listeners.results.horizon = run.clock
         try:
             now = asyncio.get_running_loop().time()
-            own = self.own.get(run.call) if run.owner and run.owner == self._program else None
-            if own is not None:
-                self._offer(run, self._outcome(own, run), now, owned=True)
+            own_call = (
+                self.own_calls.get(run.call) if run.owner and run.owner == self._program else None
+            )
+            if own_call is not None:
+                self._offer(run, self._outcome(own_call, run), now, owned=True)
                 return
             expected = self._expected()
             if expected is not None and run.application != expected:
@@ -432,16 +438,16 @@ class Receiver:
                 return
             if listeners.streams_results and self._take_burst(run, now):
                 return
-            for one in singles(run):
+            for single in singles(run):
                 fate = "late" if run.flags & LATE else "streamed"
                 try:
                     outcome: Result | InterpretationError = self._interpret(
-                        one, self._interpretation()
+                        single, self._interpretation()
                     )
                 except InterpretationError as error:
                     outcome, fate = error, "late" if fate == "late" else "uninterpretable"
                 self._counters.count(fate)
-                self._offer(one, outcome, now, owned=False)
+                self._offer(single, outcome, now, owned=False)
         finally:
             listeners.results.horizon = math.inf
 
@@ -501,7 +507,7 @@ class Receiver:
 
 def _things(kind: str, reply: BusMessage) -> list[Any]:
     if kind == "states":
-        return [state(one) for one in reply.blobs]
+        return [state(blob) for blob in reply.blobs]
     return decode_runs(reply.blobs[0], "results that were asked for").runs
 
 

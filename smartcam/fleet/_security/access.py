@@ -52,7 +52,7 @@ class Right(NamedTuple):
 
 
 _ANY = Keys("*")  # keys of any fleet, since an authority is for one plant
-_LOOKING = tuple(name for name, one in SERVICES.items() if not one.command)
+_LOOKING = tuple(name for name, service in SERVICES.items() if not service.command)
 _LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
 
 RIGHTS: tuple[Right, ...] = (
@@ -145,9 +145,9 @@ def access_control(domain: int | None = None) -> dict[str, Any]:
             "messages": [message],
             "flows": [flow],
             "permission": "allow",
-            "key_exprs": [*found],
+            "key_exprs": [*entry],
         }
-        for (role, message, flow), found in keys.items()
+        for (role, message, flow), entry in keys.items()
     }
     return {
         "enabled": True,

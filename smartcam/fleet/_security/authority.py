@@ -39,7 +39,7 @@ RENEWAL_TIME = timedelta(days=30)
 BEFORE = timedelta(days=1)
 """Time before now at which certificates begin, since clocks in a plant differ."""
 
-HERE = ("localhost", "127.0.0.1", "::1")
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Hosts in every agent's certificate."""
 
 HOST = re.compile(r"[\w.:-]+", re.ASCII)
@@ -74,7 +74,7 @@ def make_certificates(
     hosts: Iterable[str] = (),
     lifetime: timedelta = LIFETIME,
 ) -> list[MadeCertificate]:
-    """Make a plant's missing certificates, and renew those that end soon; blocks.
+    """Make a plant's missing certificates, and renew certificates that end soon; blocks.
 
     Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text on its use.
     The authority is made the first time, in ``authority``, and never again. A renewed certificate
@@ -134,16 +134,16 @@ class _Authority:
         from cryptography import x509
 
         place = folder / AUTHORITY
-        own = (place / CA_FILE).exists()
+        has_authority = (place / CA_FILE).exists()
         foreign = (folder / CA_FILE).exists()
-        if foreign or (own and not (place / KEY_FILE).exists()):
+        if foreign or (has_authority and not (place / KEY_FILE).exists()):
             raise ConfigurationError(
                 f"certificates: {(folder if foreign else place) / CA_FILE} is of an authority "
                 f"whose key is not in {place}, and it is not overwritten: expected a folder that "
                 "this command made, or an empty one"
             )
-        if not own:
-            cls._found(place)
+        if not has_authority:
+            cls._authority_in(place)
         try:
             made = x509.load_pem_x509_certificate((place / CA_FILE).read_bytes())
         except (OSError, ValueError) as exc:
@@ -153,7 +153,7 @@ class _Authority:
         return cls(folder, made, _key_in(place))
 
     @staticmethod
-    def _found(place: Path) -> None:
+    def _authority_in(place: Path) -> None:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
 
@@ -184,8 +184,8 @@ class _Authority:
         done = "kept"
         if role in LISTENING:
             had = [] if old is None else _hosts_of(old)
-            asked = [*HERE, *(hosts or ([] if had else [socket.gethostname()]))]
-            hosts = [*dict.fromkeys([*had, *asked])]
+            names = [*LOCAL_HOSTS, *(hosts or ([] if had else [socket.gethostname()]))]
+            hosts = [*dict.fromkeys([*had, *names])]
             stale = bool({*hosts} - {*had})
         else:
             hosts, stale = [], False
@@ -315,7 +315,7 @@ def _hosts_of(certificate: Any) -> list[str]:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
     except x509.ExtensionNotFound:
         return []
-    return [str(one.value) for one in extension.value]
+    return [str(name.value) for name in extension.value]
 
 
 def _ends_soon(certificate: Any) -> bool:
@@ -363,7 +363,7 @@ def _write_key(place: Path, key: Any) -> None:
 
 def _use(role: str, name: str, place: Path, hosts: list[str]) -> str:
     """Return a text on how to use a certificate."""
-    host = next((one for one in reversed(hosts) if one not in HERE), "HOST")
+    host = next((host for host in reversed(hosts) if host not in LOCAL_HOSTS), "HOST")
     if role == ROUTER:
         return f"zenohd --config {place / ROUTER_FILE}\n"
     if role == AGENT:
@@ -388,7 +388,7 @@ def _router(place: Path) -> bytes:
     for path, value in link.settings(10.0).items():
         inner: dict[str, Any] = wanted
         *above, last = path.split("/")
-        for one in above:
-            inner = inner.setdefault(one, {})
+        for part in above:
+            inner = inner.setdefault(part, {})
         inner[last] = value
     return json.dumps(wanted, indent=2).encode()

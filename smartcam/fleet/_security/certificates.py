@@ -29,7 +29,7 @@ WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 
 DAY = timedelta(days=1)
 
-LOOK_TIMEOUT = 1.0
+DIAGNOSIS_TIMEOUT = 1.0
 """Seconds of the timeout for finding out why a handshake failed."""
 
 RENEW = "smartcam fleet certificates DIR makes a new one"
@@ -88,25 +88,25 @@ class Identity(NamedTuple):
     def expired(self) -> str:
         """Text that the certificate has expired; empty if it has not."""
         now = datetime.now(UTC)
-        for what, ends in self._endings:
+        for certificate, ends in self._endings:
             if now >= ends:
-                return f"{what} has expired on {_day(ends)}; {RENEW}"
+                return f"{certificate} has expired on {_day(ends)}; {RENEW}"
         return ""
 
     @property
     def warning(self) -> str:
         """Text that the certificate ends soon, or has expired; empty otherwise."""
-        return self.expired or ends_soon(*min(self._endings, key=lambda one: one[1]))
+        return self.expired or ends_soon(*min(self._endings, key=lambda ending: ending[1]))
 
     @property
     def urgency(self) -> int:
         """Number of past warning times; one more when the certificate has expired."""
-        return sum(self._left <= one for one in (*WARN_BEFORE, timedelta()))
+        return sum(self._left <= limit for limit in (*WARN_BEFORE, timedelta()))
 
     @property
     def look_after(self) -> float:
         """Seconds until the next warning, at most a day, since it may be renewed by then."""
-        times = [self._left - one for one in (*WARN_BEFORE, timedelta()) if self._left > one]
+        times = [self._left - limit for limit in (*WARN_BEFORE, timedelta()) if self._left > limit]
         return min([DAY, *times]).total_seconds() + 0.1
 
     @property
@@ -115,16 +115,16 @@ class Identity(NamedTuple):
 
     @property
     def _endings(self) -> tuple[tuple[str, datetime], ...]:
-        mine = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
-        theirs = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
-        return (mine, self.ends), (theirs, self.authority_ends)
+        agent_text = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
+        authority_text = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
+        return (agent_text, self.ends), (authority_text, self.authority_ends)
 
 
-def ends_soon(what: str, ends: datetime | None) -> str:
+def ends_soon(certificate: str, ends: datetime | None) -> str:
     """Return a text that a certificate ends soon; empty if it does not."""
     if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
         return ""
-    return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
+    return f"{certificate} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
 
 
 def may_command(role: str) -> bool:
@@ -169,7 +169,7 @@ def read_identity(folder: Path) -> Identity:
                 f"certificates: {folder / name}: expected {MAX_BYTES} bytes at most, got more"
             )
     try:
-        own = x509.load_pem_x509_certificate(bodies[1])
+        certificate = x509.load_pem_x509_certificate(bodies[1])
         authorities = x509.load_pem_x509_certificates(bodies[0])
     except ValueError as exc:
         raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
@@ -182,16 +182,16 @@ def read_identity(folder: Path) -> Identity:
     oid = x509.NameOID
     return Identity(
         folder,
-        _named(own, oid.COMMON_NAME),
-        _named(own, oid.ORGANIZATIONAL_UNIT_NAME),
-        own.not_valid_after_utc,
-        max(one.not_valid_after_utc for one in authorities),
+        _named(certificate, oid.COMMON_NAME),
+        _named(certificate, oid.ORGANIZATIONAL_UNIT_NAME),
+        certificate.not_valid_after_utc,
+        max(authority.not_valid_after_utc for authority in authorities),
         hashlib.sha256(b"\0".join(bodies)).digest(),
     )
 
 
-def _named(own: x509.Certificate, oid: Any) -> str:
-    attributes = own.subject.get_attributes_for_oid(oid)
+def _named(certificate: x509.Certificate, oid: Any) -> str:
+    attributes = certificate.subject.get_attributes_for_oid(oid)
     return str(attributes[0].value) if attributes else ""
 
 
@@ -221,7 +221,7 @@ class Handshake(NamedTuple):
 
 
 async def shake_hands(
-    host: str, port: int, folder: Path, within: float = LOOK_TIMEOUT
+    host: str, port: int, folder: Path, within: float = DIAGNOSIS_TIMEOUT
 ) -> Handshake:
     """Try a handshake, and return its outcome ``within`` seconds."""
     loop = asyncio.get_running_loop()
@@ -231,9 +231,11 @@ async def shake_hands(
         async with asyncio.timeout(within):
             made = await loop.run_in_executor(None, context, folder)
             reader, writer = await asyncio.open_connection(host, port, ssl=made)
-            found: Any = writer.get_extra_info("peercert") or {}
-            if "notAfter" in found:
-                ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(found["notAfter"]), UTC)
+            peer_certificate: Any = writer.get_extra_info("peercert") or {}
+            if "notAfter" in peer_certificate:
+                ends = datetime.fromtimestamp(
+                    ssl.cert_time_to_seconds(peer_certificate["notAfter"]), UTC
+                )
             await reader.read(1)  # an endpoint that refuses the certificate reports it now
     except TimeoutError:  # an endpoint that waits for data has accepted it
         return Handshake(SILENT if writer is None else "", ends)

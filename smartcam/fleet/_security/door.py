@@ -42,10 +42,10 @@ LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
 """Seconds between two checks of the free descriptors, and the same if there are hardly fewer than
 at the last check. A new connection causes a check at once."""
 
-LOOK_WHO_COMES_EVERY = 0.25
+CHECK_INTERVAL = 0.25
 """Seconds between two checks of connections while some are half-open and no other comes."""
 
-REST = 4.0
+CHECK_PAUSE_FACTOR = 4.0
 """Pause after a check of connections, in multiples of its duration: it reads every descriptor, and
 an agent may have thousands of cameras."""
 
@@ -62,7 +62,7 @@ RESERVED_DESCRIPTORS: Final = 256
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
 """Largest number of half-open connections of one address, which gets no further one then."""
 
-FEW_HALF_OPEN: Final = 4
+RESUMING_HALF_OPEN: Final = 4
 """Number of half-open connections at which an address gets a further one again."""
 
 MAX_BLOCKED_ADDRESSES: Final = 256
@@ -112,8 +112,8 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
     if shut:
         return [_DROP]
     steps: list[_Instruction] = []
-    for one in blocked:
-        address = ipaddress.ip_address(one)
+    for network in blocked:
+        address = ipaddress.ip_address(network)
         offset, words = (12, 1) if address.version == 4 else (8, 4)
         steps += [
             _Instruction(LOAD_BYTE, IP_HEADER),
@@ -215,7 +215,7 @@ class Door:
 
     # ------------------------------------------------------------------ connections
 
-    def _hear_knocks(self) -> None:
+    def _watch_connections(self) -> None:
         """Check at each new connection, which the engine accepts in its own threads."""
         self._forget_knocks()
         self._knocks = select.epoll()
@@ -252,14 +252,14 @@ class Door:
             return
         begun = loop.time()
         coming = collections.Counter(host for host, _ in self._connected() - links)
-        self._rested = loop.time() + REST * (loop.time() - begun)
+        self._rested = loop.time() + CHECK_PAUSE_FACTOR * (loop.time() - begun)
         if coming:
-            self._expect_look(LOOK_WHO_COMES_EVERY)
+            self._expect_look(CHECK_INTERVAL)
         many = [
             host
             for host, count in coming.most_common(MAX_BLOCKED_ADDRESSES)
             if count >= MAX_HALF_OPEN_CONNECTIONS
-            or (host in self.blocked and count > FEW_HALF_OPEN)
+            or (host in self.blocked and count > RESUMING_HALF_OPEN)
         ]
         if self.blocked == {*many}:
             return
@@ -276,10 +276,10 @@ class Door:
     def _connected(self) -> set[Place]:
         """Return the other ends of all connections of the ports."""
         ends: set[Place] = set()
-        for one in _sockets():
+        for sock in _sockets():
             with contextlib.suppress(OSError, IndexError):  # not a connection, or ended
-                if one.getsockname()[1] in self._ports and not _listens(one):
-                    host, port, *_ = one.getpeername()
+                if sock.getsockname()[1] in self._ports and not _listens(sock):
+                    host, port, *_ = sock.getpeername()
                     ends.add((plain_host(host), port))
         return ends
 
@@ -293,7 +293,7 @@ class Door:
     def _find_again(self) -> None:
         with contextlib.suppress(OSError):  # no descriptor is left for the search
             self._listeners = self._find()
-            self._hear_knocks()
+            self._watch_connections()
         for number in self._listeners:
             self._filter(number)
 
@@ -336,27 +336,29 @@ class Door:
     def _find(self) -> list[int]:
         """Return the descriptors of the engine's listening sockets."""
         numbers: list[int] = []
-        for found in _sockets():
+        for sock in _sockets():
             with contextlib.suppress(OSError):
-                if self._is_ours(found):
-                    found.listen(BACKLOG)
-                    numbers.append(found.fileno())
+                if self._is_ours(sock):
+                    sock.listen(BACKLOG)
+                    numbers.append(sock.fileno())
         return numbers
 
-    def _is_ours(self, found: socket.socket) -> bool:
-        return _listens(found) and found.getsockname()[1] in self._ports
+    def _is_ours(self, sock: socket.socket) -> bool:
+        return _listens(sock) and sock.getsockname()[1] in self._ports
 
 
-def attach(found: socket.socket, steps: list[_Instruction]) -> None:
+def attach(sock: socket.socket, steps: list[_Instruction]) -> None:
     """Set the filter of a socket in the system.
 
     Raises:
         OSError: the system refuses the filter.
     """
-    packed = b"".join(struct.pack("HBBI", one.code, one.yes, one.no, one.value) for one in steps)
-    kept = ctypes.create_string_buffer(packed, len(packed))
-    program = struct.pack("HP", len(steps), ctypes.addressof(kept))
-    found.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy
+    packed = b"".join(
+        struct.pack("HBBI", step.code, step.yes, step.no, step.value) for step in steps
+    )
+    program_buffer = ctypes.create_string_buffer(packed, len(packed))
+    program = struct.pack("HP", len(steps), ctypes.addressof(program_buffer))
+    sock.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy
 
 
 def plain_host(text: str) -> str:
@@ -365,9 +367,9 @@ def plain_host(text: str) -> str:
     return str(getattr(address, "ipv4_mapped", None) or address)
 
 
-def _listens(found: socket.socket) -> bool:
-    internet = found.family in {socket.AF_INET, socket.AF_INET6}
-    return internet and bool(found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+def _listens(sock: socket.socket) -> bool:
+    internet = sock.family in {socket.AF_INET, socket.AF_INET6}
+    return internet and bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
 
 def _sockets() -> Iterator[socket.socket]:

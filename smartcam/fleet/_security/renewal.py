@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-LOOK_EVERY = 10.0
+CHECK_INTERVAL = 10.0
 """Seconds between two checks of the files."""
 
 MAX_WAIT = 600.0
@@ -41,7 +41,7 @@ class CertificateWatch:
         end: the agent's end of the bus, open.
         listens: whether the end listens.
         busy: function that returns whether a command runs.
-        away: context around a new session: on entry all that cannot stay is closed.
+        away: context around a new session: on entry everything that cannot stay is closed.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class CertificateWatch:
         """Check the files periodically, forever."""
         seen = self._end.identity
         while True:
-            await asyncio.sleep(LOOK_EVERY)
+            await asyncio.sleep(CHECK_INTERVAL)
             try:
                 seen = await self._follow(seen)
             except Exception:

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_WAITING_FRAMES: Final = 32
-"""A decoder keeps the data of at most this many encoded frames until their pictures come out."""
+"""Largest number of encoded frames whose data a decoder keeps until it returns their pictures."""
 
 
 class Runs(Protocol):
-    """A function that runs work, in a thread or at once, such as that of ``Codecs``."""
+    """A function that runs work in a thread or at once, such as a method of ``Codecs``."""
 
     def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
         """Run the work, in a thread or at once, and return its result."""
@@ -37,12 +37,12 @@ class Runs(Protocol):
 
 
 class H264Encoder:
-    """One stream of H.264; made by :meth:`Codecs.h264_encoder`.
+    """Encoder of one stream of H.264, made by :meth:`Codecs.h264_encoder`.
 
     Each frame is encoded at once into its own bytes. Instead of large key frames, a column of each
     frame is encoded without reference to earlier ones (intra refresh). The parameter sets are
     repeated, so a viewer can join late. Another size or format restarts the stream with a key
-    frame, and so does a cancelled call, whose bytes were never returned.
+    frame; so does a cancelled call, whose bytes are lost.
 
     Four pixels share U and V. Y is encoded as the camera sent it, and the stream says its range;
     only RGB is converted, to BT.601 with limited range. A JPEG is decoded to RGB first.
@@ -52,12 +52,12 @@ class H264Encoder:
         self, run: Runs, *, fps: float, keyint: int, crf: float, bitrate: int | None
     ) -> None:
         load("av")
-        who = "h264_encoder"
-        fps = check_number(fps, "fps", 0.01, 1000.0, who)
-        keyint = check_integer(keyint, "keyint", 2, 600, who)
-        crf = check_number(crf, "crf", 0, 51, who)
+        caller = "h264_encoder"
+        fps = check_number(fps, "fps", 0.01, 1000.0, caller)
+        keyint = check_integer(keyint, "keyint", 2, 600, caller)
+        crf = check_number(crf, "crf", 0, 51, caller)
         if bitrate is not None:
-            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
+            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, caller)
         self._run = run
         self._rate = Fraction(fps).limit_denominator(1000)
         self._time_base = 1 / self._rate
@@ -129,17 +129,18 @@ class H264Encoder:
 
 
 class H264Decoder:
-    """One stream of H.264; made by :meth:`Codecs.h264_decoder`.
+    """Decoder of one stream of H.264, made by :meth:`Codecs.h264_decoder`.
 
-    It returns only whole pictures. It begins at a key frame, or at the end of a refresh that began
-    after it had decoded something (FFmpeg alone may take a refresh for complete although its first
-    frame had no reference). In the middle of a stream that takes up to three times the encoder's
-    ``keyint``, after a loss two times, and no time after :meth:`H264Encoder.begin_anew`.
+    It returns only whole pictures. The first one follows a key frame, or the end of a refresh that
+    began after the decoder had decoded something: FFmpeg may take a refresh for complete although
+    its first frame had no reference. In the middle of a stream the first picture takes up to three
+    times the encoder's ``keyint``, after a loss two times, and after :meth:`H264Encoder.begin_anew`
+    no time.
 
     Args:
         run: function that runs the work.
-        reorders: whether pictures are sent in another order than they are shown in, so that some
-            have to wait for others.
+        reorders: whether pictures are sent in another order than they are shown, so that some wait
+            for others.
         to: pixel format of FFmpeg that pictures are converted to; "": no conversion.
     """
 
@@ -164,13 +165,13 @@ class H264Decoder:
 
     @property
     def whole(self) -> bool:
-        """True if pictures come: the stream is whole since its start or its last loss."""
+        """True if the decoder has decoded a whole picture since its start or the last loss."""
         return self._missing == 0 and self._losses == self._losses_seen
 
     def lost(self) -> None:
-        """Report that bytes of the stream are missing: no picture comes until it is whole again.
+        """Report missing bytes: no picture is returned until a whole one was decoded.
 
-        A decoder cannot notice that itself, and would go on with a broken picture.
+        A decoder cannot detect missing bytes, and would return broken pictures.
         """
         self._losses += 1
 
@@ -181,11 +182,10 @@ class H264Decoder:
             frame: frame of format ``H264``; one encoded frame, whole.
 
         Returns:
-            None as long as there is no whole picture: at the start in the middle of a stream, and
-                after a loss.
+            None without a whole picture: after a start in the middle of a stream, and after a loss.
 
         Raises:
-            FrameFormatError: the frame is damaged, or its picture has another size; that counts as
+            FrameFormatError: the frame is damaged, or its picture has another size; this counts as
                 a loss.
             LocalProtocolError: the codecs are closed.
 
@@ -263,10 +263,10 @@ class H264Decoder:
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
 
-    def _damaged(self, frame: Frame, got: str) -> FrameFormatError:
+    def _damaged(self, frame: Frame, actual: str) -> FrameFormatError:
         return FrameFormatError(
             f"{frame.source}: {self.NAME} {frame.width}x{frame.height}: expected a whole encoded "
-            f"frame, got {len(frame.data)} bytes: {got}",
+            f"frame, got {len(frame.data)} bytes: {actual}",
             source=frame.source,
         )
 
@@ -288,8 +288,8 @@ def entry_point(data: bytes) -> tuple[bool, int | None]:
             return kind == KEY, refresh
         if kind == SEI:
             end = after if after >= 0 else len(data)
-            found = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
-            refresh = refresh if found is None else found
+            frames_to_recovery = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
+            refresh = refresh if frames_to_recovery is None else frames_to_recovery
         place = after
     return False, refresh
 

@@ -42,7 +42,7 @@ class DecodedJpeg(NamedTuple):
     remark: str
 
 
-def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, int, bool]:
+def jpeg_header(data: bytes | bytearray | memoryview, label: str) -> tuple[int, int, bool]:
     """Return width and height, and whether the JPEG has colours, without decoding it.
 
     Raises:
@@ -53,12 +53,12 @@ def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, i
     try:
         height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
     except (ValueError, KeyError) as exc:  # the second value is for unknown kinds of colours
-        raise _wrong(what, data, exc) from exc
+        raise _wrong(label, data, exc) from exc
     return width, height, colours != "Gray"
 
 
 def decode_jpeg(
-    data: bytes | bytearray | memoryview, colours: str, size: tuple[int, int], what: str
+    data: bytes | bytearray | memoryview, colours: str, size: tuple[int, int], label: str
 ) -> DecodedJpeg:
     """Return the pixels, and a remark on faults that the decoder skipped.
 
@@ -66,35 +66,35 @@ def decode_jpeg(
         data: a JPEG; also without Huffman tables, as cameras on USB send it.
         colours: ``GRAY`` for the luma as it is in the file, or ``RGB``.
         size: expected width and height; no memory is allocated for a picture of another size.
-        what: name of the picture for errors.
+        label: name of the picture for errors.
 
     Raises:
         FrameFormatError: the picture is cut off, damaged, of another size, or no JPEG.
         MissingExtraError: simplejpeg is not installed.
     """
-    width, height, _ = jpeg_header(data, what)
+    width, height, _ = jpeg_header(data, label)
     if (width, height) != size:
         raise FrameFormatError(
-            f"{what} {size[0]}x{size[1]}: expected a JPEG of that size, got {width}x{height}"
+            f"{label} {size[0]}x{size[1]}: expected a JPEG of that size, got {width}x{height}"
         )
     decode = load("simplejpeg").decode_jpeg
     try:
         return DecodedJpeg(decode(data, colours), "")
     except ValueError as exc:
         remark = str(exc)
-        if not remark.strip() or any(one in remark.lower() for one in DAMAGE):
-            raise _wrong(what, data, exc) from exc
-        _check_restarts(data, what, exc)
-        return DecodedJpeg(_decode_tolerantly(decode, data, colours, what), remark)
+        if not remark.strip() or any(text in remark.lower() for text in DAMAGE):
+            raise _wrong(label, data, exc) from exc
+        _check_restarts(data, label, exc)
+        return DecodedJpeg(_decode_tolerantly(decode, data, colours, label), remark)
 
 
 def _decode_tolerantly(
-    decode: Any, data: bytes | bytearray | memoryview, colours: str, what: str
+    decode: Any, data: bytes | bytearray | memoryview, colours: str, label: str
 ) -> Any:
     try:
         return decode(_joined_segments(bytes(data)), colours, strict=False)
     except ValueError as exc:
-        raise _wrong(what, data, exc) from exc
+        raise _wrong(label, data, exc) from exc
 
 
 def _joined_segments(data: bytes) -> bytes:
@@ -103,7 +103,7 @@ def _joined_segments(data: bytes) -> bytes:
     Even in its tolerant mode simplejpeg 1.9 refuses such bytes, and a JFIF segment of an unknown
     revision, which does not affect the pixels.
     """
-    kept, place = [data[:2]], 2
+    segments, place = [data[:2]], 2
     while place + 4 <= len(data):
         begin = data.find(b"\xff", place)
         if begin < 0 or data[begin + 1 : begin + 2] in (b"", b"\xda"):
@@ -113,28 +113,28 @@ def _joined_segments(data: bytes) -> bytes:
             continue
         place = begin + 2 + int.from_bytes(data[begin + 2 : begin + 4], "big")
         if not data[begin:].startswith(b"\xff\xe0") or data[begin + 4 : begin + 10] in _JFIF:
-            kept.append(data[begin:place])
+            segments.append(data[begin:place])
     scan = data.find(b"\xff\xda", place)
-    return b"".join([*kept, data[scan:]]) if scan >= 0 else data
+    return b"".join([*segments, data[scan:]]) if scan >= 0 else data
 
 
-def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Exception) -> None:
+def _check_restarts(data: bytes | bytearray | memoryview, label: str, warning: Exception) -> None:
     """Raise if a restart marker is missing: libjpeg reports only its last warning.
 
     Raises:
         FrameFormatError: the markers are not in sequence, or the end marker is missing.
     """
-    whole = bytes(data)
-    scan = whole.rfind(b"\xff\xda")
-    marks = [found[0] - 0xD0 for found in _RESTART.findall(whole, max(scan, 0))]
-    if scan < 0 or b"\xff\xd9" not in whole[scan:]:
-        raise _wrong(what, data, warning)
+    remaining = bytes(data)
+    scan = remaining.rfind(b"\xff\xda")
+    marks = [number[0] - 0xD0 for number in _RESTART.findall(remaining, max(scan, 0))]
+    if scan < 0 or b"\xff\xd9" not in remaining[scan:]:
+        raise _wrong(label, data, warning)
     if marks != [place % 8 for place in range(len(marks))]:
-        raise _wrong(what, data, ValueError(f"a restart mark is missing; {warning}"))
+        raise _wrong(label, data, ValueError(f"a restart mark is missing; {warning}"))
 
 
-def _wrong(what: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
+def _wrong(label: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
     return FrameFormatError(
-        f"{what}: expected a whole JPEG, got {len(data)} bytes that "
+        f"{label}: expected a whole JPEG, got {len(data)} bytes that "
         f"begin with {bytes(data[:4]).hex(' ')}: {exc}"
     )

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 def with_pixels(frame: Frame, pixels: NDArray[Any], name: str) -> Frame:
     """Return the frame with other pixels and the same other attributes."""
     height, width = pixels.shape[:2]
-    kept = np.ascontiguousarray(pixels)
+    contiguous = np.ascontiguousarray(pixels)
     return replace(
         frame,
-        data=kept.data.toreadonly().cast("B"),
+        data=contiguous.data.toreadonly().cast("B"),
         format=find_format(name),
         width=width,
         height=height,
-        stride=kept.nbytes // height,
+        stride=contiguous.nbytes // height,
     )
 
 
@@ -97,7 +97,9 @@ def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
     if matrix == "601":
         y, chroma = _wideners()
         tables = (y, chroma, chroma)
-        ready = [looked_up(*one) for one in zip(tables, planes, strict=True)]
+        ready = [
+            looked_up(*table_and_plane) for table_and_plane in zip(tables, planes, strict=True)
+        ]
     else:
         ready = [np.ascontiguousarray(plane) for plane in planes]
     data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*ready, quality)
@@ -109,7 +111,7 @@ def _wideners() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the full-range value for each limited-range value of Y, and of U and V."""
     value = np.arange(256.0)
     wide = ((value - 16) * 255 / 219, (value - 128) * 255 / 224 + 128)
-    y, chroma = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in wide)
+    y, chroma = (np.clip(np.rint(table), 0, 255).astype(np.uint8) for table in wide)
     return y, chroma
 
 
@@ -268,9 +270,10 @@ def _jpegxl_stream(data: bytes) -> bytes:
     return data
 
 
-def _unfit(frame: Frame, expected: str, got: str) -> FrameFormatError:
+def _unfit(frame: Frame, expected: str, actual: str) -> FrameFormatError:
     return FrameFormatError(
-        f"{frame.source}: {frame.format.name}: expected {expected}, got {got}", source=frame.source
+        f"{frame.source}: {frame.format.name}: expected {expected}, got {actual}",
+        source=frame.source,
     )
 
 

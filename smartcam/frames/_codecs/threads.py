@@ -43,7 +43,7 @@ class Codecs:
 
     The result is a frame of the compressed format with all other attributes of the given one: time
     of capture, number, source, lens. A frame is encoded as its camera sent it. A format that the
-    codec does not support is refused; :meth:`converted` converts it to one that it does.
+    codec does not support is refused; :meth:`converted` converts it to a supported format.
 
     At most one picture per thread is processed at a time; further calls wait in the order in which
     they came. So a loop that reads a source and encodes its frames skips frames when the machine is
@@ -107,7 +107,7 @@ class Codecs:
         """Return a frame as a JPEG, format ``MJPEG``.
 
         Grey stays grey. Y, U and V are encoded as they are, only widened to JPEG's full range;
-        those of BT.709 are converted through RGB. A JPEG is encoded again. Four pixels of a
+        U and V of BT.709 are converted through RGB. A JPEG is encoded again. Four pixels of a
         coloured frame share U and V (4:2:0); YUV formats keep their own subsampling.
 
         Args:

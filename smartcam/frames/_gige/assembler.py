@@ -196,15 +196,17 @@ class Assembler:
             if self._deadline(block) <= now:
                 self._overdue(block, now, wanted)
         self._settle()
-        self.counts.requested += sum(one.last - one.first + 1 for one in wanted)
+        self.counts.requested += sum(span.last - span.first + 1 for span in wanted)
         return wanted
 
     def _open_blocks(self) -> list[Block]:
-        return [one for one in self._blocks.values() if not (one.complete or one.dead)]
+        return [block for block in self._blocks.values() if not (block.complete or block.dead)]
 
     def _deadline(self, block: Block) -> float:
         if block.missing_since < math.inf:
-            return max(block.missing_since + REORDER_GRACE, block.asked + RESEND_INTERVAL)
+            return max(
+                block.missing_since + REORDER_GRACE, block.resend_requested_at + RESEND_INTERVAL
+            )
         if block.highest or block.trailer is not None:
             return block.progress + SILENCE_TIMEOUT
         return block.progress + LEADER_TIMEOUT
@@ -235,7 +237,7 @@ class Assembler:
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
         # while other packets come, the next request is delayed
         block.tries += past
-        block.asked = now
+        block.resend_requested_at = now
         wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
 
     # packets
@@ -309,10 +311,10 @@ class Assembler:
 
     def _open(self, number: int, extended: bool, now: float) -> Block:
         """Open a block, and earlier blocks of which no packet came."""
-        for one in self._blocks.values():
-            if one.number < number and not one.over:
-                one.over = True
-                one.missing_since = min(one.missing_since, now)
+        for older in self._blocks.values():
+            if older.number < number and not older.over:
+                older.over = True
+                older.missing_since = min(older.missing_since, now)
         for missing in range(max(self._newest + 1, number - MAX_OPEN_BLOCKS + 1), number):
             self._make(missing, extended, now).over = True
             self._blocks[missing].missing_since = now
@@ -349,7 +351,7 @@ class Assembler:
                 block.dead = True
                 self._settle()
             return
-        if packet < len(block.seen) and block.seen[packet]:
+        if packet < len(block.packets_received) and block.packets_received[packet]:
             self.counts.doubled += 1
             return
         if not self._fits(block, header, payload):

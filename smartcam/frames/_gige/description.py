@@ -18,7 +18,7 @@ from xml.parsers import expat
 from smartcam.exceptions import MessageError
 
 MAX_PLAIN_BYTES: Final = 16 << 20
-"""Largest size of an unpacked description, bytes; those of large cameras have 2 MB."""
+"""Largest size of an unpacked description, bytes; descriptions of large cameras have 2 MB."""
 
 MAX_PACKED_BYTES: Final = 4 << 20
 """Largest size of a description's ZIP archive, bytes: 2 MB of XML take 0.2 MB. An archive can
@@ -28,7 +28,7 @@ MAX_LEVELS: Final = 32
 """Largest depth of nested elements of a description."""
 
 MAX_ELEMENTS: Final = 400_000
-"""Largest number of elements of a description; those of a ``StructReg`` count for each entry."""
+"""Largest number of elements of a description; elements of a ``StructReg`` count for each entry."""
 
 
 class Location(NamedTuple):
@@ -66,16 +66,16 @@ class Element:
 
     def all(self, *kinds: str) -> list[Element]:
         """Return the children of these kinds."""
-        return [one for one in self.children if one.kind in kinds]
+        return [child for child in self.children if child.kind in kinds]
 
     def first(self, *kinds: str) -> Element | None:
         """Return the first child of these kinds."""
-        return next((one for one in self.children if one.kind in kinds), None)
+        return next((child for child in self.children if child.kind in kinds), None)
 
     def text_of(self, kind: str, default: str = "") -> str:
         """Return the text of the first child of a kind."""
-        found = self.first(kind)
-        return default if found is None else found.text
+        child = self.first(kind)
+        return default if child is None else child.text
 
 
 def locate(url: str) -> Location:
@@ -84,14 +84,14 @@ def locate(url: str) -> Location:
     Raises:
         MessageError: the URL has another form, or impossible numbers.
     """
-    found = re.fullmatch(
+    match = re.fullmatch(
         r"local:/*([^;]*);\s*(?:0x)?([0-9a-f]{1,8});\s*(?:0x)?([0-9a-f]{1,8})(?:\?.*)?",
         url.strip(),
         re.IGNORECASE,
     )
-    if found is None:
+    if match is None:
         raise MessageError(f"expected 'Local:NAME;ADDRESS;LENGTH', got {url[:80]!r}")
-    place = Location(found[1], int(found[2], 16), int(found[3], 16))
+    place = Location(match[1], int(match[2], 16), int(match[3], 16))
     if not 0 < place.length <= MAX_PLAIN_BYTES:
         raise MessageError(
             f"{url[:80]!r}: expected 1 to {MAX_PLAIN_BYTES} bytes, got {place.length}"
@@ -199,14 +199,14 @@ class _XmlReader:
 
 def _nodes(root: Element) -> dict[str, Element]:
     """Return the named elements; an entry of a StructReg also gets the register's elements."""
-    found: dict[str, Element] = {}
+    nodes: dict[str, Element] = {}
     waiting, copies = [root], 0
     while waiting:
         element = waiting.pop()
         if element.kind in ("RegisterDescription", "Group"):
             waiting += element.children
         elif element.kind == "StructReg":
-            shared = [one for one in element.children if one.kind != "StructEntry"]
+            shared = [child for child in element.children if child.kind != "StructEntry"]
             for entry in element.all("StructEntry"):
                 copies += len(shared)
                 if copies > MAX_ELEMENTS:
@@ -214,9 +214,9 @@ def _nodes(root: Element) -> dict[str, Element]:
                         f"the description: expected at most {MAX_ELEMENTS} elements, those of a "
                         f"StructReg counted for each entry, got {copies} such ones"
                     )
-                own = {one.kind for one in entry.children}
-                entry.children += [one for one in shared if one.kind not in own]
-                found[entry.name] = entry
+                own_kinds = {child.kind for child in entry.children}
+                entry.children += [node for node in shared if node.kind not in own_kinds]
+                nodes[entry.name] = entry
         elif element.name:
-            found[element.name] = element
-    return found
+            nodes[element.name] = element
+    return nodes

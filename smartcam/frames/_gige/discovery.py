@@ -73,7 +73,7 @@ def networks() -> list[Network]:
         import fcntl
     except ImportError:
         return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - any address of its own
-    found = []
+    places = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         for _, name in socket.if_nameindex():
             request = struct.pack("256s", name.encode()[:15])
@@ -83,10 +83,10 @@ def networks() -> list[Network]:
                     for number in (_SIOCGIFADDR, _SIOCGIFBRDADDR, _SIOCGIFNETMASK)
                 )
                 network = ipaddress.IPv4Network(f"{address}/{mask}", strict=False)
-                own = broadcast if broadcast != "0.0.0.0" else str(network.broadcast_address)  # noqa: S104
-                targets = (own, address if network.is_loopback else "255.255.255.255")
-                found.append(Network(address, targets, network))
-    return found
+                target = broadcast if broadcast != "0.0.0.0" else str(network.broadcast_address)  # noqa: S104
+                targets = (target, address if network.is_loopback else "255.255.255.255")
+                places.append(Network(address, targets, network))
+    return places
 
 
 async def find(
@@ -102,18 +102,18 @@ async def find(
     Cancellation: safe.
     """
     loop = asyncio.get_running_loop()
-    asked: list[_Asking] = []
+    searches: list[_NetworkSearch] = []
     transports: list[asyncio.DatagramTransport] = []
     try:
         for place in places:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, asking = await loop.create_datagram_endpoint(
-                    functools.partial(_Asking, place),
+                    functools.partial(_NetworkSearch, place),
                     local_addr=(place.address, 0),
                     allow_broadcast=True,
                 )
                 transports.append(transport)
-                asked.append(asking)
+                searches.append(asking)
                 flags = ACK_REQUIRED | BROADCAST_ACK
                 for target in place.targets:
                     transport.sendto(
@@ -123,15 +123,18 @@ async def find(
     finally:
         for opened in transports:
             opened.close()
-    answers = sorted((one for it in asked for one in it.found), key=lambda one: one.reachable)
-    found = {(one.info.mac, one.info.serial, one.address): one for one in answers}
-    return sorted(found.values(), key=lambda one: (one.info.label, one.address))
+    answers = sorted(
+        (answer for search in searches for answer in search.cameras),
+        key=lambda answer: answer.reachable,
+    )
+    cameras = {(answer.info.mac, answer.info.serial, answer.address): answer for answer in answers}
+    return sorted(cameras.values(), key=lambda camera: (camera.info.label, camera.address))
 
 
-class _Asking(asyncio.DatagramProtocol):
+class _NetworkSearch(asyncio.DatagramProtocol):
     def __init__(self, place: Network) -> None:
         self._place = place
-        self.found: list[AnsweringCamera] = []
+        self.cameras: list[AnsweringCamera] = []
         self._answers = Counter[str]()  # number of answers by address
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
@@ -149,8 +152,8 @@ class _Asking(asyncio.DatagramProtocol):
         network = self._place.network
         reachable = network is None or ipaddress.IPv4Address(info.address) in network
         self._answers[addr[0]] += 1
-        if len(self.found) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:
-            self.found.append(AnsweringCamera(info, addr[0], reachable))
+        if len(self.cameras) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:
+            self.cameras.append(AnsweringCamera(info, addr[0], reachable))
 
     def error_received(self, exc: Exception) -> None:
         """Ignore that no process listens at one of the targets."""

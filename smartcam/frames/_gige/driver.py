@@ -122,7 +122,7 @@ class GigEDriver(FrameDriver):
     @classmethod
     async def discover(cls) -> list[FoundSource]:
         """Return the cameras that answer on this machine's networks, within half a second."""
-        return [found(one) for one in await find(networks())]
+        return [found(camera) for camera in await find(networks())]
 
     @property
     def name(self) -> str:
@@ -355,8 +355,8 @@ class GigEDriver(FrameDriver):
                 f"{self.name}: no socket for the stream: {exc}", source=self.name
             ) from exc
         try:
-            asked = self._wanted.packet_size or self._packet_size
-            size = self._packet_size = await connect(session, where, asked)
+            packet_size = self._wanted.packet_size or self._packet_size
+            size = self._packet_size = await connect(session, where, packet_size)
             resend = session.can_resend and self._wanted.resend
             assembler = Assembler(
                 shape.payload,
@@ -445,9 +445,9 @@ class GigEDriver(FrameDriver):
     ) -> Frame:
         ticks = session.ticks_per_second
         duration = self._longest(shape, picture.arrived)
-        own = chunks.get("ChunkExposureTime") if shape.exposure.is_auto else None
-        if isinstance(own, (int, float)) and 0 < own < MAX_NUMBER:
-            duration = own / 1e6 + shape.exposure.readout
+        exposure = chunks.get("ChunkExposureTime") if shape.exposure.is_auto else None
+        if isinstance(exposure, (int, float)) and 0 < exposure < MAX_NUMBER:
+            duration = exposure / 1e6 + shape.exposure.readout
         return Frame(
             data=picture.data,
             format=shape.format.format,

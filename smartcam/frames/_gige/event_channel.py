@@ -210,7 +210,7 @@ class EventChannel(asyncio.DatagramProtocol):
         async with self._lock:
             if watcher in self._watchers:
                 self._watchers.remove(watcher)
-            watched = {name for one in self._watchers for name in one.names}
+            watched = {name for watcher in self._watchers for name in watcher.names}
             if self._session.lost is None and self._transport is not None:
                 for name in watcher.names:
                     if name not in watched:
@@ -270,7 +270,7 @@ class EventChannel(asyncio.DatagramProtocol):
         features = self._session.features
         await features.set("EventSelector", name)
         entries = await features.entries("EventNotification")
-        entry = next((one for one in _ON_ENTRIES if one in entries), "On") if on else "Off"
+        entry = next((entry for entry in _ON_ENTRIES if entry in entries), "On") if on else "Off"
         await features.set("EventNotification", entry)
 
     def end(self, error: FrameSourceError | None) -> None:

@@ -77,8 +77,8 @@ _OF_C, _OF_EMVA = _strength(_LEVELS_OF_C), _strength(_LEVELS_OF_EMVA)
 
 def _wrapped(value: Number) -> int:
     """Return an integer wrapped to 64 bits with a sign."""
-    whole = int(value) & 0xFFFFFFFFFFFFFFFF
-    return whole - (1 << 64) if whole >> 63 else whole
+    unsigned = int(value) & 0xFFFFFFFFFFFFFFFF
+    return unsigned - (1 << 64) if unsigned >> 63 else unsigned
 
 
 def _divided(left: Number, right: Number) -> Number:
@@ -89,10 +89,10 @@ def _divided(left: Number, right: Number) -> Number:
     return left / right
 
 
-def _rest(left: Number, right: Number) -> Number:
+def _remainder(left: Number, right: Number) -> Number:
     if isinstance(left, int) and isinstance(right, int):
-        rest = abs(left) % abs(right)
-        return -rest if left < 0 else rest
+        remainder = abs(left) % abs(right)
+        return -remainder if left < 0 else remainder
     return math.fmod(left, right)
 
 
@@ -129,7 +129,7 @@ _BINARY: Final[Mapping[str, Callable[[Number, Number], Number]]] = {
     "-": operator.sub,
     "*": operator.mul,
     "/": _divided,
-    "%": _rest,
+    "%": _remainder,
     "**": _power,
 }
 
@@ -164,7 +164,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
 _CONSTANTS: Final = {"E": math.e, "PI": math.pi}
 
 
-def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> Number:
+def evaluate(formula: str, variables: Mapping[str, Number], *, integral: bool) -> Number:
     """Evaluate a formula.
 
     EMVA's GenApi, with which makers test their descriptions, gives operators another precedence
@@ -174,16 +174,16 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
     Args:
         formula: text of the formula in the description.
         variables: value of each name in it.
-        whole: whether all numbers are integers, as in an ``IntSwissKnife``.
+        integral: whether all numbers are integers, as in an ``IntSwissKnife``.
 
     Raises:
         MessageError: the formula is not valid, has an unknown name, or has no value: it divides by
             zero, a number exceeds its bounds, or the two readings give different values.
     """
     tree, other = _parsed(formula)
-    value = _worked_out(formula, tree, variables, whole)
+    value = _worked_out(formula, tree, variables, integral)
     if other != tree:
-        second = _worked_out(formula, other, variables, whole)
+        second = _worked_out(formula, other, variables, integral)
         if second != value:
             raise MessageError(
                 f"formula {formula[:80]!r}: expected one value, got {value:g} in C's order of "
@@ -192,9 +192,11 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
     return value
 
 
-def _worked_out(formula: str, tree: Tree, variables: Mapping[str, Number], whole: bool) -> Number:
+def _worked_out(
+    formula: str, tree: Tree, variables: Mapping[str, Number], integral: bool
+) -> Number:
     try:
-        value = _value(tree, variables, whole)
+        value = _value(tree, variables, integral)
         if not math.isfinite(value):
             raise OverflowError("not a finite number")
     except RecursionError as exc:
@@ -204,7 +206,7 @@ def _worked_out(formula: str, tree: Tree, variables: Mapping[str, Number], whole
     return value
 
 
-def _value(tree: Tree, variables: Mapping[str, Number], whole: bool) -> Number:
+def _value(tree: Tree, variables: Mapping[str, Number], integral: bool) -> Number:
     if isinstance(tree, str):
         value = variables.get(tree, _CONSTANTS.get(tree))
         if value is None:
@@ -212,25 +214,25 @@ def _value(tree: Tree, variables: Mapping[str, Number], whole: bool) -> Number:
                 f"formula: unknown name {tree[:80]!r}; known are "
                 f"{', '.join([*variables][:MAX_NAMES_SHOWN]) or 'none'}"
             )
-        return _bounded(value, whole)
+        return _bounded(value, integral)
     if not isinstance(tree, tuple):
-        return _bounded(tree, whole)
+        return _bounded(tree, integral)
     sign, parts = tree
     if sign == "?":
-        return _value(parts[1 if _value(parts[0], variables, whole) else 2], variables, whole)
-    first = _value(parts[0], variables, whole)
+        return _value(parts[1 if _value(parts[0], variables, integral) else 2], variables, integral)
+    first = _value(parts[0], variables, integral)
     if sign in ("||", "&&"):
         if bool(first) == (sign == "||"):
             return int(bool(first))
-        return int(bool(_value(parts[1], variables, whole)))
-    values = [first, *(_value(part, variables, whole) for part in parts[1:])]
+        return int(bool(_value(parts[1], variables, integral)))
+    values = [first, *(_value(part, variables, integral) for part in parts[1:])]
     if sign in _FUNCTIONS:
-        return _bounded(_FUNCTIONS[sign][1](*values), whole)
-    return _bounded(_UNARY[sign](*values) if len(values) == 1 else _BINARY[sign](*values), whole)
+        return _bounded(_FUNCTIONS[sign][1](*values), integral)
+    return _bounded(_UNARY[sign](*values) if len(values) == 1 else _BINARY[sign](*values), integral)
 
 
-def _bounded(value: Number, whole: bool) -> Number:
-    return _wrapped(value) if whole else float(value)
+def _bounded(value: Number, integral: bool) -> Number:
+    return _wrapped(value) if integral else float(value)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -266,17 +268,17 @@ class _FormulaParser:
         tokens, at = [], 0
         end = len(formula.rstrip())
         while at < end:
-            found = _TOKEN.match(formula, at)
-            if found is None:
+            token = _TOKEN.match(formula, at)
+            if token is None:
                 raise MessageError(f"formula {formula[:80]!r}: unexpected {formula[at]!r} at {at}")
-            kind = str(found.lastgroup)
-            tokens.append((kind, found[kind]))
-            at = found.end()
+            kind = str(token.lastgroup)
+            tokens.append((kind, token[kind]))
+            at = token.end()
         return tokens
 
     def _wrong(self, expected: str) -> MessageError:
-        got = repr(self._tokens[self._at][1]) if self._at < len(self._tokens) else "its end"
-        return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {got}")
+        actual = repr(self._tokens[self._at][1]) if self._at < len(self._tokens) else "its end"
+        return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {actual}")
 
     def _next(self, *signs: str) -> str | None:
         """Consume one of these operators if it is next."""

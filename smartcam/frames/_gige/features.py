@@ -108,10 +108,10 @@ class GenicamFeatures:
     def names(self) -> list[str]:
         """Return the names of the features in the description's categories."""
         listed = [
-            one.text
+            feature.text
             for node in self._nodes.values()
             if node.kind == "Category"
-            for one in node.all("pFeature")
+            for feature in node.all("pFeature")
         ]
         return sorted({name for name in listed if self._kind(name) not in ("", "Category")})
 
@@ -260,10 +260,10 @@ class GenicamFeatures:
     async def _begin(self, name: str) -> Element:
         node = self._named(name)
         try:
-            there = await self._is_available(node, 0)
+            available = await self._is_available(node, 0)
         except MessageError as exc:
             raise self._wrong(name, str(exc)) from exc
-        if not there:
+        if not available:
             raise self._wrong(name, "it is not available now")
         return node
 
@@ -272,12 +272,12 @@ class GenicamFeatures:
         return implemented and await self._condition(node, "pIsAvailable", True, depth)
 
     async def _condition(self, node: Element, kind: str, default: bool, depth: int) -> bool:
-        found = node.first(kind)
-        return default if found is None else bool(await self._numbered(found.text, depth + 1))
+        child = node.first(kind)
+        return default if child is None else bool(await self._numbered(child.text, depth + 1))
 
     async def _entries_now(self, node: Element) -> dict[str, int]:
         return {
-            entry.name: _whole(entry.text_of("Value"))
+            entry.name: _integer(entry.text_of("Value"))
             for entry in node.all("EnumEntry")
             if await self._is_available(entry, 0)
         }
@@ -286,7 +286,7 @@ class GenicamFeatures:
         """Return a node's value in the user's form."""
         value = await self._get(node, 0)
         if node.kind == "Enumeration":
-            return next((name for name, one in _entries(node).items() if one == value), value)
+            return next((name for name, entry in _entries(node).items() if entry == value), value)
         if node.kind == "Boolean":
             return value == _on(node)
         return value
@@ -347,11 +347,11 @@ class GenicamFeatures:
         self, node: Element, kind: str, depth: int, default: float | None = None
     ) -> int | float:
         """Return the number in ``<kind>``, or of the node named in ``<pKind>``."""
-        for one in node.children:
-            if one.kind == kind:
-                return _number(one.text)
-            if one.kind == "p" + kind:
-                return await self._numbered(one.text, depth + 1)
+        for child in node.children:
+            if child.kind == kind:
+                return _number(child.text)
+            if child.kind == "p" + kind:
+                return await self._numbered(child.text, depth + 1)
         if default is None:
             raise MessageError(f"{node.kind} {node.name}: it has no <{kind}>")
         return default
@@ -415,60 +415,61 @@ class GenicamFeatures:
     async def _indexed(self, node: Element, depth: int) -> int | float:
         """Return the description's number for the value of an index."""
         wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
-        for one in node.all("ValueIndexed"):
-            if _number(one.attributes.get("Index", "-1")) == wanted:
-                return _number(one.text)
+        for child in node.all("ValueIndexed"):
+            if _number(child.attributes.get("Index", "-1")) == wanted:
+                return _number(child.text)
         return await self._field(node, "ValueDefault", depth)
 
     async def _target(self, node: Element, depth: int) -> Element | None:
         """Return the node that holds a node's value; None: the node itself."""
-        found = node.first("pValue")
+        element = node.first("pValue")
         index = node.first("pIndex")
         if index is not None and node.kind in ("Integer", "Float"):
             wanted = await self._numbered(index.text, depth + 1)
-            for one in node.all("pValueIndexed"):
-                if _number(one.attributes.get("Index", "-1")) == wanted:
-                    found = one
+            for child in node.all("pValueIndexed"):
+                if _number(child.attributes.get("Index", "-1")) == wanted:
+                    element = child
                     break
             else:
                 chosen = wanted in [
-                    _number(one.attributes.get("Index", "-1")) for one in node.all("ValueIndexed")
+                    _number(child.attributes.get("Index", "-1"))
+                    for child in node.all("ValueIndexed")
                 ]
-                found = None if chosen else node.first("pValueDefault") or found
-        if found is None:
+                element = None if chosen else node.first("pValueDefault") or element
+        if element is None:
             return None
-        target = self._nodes.get(found.text)
+        target = self._nodes.get(element.text)
         if target is None:
-            raise MessageError(f"{node.kind} {node.name}: there is no node {found.text[:80]!r}")
+            raise MessageError(f"{node.kind} {node.name}: there is no node {element.text[:80]!r}")
         return target
 
     async def _worked_out(
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
         """Evaluate a formula with the node's variables."""
-        whole = node.kind.startswith("Int")
+        integral = node.kind.startswith("Int")
         self._spend(node, len(formula))
-        for one in node.children:
-            if one.kind == "pVariable":
-                variables[one.name] = await self._variable(one, depth)
-            elif one.kind == "Constant":
-                variables[one.name] = _number(one.text)
-            elif one.kind == "Expression":
-                self._spend(node, len(one.text))
-                variables[one.name] = evaluate(one.text, variables, whole=whole)
-        return evaluate(formula, variables, whole=whole)
+        for child in node.children:
+            if child.kind == "pVariable":
+                variables[child.name] = await self._variable(child, depth)
+            elif child.kind == "Constant":
+                variables[child.name] = _number(child.text)
+            elif child.kind == "Expression":
+                self._spend(node, len(child.text))
+                variables[child.name] = evaluate(child.text, variables, integral=integral)
+        return evaluate(formula, variables, integral=integral)
 
     async def _variable(self, variable: Element, depth: int) -> int | float:
         """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
-        _, _, what = variable.name.partition(".")
-        if what in ("", "Value"):
+        _, _, property_ = variable.name.partition(".")
+        if property_ in ("", "Value"):
             return await self._numbered(variable.text, depth + 1)
         node = self._nodes.get(variable.text)
         if node is None:
             raise MessageError(f"the description has no node {variable.text[:80]!r}")
-        if what in ("Min", "Max", "Inc"):
-            return await self._limit(node, what, depth + 1)
-        kind, _, entry = what.partition(".")
+        if property_ in ("Min", "Max", "Inc"):
+            return await self._limit(node, property_, depth + 1)
+        kind, _, entry = property_.partition(".")
         if kind == "Entry":
             entries = _entries(node)
             if entry not in entries:
@@ -482,31 +483,31 @@ class GenicamFeatures:
             "after its name"
         )
 
-    async def _limit(self, node: Element, what: str, depth: int) -> int | float:
+    async def _limit(self, node: Element, bound: str, depth: int) -> int | float:
         """Return the smallest or largest value of a node, or its step.
 
         A node without limits has the limits of the node that holds its value; without these, they
         follow from its bits (GenApi 2.0, 2.8.4 and 2.8.6).
         """
         self._step(node, depth)
-        if node.first(what, "p" + what) is not None:
-            return await self._field(node, what, depth)
+        if node.first(bound, "p" + bound) is not None:
+            return await self._field(node, bound, depth)
         has_own_value = node.kind in ("Integer", "Float", "Enumeration")
         target = await self._target(node, depth) if has_own_value else None
         if target is not None:
-            return await self._limit(target, what, depth + 1)
-        if what == "Inc" and node.kind in _WHOLE:
+            return await self._limit(target, bound, depth + 1)
+        if bound == "Inc" and node.kind in _WHOLE:
             return 1
-        if node.kind in ("Float", "FloatReg") and what != "Inc":
-            return -sys.float_info.max if what == "Min" else sys.float_info.max
-        if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and what != "Inc":
-            return -(1 << 63) if what == "Min" else (1 << 63) - 1
-        if node.kind in _REGISTERS and what != "Inc":
+        if node.kind in ("Float", "FloatReg") and bound != "Inc":
+            return -sys.float_info.max if bound == "Min" else sys.float_info.max
+        if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and bound != "Inc":
+            return -(1 << 63) if bound == "Min" else (1 << 63) - 1
+        if node.kind in _REGISTERS and bound != "Inc":
             _, length = await self._place(node, depth)
             _, bits = _span(node, length)
             signed = int(_signed(node))
-            return -(1 << bits - 1) * signed if what == "Min" else (1 << bits - signed) - 1
-        raise NoLimitError(f"{node.kind} {node.name}: it has no <{what}>")
+            return -(1 << bits - 1) * signed if bound == "Min" else (1 << bits - signed) - 1
+        raise NoLimitError(f"{node.kind} {node.name}: it has no <{bound}>")
 
     async def _set(self, node: Element, value: FeatureValue, depth: int) -> None:
         self._step(node, depth)
@@ -560,10 +561,10 @@ class GenicamFeatures:
         if kind == "enumeration":
             parts["entries"] = tuple(await self._noted(self._entries_now(node), problems) or ())
         elif kind in ("integer", "float"):
-            for part, what in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
-                if what == "Inc" and kind == "float":
+            for part, bound in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
+                if bound == "Inc" and kind == "float":
                     continue
-                limit = await self._noted(self._limit(node, what, 0), problems)
+                limit = await self._noted(self._limit(node, bound, 0), problems)
                 endless = limit is None or abs(limit) >= (
                     sys.float_info.max if kind == "float" else (1 << 63) - 1
                 )
@@ -594,12 +595,12 @@ class GenicamFeatures:
             modes = _access(node)
             readable = readable and "WO" not in modes
             writable = writable and "RO" not in modes and node.kind not in _KNIVES
-            found = None
+            access = None
             if node.kind in (*_HOLDERS, *_CONVERTERS):
-                found = await self._target(node, depth)
-            if found is None:
+                access = await self._target(node, depth)
+            if access is None:
                 break
-            node = found
+            node = access
             if not await self._is_available(node, depth):
                 return ""
             writable = writable and not await self._condition(node, "pIsLocked", False, depth)
@@ -611,20 +612,22 @@ class GenicamFeatures:
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
-            found = await self._noted(self._target(node, depth), problems)
-            if found is None:
+            unit_text = await self._noted(self._target(node, depth), problems)
+            if unit_text is None:
                 return ""
-            node = found
+            node = unit_text
         return ""
 
     def _selected_by(self, name: str) -> tuple[str, ...]:
         """Return the features that select the instance of a feature."""
         if self._selectors is None:
-            found: dict[str, list[str]] = {}
+            names_by_selector: dict[str, list[str]] = {}
             for node in self._nodes.values():
-                for one in node.all("pSelected"):
-                    found.setdefault(one.text, []).append(node.name)
-            self._selectors = {selected: tuple(names) for selected, names in found.items()}
+                for child in node.all("pSelected"):
+                    names_by_selector.setdefault(child.text, []).append(node.name)
+            self._selectors = {
+                selected: tuple(names) for selected, names in names_by_selector.items()
+            }
         return self._selectors.get(name, ())
 
     # registers
@@ -637,15 +640,15 @@ class GenicamFeatures:
         if not 0 < length <= MAX_REGISTER_BYTES:
             raise MessageError(f"{node.kind} {node.name}: impossible length {length}")
         address = 0
-        for one in node.children:
-            if one.kind == "Address":
-                address += _whole(one.text)
-            elif one.kind == "pAddress":
-                address += int(await self._numbered(one.text, depth + 1))
-            elif one.kind == "IntSwissKnife":
-                address += int(await self._get(one, depth + 1))
-            elif one.kind == "pIndex":
-                address += await self._index(one, length, depth)
+        for child in node.children:
+            if child.kind == "Address":
+                address += _integer(child.text)
+            elif child.kind == "pAddress":
+                address += int(await self._numbered(child.text, depth + 1))
+            elif child.kind == "IntSwissKnife":
+                address += int(await self._get(child, depth + 1))
+            elif child.kind == "pIndex":
+                address += await self._index(child, length, depth)
         if not 0 <= address <= 0xFFFFFFFF - length:
             raise MessageError(f"{node.kind} {node.name}: impossible address {address:#x}")
         return address, length
@@ -653,7 +656,7 @@ class GenicamFeatures:
     async def _index(self, index: Element, length: int, depth: int) -> int:
         offset: int | float = length
         if "Offset" in index.attributes:
-            offset = _whole(index.attributes["Offset"])
+            offset = _integer(index.attributes["Offset"])
         elif "pOffset" in index.attributes:
             offset = await self._numbered(index.attributes["pOffset"], depth + 1)
         return int(offset * await self._numbered(index.text, depth + 1))
@@ -686,17 +689,17 @@ class GenicamFeatures:
         elif node.kind == "FloatReg":
             data = struct.pack(_float_format(node, length), value)
         else:
-            whole = round(value)
+            number = round(value)
             shift, bits = _span(node, length)
             least = -(1 << bits - 1) if _signed(node) else 0
-            if not least <= whole < least + (1 << bits):
-                raise MessageError(f"{whole} does not fit into {bits} bits")
+            if not least <= number < least + (1 << bits):
+                raise MessageError(f"{number} does not fit into {bits} bits")
             order = _order(node)
             if bits < 8 * length:
                 before = int.from_bytes(await self._bytes(node, address, length), order)
                 mask = (1 << bits) - 1 << shift
-                whole = before & ~mask | whole << shift & mask
-            data = (whole & (1 << 8 * length) - 1).to_bytes(length, order)
+                number = before & ~mask | number << shift & mask
+            data = (number & (1 << 8 * length) - 1).to_bytes(length, order)
         memory = self._memory(node)
         self._read.clear()
         if self._writing is not None:
@@ -706,7 +709,7 @@ class GenicamFeatures:
 
 def _number(text: str) -> int | float:
     try:
-        return _whole(text)
+        return _integer(text)
     except MessageError:
         pass
     try:
@@ -718,7 +721,7 @@ def _number(text: str) -> int | float:
     return number
 
 
-def _whole(text: str) -> int:
+def _integer(text: str) -> int:
     digits = text.strip()
     try:
         if len(digits) > 24:
@@ -730,7 +733,7 @@ def _whole(text: str) -> int:
 
 
 def _entries(node: Element) -> dict[str, int]:
-    return {entry.name: _whole(entry.text_of("Value")) for entry in node.all("EnumEntry")}
+    return {entry.name: _integer(entry.text_of("Value")) for entry in node.all("EnumEntry")}
 
 
 def _access(node: Element) -> tuple[str, str]:
@@ -739,11 +742,11 @@ def _access(node: Element) -> tuple[str, str]:
 
 
 def _on(node: Element) -> int:
-    return _whole(node.text_of("OnValue", "1"))
+    return _integer(node.text_of("OnValue", "1"))
 
 
 def _off(node: Element) -> int:
-    return _whole(node.text_of("OffValue", "0"))
+    return _integer(node.text_of("OffValue", "0"))
 
 
 def _signed(node: Element) -> bool:
@@ -759,7 +762,7 @@ def _span(node: Element, length: int) -> tuple[int, int]:
     if node.kind == "IntReg":
         return 0, 8 * length
     bit = node.text_of("Bit")
-    ends = [_whole(bit or node.text_of(kind)) for kind in ("LSB", "MSB")]
+    ends = [_integer(bit or node.text_of(kind)) for kind in ("LSB", "MSB")]
     low, high = min(ends), max(ends)
     if not 0 <= low <= high < 8 * length:
         raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")

@@ -79,10 +79,10 @@ async def force_address(
     wanted = checked_mac(mac)
     interface = _interface(address)
     way_out = _ip(gateway, "gateway")
-    asked = networks() if places is None else places
-    there = await find(asked, port=port)
-    camera = _of_mac(there, wanted)
-    taken = [one for one in there if one.info.address == str(interface.ip)]
+    interfaces = networks() if places is None else places
+    cameras = await find(interfaces, port=port)
+    camera = _of_mac(cameras, wanted)
+    taken = [camera for camera in cameras if camera.info.address == str(interface.ip)]
     if taken and taken[0].info.mac != wanted:
         raise ConfigurationError(
             f"address: {interface.ip} is the address of {taken[0].info.label} "
@@ -94,8 +94,8 @@ async def force_address(
         interface.netmask.packed,
         way_out.packed,
     )
-    await _sent(payload, asked, port, camera)
-    return await _appeared(wanted, str(interface.ip), asked, port)
+    await _sent(payload, interfaces, port, camera)
+    return await _appeared(wanted, str(interface.ip), interfaces, port)
 
 
 def checked_mac(mac: str) -> str:
@@ -131,19 +131,21 @@ def _interface(address: str) -> ipaddress.IPv4Interface:
     return interface
 
 
-def _ip(text: str, what: str) -> ipaddress.IPv4Address:
-    given = check_text(text, what, "force_address", most=100)
+def _ip(text: str, label: str) -> ipaddress.IPv4Address:
+    given = check_text(text, label, "force_address", most=100)
     try:
         return ipaddress.IPv4Address(given.strip())
     except ValueError as exc:
-        raise ConfigurationError(f"{what}: expected an IPv4 address, got {given[:60]!r}") from exc
+        raise ConfigurationError(f"{label}: expected an IPv4 address, got {given[:60]!r}") from exc
 
 
-def _of_mac(there: list[AnsweringCamera], mac: str) -> AnsweringCamera:
-    for camera in there:
+def _of_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:
+    for camera in cameras:
         if camera.info.mac == mac:
             return camera
-    known = tuple(f"{one.info.mac} {one.info.label} at {one.info.address}" for one in there)
+    known = tuple(
+        f"{camera.info.mac} {camera.info.label} at {camera.info.address}" for camera in cameras
+    )
     raise FrameSourceError(
         f"no camera with the hardware address {mac} answers; there are "
         f"{', '.join(known) or 'none'}",

@@ -190,7 +190,7 @@ class DeviceInfo(NamedTuple):
 def text(data: bytes) -> str:
     """Return a register's text up to its first zero, with unprintable bytes replaced."""
     shown = data.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
-    return "".join(one if one.isprintable() else "?" for one in shown)
+    return "".join(character if character.isprintable() else "?" for character in shown)
 
 
 def status_text(status: int) -> str:

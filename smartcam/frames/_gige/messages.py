@@ -44,24 +44,24 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
     Raises:
         MessageError: the lengths do not fit, or there are more chunks than any camera sends.
     """
-    found: dict[int, memoryview] = {}
+    chunks: dict[int, memoryview] = {}
     end = len(payload)
     while end:
-        if end < _ENDING.size or len(found) >= MAX_CHUNKS:
+        if end < _ENDING.size or len(chunks) >= MAX_CHUNKS:
             raise MessageError(
                 f"chunk data: expected at most {MAX_CHUNKS} chunks that fill {len(payload)} bytes, "
                 f"{end} are left"
             )
         number, length = _ENDING.unpack_from(payload, end - _ENDING.size)
         begin = end - _ENDING.size - length
-        if begin < 0 or number in found:
+        if begin < 0 or number in chunks:
             raise MessageError(
                 f"chunk data: chunk {number:#x} of {length} bytes, which is there "
-                f"{'twice' if number in found else f'before byte {end}'}"
+                f"{'twice' if number in chunks else f'before byte {end}'}"
             )
-        found[number] = payload[begin : end - _ENDING.size]
+        chunks[number] = payload[begin : end - _ENDING.size]
         end = begin
-    return found
+    return chunks
 
 
 def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
@@ -143,13 +143,13 @@ class MessageFeatures(GenicamFeatures):
         """Return the number of the message with a feature's value."""
         waiting, seen = [name], set[str]()
         while waiting and len(seen) < MAX_REFERENCES:
-            one = waiting.pop()
-            node = self._nodes.get(one)
-            if node is None or one in seen:
+            waiting_node = waiting.pop()
+            node = self._nodes.get(waiting_node)
+            if node is None or waiting_node in seen:
                 continue
-            seen.add(one)
-            if one in self._ports:
-                return self._ports[one]
+            seen.add(waiting_node)
+            if waiting_node in self._ports:
+                return self._ports[waiting_node]
             waiting += [child.text for child in node.all(*_LEADS_TO_VALUE)]
         return None
 
@@ -173,12 +173,12 @@ class _MessageBytes:
 
 def _port_numbers(nodes: Mapping[str, Element], kind: str) -> dict[str, int]:
     """Return the number of each port of the kind."""
-    found: dict[str, int] = {}
+    numbers: dict[str, int] = {}
     for node in nodes.values():
         text = node.text_of(kind) if node.kind == "Port" else ""
         if text:
             try:
-                found[node.name] = int(text, 16)
+                numbers[node.name] = int(text, 16)
             except ValueError as exc:
                 raise MessageError(f"Port {node.name}: {kind} {text[:40]!r} is no number") from exc
-    return found
+    return numbers

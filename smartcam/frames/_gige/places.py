@@ -44,20 +44,20 @@ def wanted(address: FrameAddress) -> WantedStream:
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
     packet_size = given.get("packet_size", "auto")
-    asked = 0.0
+    rate = 0.0
     if packet_size != "auto":
-        asked = address.number("packet_size", packet_size, *PACKET_SIZES)
+        rate = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
         given,
         address.size(given["size"]) if "size" in given else None,
         address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
-        int(asked) & ~3,
+        int(rate) & ~3,
         resend == "on",
         given.get("trigger"),
     )
 
 
-async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
+async def place(address: FrameAddress, stream: WantedStream) -> tuple[str, int]:
     """Return the address and the port of a camera.
 
     Raises:
@@ -65,11 +65,11 @@ async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
     """
     if address.host:
         return address.host, address.port or PORT
-    serial = what.parameters.get("serial")
-    there = await find(networks())
-    fitting = [one for one in there if serial in (None, one.info.serial)]
+    serial = stream.parameters.get("serial")
+    cameras = await find(networks())
+    fitting = [camera for camera in cameras if serial in (None, camera.info.serial)]
     if len(fitting) != 1:
-        known = tuple(f"{found(one).url} {one.info.label}" for one in there)
+        known = tuple(f"{found(camera).url} {camera.info.label}" for camera in cameras)
         which = "" if serial is None else f" with the serial number {serial}"
         raise FrameSourceError(
             f"{address.shown}: expected one camera{which}, found {len(fitting)}; there "

@@ -137,7 +137,7 @@ async def _set_format(session: GigESession, name: str) -> None:
     for entry, number in entries.items():
         known = _format_of_code(number)
         names = [entry] if known is None else [entry, known.name, known.fourcc]
-        if name.upper() in (one.upper() for one in names):
+        if name.upper() in (name.upper() for name in names):
             await session.features.set("PixelFormat", entry)
             return
     raise FrameFormatError(
@@ -191,7 +191,9 @@ async def read_shape(session: GigESession) -> StreamShape:
     number = int(await features.number("PixelFormat") or 0)
     pixels = _format_of_code(number)
     if pixels is None:
-        fitting = tuple(name for name, one in entries.items() if _format_of_code(one) is not None)
+        fitting = tuple(
+            name for name, entry in entries.items() if _format_of_code(entry) is not None
+        )
         raise FrameFormatError(
             f"{session.label}: it is set to {entry}, {number:#010x}, which is unknown; of "
             f"its formats, smartcam knows {', '.join(fitting) or 'none'}",
@@ -223,7 +225,7 @@ async def read_exposure(features: GenicamFeatures) -> Exposure:
     if "ExposureAuto" in features:
         with contextlib.suppress(FrameSourceError):
             is_auto = await features.get("ExposureAuto") != "Off"
-            for name in (one for one in _EXPOSURES if is_auto and one in features):
+            for name in (exposure for exposure in _EXPOSURES if is_auto and exposure in features):
                 longest = (await features.describe(name)).maximum
                 if longest is not None and longest < MAX_NUMBER:
                     exposure = max(exposure, longest)
@@ -248,13 +250,13 @@ async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> fl
 # the stream channel
 
 
-async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
+async def connect(session: GigESession, where: StreamSocket, packet_size: int) -> int:
     """Direct the camera's stream channel to a socket.
 
     Args:
         session: the camera.
         where: socket that receives the packets.
-        asked: number of bytes of a packet; 0: the largest that passes a test.
+        packet_size: number of bytes of a packet; 0: the largest that passes a test.
 
     Returns:
         Number of bytes of an IP packet of the stream.
@@ -266,7 +268,11 @@ async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
     address = int(ipaddress.IPv4Address(control.local_address))
     await control.write_register(Register.STREAM_DESTINATION, address)
     await control.write_register(Register.STREAM_PORT, where.port)
-    chosen = _requested_packet_size(session, asked) if asked else _largest_tested(session, where)
+    chosen = (
+        _requested_packet_size(session, packet_size)
+        if packet_size
+        else _largest_tested(session, where)
+    )
     size = await chosen
     if not size > IP_UDP_BYTES + EXTENDED_HEADER_BYTES:
         raise FrameSourceError(
@@ -276,13 +282,13 @@ async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
     return size
 
 
-async def _requested_packet_size(session: GigESession, asked: int) -> int:
+async def _requested_packet_size(session: GigESession, packet_size: int) -> int:
     control = session.control
-    await control.write_register(Register.STREAM_PACKET_SIZE, asked | DO_NOT_FRAGMENT)
+    await control.write_register(Register.STREAM_PACKET_SIZE, packet_size | DO_NOT_FRAGMENT)
     size = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
-    if size > asked:
+    if size > packet_size:
         raise FrameSourceError(
-            f"{session.label}: packet_size: asked for {asked} bytes, the camera sends {size}",
+            f"{session.label}: packet_size: asked for {packet_size} bytes, the camera sends {size}",
             source=session.label,
         )
     return size
@@ -291,9 +297,9 @@ async def _requested_packet_size(session: GigESession, asked: int) -> int:
 async def _largest_tested(session: GigESession, where: StreamSocket) -> int:
     """Return the size of the largest received test packet, or the camera's own size."""
     control = session.control
-    own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
-    way = min(control.path_mtu, 9000)
-    for size in sorted({way, min(way, 1500), PACKET_SIZES[0]}, reverse=True):
+    configured = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
+    largest = min(control.path_mtu, 9000)
+    for size in sorted({largest, min(largest, 1500), PACKET_SIZES[0]}, reverse=True):
         value = size | DO_NOT_FRAGMENT | FIRE_TEST_PACKET
         # the camera does not send test packets of this size
         with contextlib.suppress(FrameSourceError):
@@ -301,4 +307,4 @@ async def _largest_tested(session: GigESession, where: StreamSocket) -> int:
             set_to = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
             if set_to <= size and await where.test_packet(set_to, TEST_WAIT):
                 return set_to
-    return await _requested_packet_size(session, min(own or 1500, way, 1500))
+    return await _requested_packet_size(session, min(configured or 1500, largest, 1500))

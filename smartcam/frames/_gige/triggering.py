@@ -65,14 +65,14 @@ async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
     if "TriggerSelector" not in features:
         return await _setting(features, "")
     chosen = await features.get("TriggerSelector")
-    found: list[TriggerSetting] = []
+    settings: list[TriggerSetting] = []
     try:
         for selector in await features.entries("TriggerSelector"):
             await features.set("TriggerSelector", selector)
-            found += await _setting(features, selector)
+            settings += await _setting(features, selector)
     finally:
         await features.set("TriggerSelector", chosen)
-    return found
+    return settings
 
 
 async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:
@@ -110,7 +110,7 @@ async def set_trigger(features: GenicamFeatures, source: str) -> None:
         await features.set("TriggerMode", "Off")
         return
     sources = await features.entries("TriggerSource")
-    meant = {one.lower(): one for one in sources}.get(source.lower(), source)
+    meant = {source.lower(): source for source in sources}.get(source.lower(), source)
     # some cameras have a source only while the trigger is switched on
     await features.set("TriggerMode", "On")
     await features.set("TriggerSource", meant)

@@ -20,7 +20,9 @@ class PlanesApart:
     __slots__ = ("_joined", "_planes")
 
     def __init__(self, planes: Sequence[Any]) -> None:
-        self._planes: tuple[memoryview, ...] = tuple(memoryview(one).toreadonly() for one in planes)
+        self._planes: tuple[memoryview, ...] = tuple(
+            memoryview(plane).toreadonly() for plane in planes
+        )
         self._joined: bytes | None = None
 
     @property

@@ -82,15 +82,15 @@ def _weights(matrix: Matrix, depth: int) -> _Weights:
 @lru_cache(maxsize=8)
 def _rows(matrix: Matrix, depth: int) -> NDArray[np.float64]:
     """Return the weights of Y, U, V and 1 in red, green and blue, (3, 4)."""
-    one = _weights(matrix, depth)
+    weights = _weights(matrix, depth)
     shares = np.array(
         [
-            [one.luma, 0, one.red_of_v],
-            [one.luma, one.green_of_u, one.green_of_v],
-            [one.luma, one.blue_of_u, 0],
+            [weights.luma, 0, weights.red_of_v],
+            [weights.luma, weights.green_of_u, weights.green_of_v],
+            [weights.luma, weights.blue_of_u, 0],
         ]
     )
-    return np.column_stack([shares, -shares @ [one.black, one.middle, one.middle]])
+    return np.column_stack([shares, -shares @ [weights.black, weights.middle, weights.middle]])
 
 
 @lru_cache(maxsize=8)
@@ -106,8 +106,8 @@ def _tables(matrix: Matrix, depth: int) -> dict[str, NDArray[np.int32]]:
         "green of u": weights.green_of_u * chroma,
         "blue of u": weights.blue_of_u * chroma,
     }
-    one = 2 ** _fraction_bits(depth)
-    return {name: np.rint(part * one).astype(np.int32) for name, part in parts.items()}
+    scale = 2 ** _fraction_bits(depth)
+    return {name: np.rint(part * scale).astype(np.int32) for name, part in parts.items()}
 
 
 def _fraction_bits(depth: int) -> int:

@@ -35,9 +35,9 @@ def opencv() -> Any:
 def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
     """Return the table's value for each sample, from a table of 256 values."""
     cv2 = opencv()
-    found: NDArray[Any]
-    found = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
-    return found
+    converted: NDArray[Any]
+    converted = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
+    return converted
 
 
 def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
@@ -85,15 +85,17 @@ def planes_to_rgb(
     colours, spare = np.empty((height, width, 3), y.dtype), most < np.iinfo(y.dtype).max
     step = -(-BAND_BYTES // (colours.strides[0] * down))
     for top in range(0, rows, step):
-        parts = [one[top : top + step] for one in chroma]
+        parts = [plane[top : top + step] for plane in chroma]
         if across * down > 1:
             size = (columns * across, len(parts[0]) * down)
             interleaved = cv2.merge(parts)
             parts = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
         band = slice(top * down, (top + step) * down)
-        merged = cv2.merge([y[band], *(one[: height - band.start, :width] for one in parts)])
+        merged = cv2.merge([y[band], *(part[: height - band.start, :width] for part in parts)])
         if spare:  # bits above the depth have no meaning
             cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
-        found = cv2.transform(merged, weights)
-        colours[band] = cv2.threshold(found, most, 0, cv2.THRESH_TRUNC)[1] if spare else found
+        converted = cv2.transform(merged, weights)
+        colours[band] = (
+            cv2.threshold(converted, most, 0, cv2.THRESH_TRUNC)[1] if spare else converted
+        )
     return colours

@@ -246,28 +246,32 @@ says ``limited``. Source: PFNC 2.1 and its list of values, videodev2.h.
 """
 
 
-def with_matrix(found: PixelFormat, matrix: str) -> PixelFormat:
+def with_matrix(pixel_format: PixelFormat, matrix: str) -> PixelFormat:
     """Return the format with the same layout and another matrix of Y, U and V.
 
     Args:
-        found: format with Y, U and V.
+        pixel_format: format with Y, U and V.
         matrix: name in ``MATRICES``, with the range.
     """
-    layout: Any = found.layout
+    layout: Any = pixel_format.layout
     wanted = replace(layout, matrix=matrix)
-    return found if wanted == layout else next(one for one in PIXEL_FORMATS if one.layout == wanted)
+    return (
+        pixel_format
+        if wanted == layout
+        else next(candidate for candidate in PIXEL_FORMATS if candidate.layout == wanted)
+    )
 
 
-_BY_EXACT_NAME: Final = {one.name: one for one in PIXEL_FORMATS}
+_BY_EXACT_NAME: Final = {pixel_format.name: pixel_format for pixel_format in PIXEL_FORMATS}
 
 _VARIANTS: Final = ("_709", "_2020", "_full")
 
 _ALIASES: Final = {"JPEG": "MJPEG", "YUY2": "YUV422_8"}
 
 _BY_NAME: Final[dict[str | int, PixelFormat]] = {
-    key: one
-    for one in reversed(PIXEL_FORMATS)
-    for key in (one.fourcc.upper(), one.code, one.name.upper())
+    key: pixel_format
+    for pixel_format in reversed(PIXEL_FORMATS)
+    for key in (pixel_format.fourcc.upper(), pixel_format.code, pixel_format.name.upper())
     if key
 }
 
@@ -289,11 +293,15 @@ def find_format(name: str | int) -> PixelFormat:
     else:
         name = check_integer(name, "pixel format", 0, 0xFFFFFFFF)
     key = name if isinstance(name, int) else name.strip().upper()
-    found = _BY_NAME.get(_ALIASES.get(key, key) if isinstance(key, str) else key)
-    if found is not None:
-        return found
-    known = [one.name for one in PIXEL_FORMATS]
-    plain = [one for one in known if not one.endswith((*_VARIANTS, "_10", "_12", "_16"))]
+    pixel_format = _BY_NAME.get(_ALIASES.get(key, key) if isinstance(key, str) else key)
+    if pixel_format is not None:
+        return pixel_format
+    known = [pixel_format.name for pixel_format in PIXEL_FORMATS]
+    plain = [
+        format_name
+        for format_name in known
+        if not format_name.endswith((*_VARIANTS, "_10", "_12", "_16"))
+    ]
     shown, guess = (f"{name:#010x}", "") if isinstance(name, int) else (repr(name), None)
     raise FrameFormatError(
         f"unknown pixel format {shown}; known are {', '.join(plain)}, those "

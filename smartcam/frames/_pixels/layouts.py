@@ -39,10 +39,10 @@ class RawPicture(NamedTuple):
     height: int
     stride: int
 
-    def wrong(self, expected: str, got: str) -> FrameFormatError:
+    def wrong(self, expected: str, actual: str) -> FrameFormatError:
         """Return the error for bytes that do not fit the format."""
         return FrameFormatError(
-            f"{self.format} {self.width}x{self.height}: expected {expected}, got {got}"
+            f"{self.format} {self.width}x{self.height}: expected {expected}, got {actual}"
         )
 
 
@@ -79,7 +79,7 @@ class PixelLayout(ABC):
         raise picture.wrong("a format of Y, U and V", "one without")
 
     def check(self, picture: RawPicture) -> None:
-        """Check that the bytes can be such a picture."""
+        """Check that the bytes can be a picture of this layout."""
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
             raise picture.wrong("a width and a height of 1 or more", f"{width}x{height}")
@@ -87,9 +87,9 @@ class PixelLayout(ABC):
         if stride < least:
             raise picture.wrong(f"{least} bytes or more from row to row", str(stride))
         size = self.size(width, height, stride)
-        came = memoryview(data).nbytes
-        if came < size:
-            raise picture.wrong(f"{size} bytes", str(came))
+        length = memoryview(data).nbytes
+        if length < size:
+            raise picture.wrong(f"{size} bytes", str(length))
 
 
 def _view(
@@ -140,7 +140,7 @@ class SampleLayout(PixelLayout):
         return stride * (height - 1) + self.least_stride(width)
 
     def check(self, picture: RawPicture) -> None:
-        """Check that the bytes can be such a picture."""
+        """Check that the bytes can be a picture of this layout."""
         if self.packing is not None and picture.stride == 0:
             width = picture.width * picture.height
             picture = picture._replace(width=width, height=1, stride=self.least_stride(width))
@@ -266,8 +266,8 @@ class Planes(PixelLayout):
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes of all planes."""
-        _, rows, own = self._chroma(width, height, stride)
-        return stride * height + own * rows * (1 if self.interleaved else 2)
+        _, rows, chroma_stride = self._chroma(width, height, stride)
+        return stride * height + chroma_stride * rows * (1 if self.interleaved else 2)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
         """Return the bytes, (N,)."""
@@ -279,13 +279,14 @@ class Planes(PixelLayout):
         """Return Y, U and V, views."""
         self.check(picture)
         _, _, width, height, stride = picture
-        across, down, own = self._chroma(width, height, stride)
+        across, down, chroma_stride = self._chroma(width, height, stride)
         size, kind = self.size_of, f"<u{self.size_of}"
         y = _view(picture, kind, (height, width), (stride, size))
         begin, step = stride * height, size * (2 if self.interleaved else 1)
-        apart = size if self.interleaved else own * down
+        apart = size if self.interleaved else chroma_stride * down
         u, v = (
-            _view(picture, kind, (down, across), (own, step), begin + place) for place in (0, apart)
+            _view(picture, kind, (down, across), (chroma_stride, step), begin + place)
+            for place in (0, apart)
         )
         return y, u, v
 

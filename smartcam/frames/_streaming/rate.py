@@ -137,13 +137,13 @@ class RateControl:
         self._quality, self._fps = float(quality[0]), float(fps[1])
         self._rise = MAX_FIRST_RISE_PER_SECOND
         self._why: str = ""
-        self._told_fps = self._fps
+        self._reported_fps = self._fps
         self._went: float | None = None
         # frame rate of the source, frames per second; 0: unknown
         self._comes = 0.0
         self._flow = _Flow()
         self._weight = _Mean()  # size of a frame with quantization steps of 1, bytes
-        self._way = _Mean()  # seconds per byte on the way
+        self._transit = _Mean()  # seconds per byte on the way
         self._age, self._took = _Mean(), _Mean()
 
     @property
@@ -196,18 +196,18 @@ class RateControl:
         # a frame that is long on its way is counted only once
         of_late = max(seconds, took)
         self._weight.add(size * _steps(had) ** SIZE_EXPONENT, of_late)
-        self._way.add(took / size, of_late)
+        self._transit.add(took / size, of_late)
         self._age.add(age, of_late)
         self._took.add(took, of_late)
         self._follow(seconds)
 
     def _learn(self, busy: float) -> None:
         """Estimate the source's frame rate if neither the link nor this control limits it."""
-        came = self._flow.frames / self._flow.seconds
+        rate = self._flow.frames / self._flow.seconds
         if busy < BUSY_SHARE and (
-            self._fps >= self._rates[1] or came * SLOW_SOURCE_FACTOR < self._fps
+            self._fps >= self._rates[1] or rate * SLOW_SOURCE_FACTOR < self._fps
         ):
-            self._comes = came
+            self._comes = rate
 
     def _follow(self, seconds: float) -> None:
         """Move towards the target values: down at once, up slowly."""
@@ -231,25 +231,25 @@ class RateControl:
             elif self._quality >= best:
                 why = "the best quality"
         self._why = why
-        self._tell()
+        self._notify()
 
     def _wanted(self) -> tuple[float, float, str]:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
         fewest, most = self._rates
         smallest = self._bytes(self._qualities[0])
-        found: list[tuple[float, float, str]] = []
+        limits: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
             comes = min(most, max(fewest, self._comes or most))
-            found.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
+            limits.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
         if self._latency is not None:
-            size = max(1.0, (self._latency - self._age.value) / self._way.value)
-            found.append(
+            size = max(1.0, (self._latency - self._age.value) / self._transit.value)
+            limits.append(
                 (size, max(most * size / smallest, FREE_SHARE / self._took.value), "latency")
             )
-        size, _, name = min(found)
+        size, _, name = min(limits)
         if size >= smallest:
             return size, most, name
-        fps = min(fps for one, fps, _ in found if one < smallest)
+        fps = min(fps for time, fps, _ in limits if time < smallest)
         if fps < fewest:
             return size, fewest, f"{name}: no frame may be smaller, nor fewer"
         return size, min(most, fps), f"{name}, at the lowest quality"
@@ -257,10 +257,13 @@ class RateControl:
     def _bytes(self, quality: float) -> float:
         return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
 
-    def _tell(self) -> None:
-        back = self._fps == self._rates[1] != self._told_fps
-        if back or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._told_fps < LOGGED_CHANGE_FACTOR:
-            self._told_fps = self._fps
+    def _notify(self) -> None:
+        back = self._fps == self._rates[1] != self._reported_fps
+        if (
+            back
+            or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._reported_fps < LOGGED_CHANGE_FACTOR
+        ):
+            self._reported_fps = self._fps
             logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
 
 
@@ -301,5 +304,5 @@ def _check_pair(value: tuple[float, float], name: str) -> None:
     """Raise unless a value is a pair of numbers; the caller checks their range."""
     if not isinstance(value, tuple) or len(value) != 2:
         raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
-    for one in value:
-        check_number(one, name, 0, 1e9, "RateControl")
+    for number in value:
+        check_number(number, name, 0, 1e9, "RateControl")

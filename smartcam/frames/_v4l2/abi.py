@@ -183,5 +183,5 @@ def fourcc(name: str) -> int:
 def fourcc_text(code: int) -> str:
     """Return a format's four characters without spaces at the end; ``-BE`` is big endian."""
     name = (code & 0x7FFFFFFF).to_bytes(4, "little").decode("latin-1").rstrip()
-    shown = "".join(one if one.isprintable() else "?" for one in name)
+    shown = "".join(character if character.isprintable() else "?" for character in name)
     return shown + ("-BE" if code >> 31 else "")

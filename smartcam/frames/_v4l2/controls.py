@@ -80,15 +80,15 @@ class DeviceControl:
 
     def number_of(self, value: int | str) -> int | None:
         """Return the number of a value; None if the device does not accept it."""
-        found = self._read(value)
-        if found is None or self.kind == "button":
-            return found
+        number = self._read(value)
+        if number is None or self.kind == "button":
+            return number
         if self.menu:
-            return found if found in self.menu else None
+            return number if number in self.menu else None
         if self.kind == "bitmask":
-            return found if 0 <= found <= self.most & 0xFFFFFFFF else None
-        fits = self.least <= found <= self.most and (found - self.least) % max(1, self.step) == 0
-        return found if fits else None
+            return number if 0 <= number <= self.most & 0xFFFFFFFF else None
+        fits = self.least <= number <= self.most and (number - self.least) % max(1, self.step) == 0
+        return number if fits else None
 
     def _read(self, value: int | str) -> int | None:
         if not isinstance(value, str):
@@ -96,9 +96,9 @@ class DeviceControl:
         text = value.strip()
         if self.kind == "boolean" and text.lower() in SWITCHES:
             return SWITCHES[text.lower()]
-        for one, label in self.menu.items():
+        for entry, label in self.menu.items():
             if simple(label) == simple(text) and not text.isdigit():
-                return one
+                return entry
         try:
             return int(text, 0)
         except ValueError:
@@ -137,30 +137,30 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
         device.try_to(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
     except OSError as exc:
         raise failure(device.path, f"setting {control.name} to {value!r}", exc) from exc
-    got = _value(device, control.number, control.flags)
-    if got is None or control.kind == "button":
+    actual = _value(device, control.number, control.flags)
+    if actual is None or control.kind == "button":
         return number
-    if got != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
-        raise _refusal(device, control, f"set to {number}, the device has it at {got}")
-    return got
+    if actual != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
+        raise _refusal(device, control, f"set to {number}, the device has it at {actual}")
+    return actual
 
 
 def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
     """Return the driver's descriptions by name, without values, which may be slow to read."""
-    found: dict[str, tuple[Any, ...]] = {}
+    described: dict[str, tuple[Any, ...]] = {}
     number = 0
     while True:
         try:
             answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
         except OSError as exc:
             if exc.errno in (errno.EINVAL, errno.ENOTTY):  # end of the list
-                return found
+                return described
             raise failure(device.path, "listing its controls", exc) from exc
         if answer[0] <= number:  # the driver repeats controls
-            return found
+            return described
         number = answer[0]
         if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:
-            found.setdefault(simple(abi.text(answer[2])), answer)
+            described.setdefault(simple(abi.text(answer[2])), answer)
 
 
 def _unknown(device: CaptureDevice, name: str) -> FrameFeatureError:

@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from smartcam.frames._v4l2.abi import BufferLayout, Ioctl
 
 
-FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fourcc}
+FORMATS: Final = {
+    abi.fourcc(pixel_format.fourcc): pixel_format
+    for pixel_format in PIXEL_FORMATS
+    if pixel_format.fourcc
+}
 """The supported formats of V4L2."""
 
 MAX_ANSWERS: Final = 512
@@ -47,13 +51,13 @@ REASONS: Final = {
 def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
     """Return the error for a failed system call; its text lists the existing devices."""
     number = error.errno or 0
-    here = tuple(f"{one} ({name})" for one, name in system.nodes().items())
+    devices = tuple(f"{path} ({name})" for path, name in system.nodes().items())
     reason = REASONS.get(number, os.strerror(number))
-    shown = f"; here are {', '.join(here)}" if here else "; no video device is here"
+    shown = f"; here are {', '.join(devices)}" if devices else "; no video device is here"
     return FrameSourceError(
         f"{path}: {tried}: {errno.errorcode.get(number, number)}, {reason}{shown}",
         source=path,
-        available=here,
+        available=devices,
     )
 
 
@@ -153,13 +157,13 @@ class CaptureDevice:
 
     def sizes(self, code: int) -> list[tuple[int, int]]:
         """Return the sizes of a format; for a range, the smallest and the largest."""
-        found: list[tuple[int, int]] = []
+        sizes: list[tuple[int, int]] = []
         for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
             if kind == abi.DISCRETE:
-                found.append((numbers[0], numbers[1]))
+                sizes.append((numbers[0], numbers[1]))
             else:
                 return [(numbers[0], numbers[3]), (numbers[1], numbers[4])]
-        return found
+        return sizes
 
     def size_texts(self, code: int) -> list[str]:
         """Return the sizes of a format as texts."""
@@ -172,18 +176,18 @@ class CaptureDevice:
 
     def rates(self, code: int, width: int, height: int) -> list[float]:
         """Return the frame rates, fastest first; for a range, the fastest and the slowest."""
-        found: list[float] = []
-        asked = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
-        for _, _, _, _, kind, *numbers in asked:
+        rates: list[float] = []
+        answers = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
+        for _, _, _, _, kind, *numbers in answers:
             last = 2 if kind == abi.DISCRETE else 4
-            found += [
+            rates += [
                 numbers[place + 1] / numbers[place]
                 for place in range(0, last, 2)
                 if numbers[place] and numbers[place + 1]
             ]
             if kind != abi.DISCRETE:
                 break
-        return sorted(found, reverse=True)
+        return sorted(rates, reverse=True)
 
     # settings
 
@@ -205,10 +209,10 @@ class CaptureDevice:
             )
         )  # fmt: skip
         self._compare(code, wanted.size, layout)
-        found = self._coloured(FORMATS[code], layout)
-        return Setting(found, layout, self._rate(wanted.rate, layout))
+        pixel_format = self._coloured(FORMATS[code], layout)
+        return Setting(pixel_format, layout, self._rate(wanted.rate, layout))
 
-    def _coloured(self, found: PixelFormat, layout: BufferLayout) -> PixelFormat:
+    def _coloured(self, pixel_format: PixelFormat, layout: BufferLayout) -> PixelFormat:
         """Return the format with the device's matrix and range.
 
         Raises:
@@ -216,11 +220,11 @@ class CaptureDevice:
         """
         is_extended = layout.private == abi.PRIVATE_MAGIC
         encoding, quantization = (layout.ycbcr_enc, layout.quantization) if is_extended else (0, 0)
-        if found.name in ("RGB8", "BGR8"):
+        if pixel_format.name in ("RGB8", "BGR8"):
             limited = quantization == abi.LIMITED_RANGE
-            return find_format(f"{found.name}_limited") if limited else found
-        if not isinstance(found.layout, YuvPairs | Planes):
-            return found
+            return find_format(f"{pixel_format.name}_limited") if limited else pixel_format
+        if not isinstance(pixel_format.layout, YuvPairs | Planes):
+            return pixel_format
         by_default = abi.MATRIX_OF_COLORSPACE.get(layout.colorspace, "601")
         matrix = abi.MATRIX_OF_ENCODING.get(encoding, by_default)
         jpeg = quantization == 0 and layout.colorspace == abi.COLORSPACE_JPEG
@@ -231,24 +235,28 @@ class CaptureDevice:
                 f"those of {matrix} (color space {layout.colorspace}, encoding {encoding})",
                 source=self.path,
             )
-        return with_matrix(found, matrix + full)
+        return with_matrix(pixel_format, matrix + full)
 
     def _check(self) -> None:
         """Check that the device captures pictures in a supported way."""
-        one = self.capability
-        does = one.device_caps if one.capabilities & abi.CAP_DEVICE_CAPS else one.capabilities
+        capability = self.capability
+        does = (
+            capability.device_caps
+            if capability.capabilities & abi.CAP_DEVICE_CAPS
+            else capability.capabilities
+        )
         if does & abi.CAP_VIDEO_CAPTURE and does & abi.CAP_STREAMING:
             return
         kind = next(
             (name for bit, name in _OTHER_KINDS.items() if does & bit),
             "no camera: it captures no pictures, or does not stream them",
         )
-        here = tuple(f"{path} ({name})" for path, name in system.nodes().items())
+        devices = tuple(f"{path} ({name})" for path, name in system.nodes().items())
         raise FrameSourceError(
             f"{self.path}: expected a camera, got {self.identity[0]!r}, which is {kind}; "
-            f"here are {', '.join(here)}",
+            f"here are {', '.join(devices)}",
             source=self.path,
-            available=here,
+            available=devices,
         )
 
     @staticmethod
@@ -262,7 +270,7 @@ class CaptureDevice:
     def _code(self, wanted: PixelFormat | None, current: int) -> int:
         """Return the fourcc to stream."""
         if wanted is None:
-            known = [one for one in (current, *self.formats()) if one in FORMATS]
+            known = [code for code in (current, *self.formats()) if code in FORMATS]
         else:
             known = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
         if not known:
@@ -270,28 +278,29 @@ class CaptureDevice:
         return known[0]
 
     def _no_format(self, expected: str) -> FrameFormatError:
-        there = tuple(_named(one) for one in self.formats())
+        offered = tuple(_named(code) for code in self.formats())
         return FrameFormatError(
-            f"{self.path}: expected {expected}, it has {', '.join(there) or 'none'}",
+            f"{self.path}: expected {expected}, it has {', '.join(offered) or 'none'}",
             source=self.path,
-            available=there,
+            available=offered,
         )
 
-    def _compare(self, code: int, size: tuple[int, int] | None, got: BufferLayout) -> None:
+    def _compare(self, code: int, size: tuple[int, int] | None, actual: BufferLayout) -> None:
         """Check that the device applied the setting."""
-        if got.fourcc != code:
+        if actual.fourcc != code:
             raise self._no_format(_named(code))
-        if size is not None and size != (got.width, got.height):
-            there = tuple(self.size_texts(code))
+        if size is not None and size != (actual.width, actual.height):
+            offered = tuple(self.size_texts(code))
             raise FrameFormatError(
                 f"{self.path}: expected {_named(code)} {size[0]}x{size[1]}, the device took "
-                f"{got.width}x{got.height}; it has {', '.join(there) or 'no list of sizes'}",
+                f"{actual.width}x{actual.height}; it has "
+                f"{', '.join(offered) or 'no list of sizes'}",
                 source=self.path,
-                available=there,
+                available=offered,
             )
-        if got.field not in abi.WHOLE_FIELDS:
+        if actual.field not in abi.WHOLE_FIELDS:
             raise FrameFormatError(
-                f"{self.path}: expected whole pictures, it has fields (kind {got.field}), half "
+                f"{self.path}: expected whole pictures, it has fields (kind {actual.field}), half "
                 "the rows each",
                 source=self.path,
             )
@@ -309,20 +318,22 @@ class CaptureDevice:
             if exc.errno not in (errno.ENOTTY, errno.EINVAL):
                 raise failure(self.path, "setting its rate", exc) from exc
             can = over = under = 0
-        got = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
-        if wanted is not None and (got is None or abs(got - wanted) > wanted * MAX_RATE_DEVIATION):
-            there = tuple(
-                f"{one:g}/s" for one in self.rates(layout.fourcc, layout.width, layout.height)
+        actual = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
+        if wanted is not None and (
+            actual is None or abs(actual - wanted) > wanted * MAX_RATE_DEVIATION
+        ):
+            offered = tuple(
+                f"{rate:g}/s" for rate in self.rates(layout.fourcc, layout.width, layout.height)
             )
             raise FrameFormatError(
                 f"{self.path}: expected {wanted:g} frames/s of {_named(layout.fourcc)} "
                 f"{layout.width}x{layout.height}, the device took "
-                f"{'an unknown rate' if got is None else f'{got:g}'}; it has "
-                f"{', '.join(there) or 'no list of rates'}",
+                f"{'an unknown rate' if actual is None else f'{actual:g}'}; it has "
+                f"{', '.join(offered) or 'no list of rates'}",
                 source=self.path,
-                available=there,
+                available=offered,
             )
-        return got
+        return actual
 
 
 _OTHER_KINDS: Final = {

@@ -19,8 +19,8 @@ def find() -> list[FoundSource]:
 
     Devices of metadata or codecs are left out, since they capture no pictures.
     """
-    found = [_look(path, name) for path, name in system.nodes().items()]
-    return [one for one in found if one is not None]
+    devices = [_look(path, name) for path, name in system.nodes().items()]
+    return [device for device in devices if device is not None]
 
 
 def _look(path: str, name: str) -> FoundSource | None:
@@ -35,7 +35,7 @@ def _look(path: str, name: str) -> FoundSource | None:
     with closing(device):
         try:
             formats = device.formats()
-            known = tuple(one for code in formats for one in _formats(device, code))
+            known = tuple(format_ for code in formats for format_ in _formats(device, code))
         except FrameSourceError as exc:
             return FoundSource(url, name, remark=str(exc))
     others = [abi.fourcc_text(code) for code in formats if code not in FORMATS]

@@ -165,7 +165,7 @@ class V4L2Driver(FrameDriver):
         if watched is not None:
             asyncio.get_running_loop().remove_reader(watched)
 
-    async def _do(self, job: Callable[[], Value], what: str) -> Value:
+    async def _do(self, job: Callable[[], Value], label: str) -> Value:
         """Run a job in the thread, in the order of the calls.
 
         Cancellation: the job runs nevertheless, and the next :meth:`stop` cleans up.
@@ -177,7 +177,7 @@ class V4L2Driver(FrameDriver):
         finished, _ = await asyncio.wait([done], timeout=DEVICE_TIMEOUT)
         if not finished:
             raise FrameSourceError(
-                f"{self.name}: the device did not {what} within {DEVICE_TIMEOUT:g} s",
+                f"{self.name}: the device did not {label} within {DEVICE_TIMEOUT:g} s",
                 source=self.name,
             )
         return done.result()
@@ -190,8 +190,9 @@ class V4L2Driver(FrameDriver):
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        asked = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
-        self._wanted = WantedSetting(asked, size, self._wanted.rate)  # keep the device's choice
+        asked_format = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
+        # keep the device's choice
+        self._wanted = WantedSetting(asked_format, size, self._wanted.rate)
         return StreamFormat(setting.format, *size, rates)
 
     def _begin(self) -> CaptureStream:
@@ -223,14 +224,14 @@ class V4L2Driver(FrameDriver):
             return job(device)
 
     def _another(self, device: CaptureDevice) -> FrameSourceError:
-        expected, got = (
-            "nothing" if one is None else " at ".join(one)
-            for one in (self._identity, device.identity)
+        expected, actual = (
+            "nothing" if identity is None else " at ".join(identity)
+            for identity in (self._identity, device.identity)
         )
         return FrameSourceError(
-            f"{self.name}: expected {expected}, as when it was opened, got {got}",
+            f"{self.name}: expected {expected}, as when it was opened, got {actual}",
             source=self.name,
-            available=(got,),
+            available=(actual,),
         )
 
 

@@ -78,8 +78,8 @@ class ControlFeature:
     def __init__(self, control: DeviceControl) -> None:
         self.control = control
         known = SFNC.get(control.number)
-        self._known = known or SfncFeature(control.name)
-        entries = dict(self._known.entries)
+        self._sfnc_feature = known or SfncFeature(control.name)
+        entries = dict(self._sfnc_feature.entries)
         if self.name == "ExposureAuto" and 0 not in control.menu:
             entries[APERTURE_PRIORITY] = entries.pop(0)
         values = control.menu or entries
@@ -88,7 +88,7 @@ class ControlFeature:
     @property
     def name(self) -> str:
         """Name of the feature."""
-        return self._known.name
+        return self._sfnc_feature.name
 
     @property
     def spellings(self) -> set[str]:
@@ -103,7 +103,9 @@ class ControlFeature:
             return self._entries.get(number, str(number))
         if self.control.kind == "boolean":
             return bool(number)
-        return number if self._known.factor == 1 else float(number * self._known.factor)
+        return (
+            number if self._sfnc_feature.factor == 1 else float(number * self._sfnc_feature.factor)
+        )
 
     def number(self, value: FeatureValue) -> int | None:
         """Return the control's number for a value; None: the device has no such value."""
@@ -111,12 +113,12 @@ class ControlFeature:
             wanted = spelled(str(value))
             names = self._entries.items()
             return next((number for number, name in names if spelled(name) == wanted), None)
-        if isinstance(value, float) and self._known.factor == 1:
+        if isinstance(value, float) and self._sfnc_feature.factor == 1:
             return self.control.number_of(int(value)) if value.is_integer() else None
-        if not isinstance(value, float) and self._known.factor == 1:
+        if not isinstance(value, float) and self._sfnc_feature.factor == 1:
             return self.control.number_of(value)
         try:
-            number = round(float(value) / self._known.factor)
+            number = round(float(value) / self._sfnc_feature.factor)
         except (ValueError, OverflowError):
             return None
         inside = self.control.least <= number <= self.control.most
@@ -132,7 +134,7 @@ class ControlFeature:
         elif control.flags & abi.CTRL_WRITE_ONLY or control.kind == "button":
             access = "wo"
         kind: FeatureKind = "enumeration" if self._entries else _KINDS[control.kind]
-        factor = self._known.factor
+        factor = self._sfnc_feature.factor
         if factor != 1:
             kind = "float"
         ranged = kind in ("integer", "float") and control.kind != "bitmask"
@@ -144,7 +146,7 @@ class ControlFeature:
             minimum=control.least * factor if ranged else None,
             maximum=control.most * factor if ranged else None,
             step=max(1, control.step) * factor if ranged else None,
-            unit=self._known.unit,
+            unit=self._sfnc_feature.unit,
             entries=tuple(self._entries.values()),
             description=f"V4L2 control {control.name}",
         )
@@ -161,54 +163,54 @@ class V4L2Features(DeviceFeatures):
         self._driver = driver
 
     async def _all(self) -> list[ControlFeature]:
-        return [ControlFeature(one) for one in (await self._driver.controls()).values()]
+        return [ControlFeature(control) for control in (await self._driver.controls()).values()]
 
     async def names(self) -> list[str]:
         """Return the names of all features."""
-        return [one.name for one in await self._all()]
+        return [feature.name for feature in await self._all()]
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
-        return {one.name: one.described() for one in await self._all()}
+        return {feature.name: feature.described() for feature in await self._all()}
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
-        return (await self._found(name)).described()
+        return (await self._feature_named(name)).described()
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""
-        found = await self._found(name)
-        value = found.value(found.control.value)
+        feature = await self._feature_named(name)
+        value = feature.value(feature.control.value)
         if value is None:
-            raise self._wrong(found, "it has no value that can be read")
+            raise self._wrong(feature, "it has no value that can be read")
         return value
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a feature; return the device's new value."""
-        found = await self._found(name)
-        if found.control.kind == "button":
-            raise self._wrong(found, "it is a command: it is executed")
-        number = found.number(value)
+        feature = await self._feature_named(name)
+        if feature.control.kind == "button":
+            raise self._wrong(feature, "it is a command: it is executed")
+        number = feature.number(value)
         if number is None:
-            raise self._wrong(found, f"expected {found.described().range}, got {value!r}")
-        has = await self._driver.set_control(found.control.name, number)
-        got = found.value(has)
-        return value if got is None else got
+            raise self._wrong(feature, f"expected {feature.described().range}, got {value!r}")
+        has = await self._driver.set_control(feature.control.name, number)
+        actual = feature.value(has)
+        return value if actual is None else actual
 
     async def execute(self, name: str) -> None:
         """Execute a command."""
-        found = await self._found(name)
-        if found.control.kind != "button":
-            raise self._wrong(found, "it is no command: it is set")
-        await self._driver.set_control(found.control.name, 1)
+        feature = await self._feature_named(name)
+        if feature.control.kind != "button":
+            raise self._wrong(feature, "it is no command: it is set")
+        await self._driver.set_control(feature.control.name, 1)
 
-    async def _found(self, name: str) -> ControlFeature:
+    async def _feature_named(self, name: str) -> ControlFeature:
         features = await self._all()
         wanted = spelled(name)
-        for one in features:
-            if wanted in one.spellings:
-                return one
-        names = [one.name for one in features]
+        for feature in features:
+            if wanted in feature.spellings:
+                return feature
+        names = [feature.name for feature in features]
         raise FrameFeatureError(
             f"{self._driver.name}: it has no feature {name!r}{did_you_mean(name, names)}; it has "
             f"{', '.join(names) or 'none'}",
@@ -216,9 +218,9 @@ class V4L2Features(DeviceFeatures):
             available=tuple(names),
         )
 
-    def _wrong(self, found: ControlFeature, text: str) -> FrameFeatureError:
+    def _wrong(self, feature: ControlFeature, text: str) -> FrameFeatureError:
         return FrameFeatureError(
-            f"{self._driver.name}: feature {found.name}: {text}",
+            f"{self._driver.name}: feature {feature.name}: {text}",
             source=self._driver.name,
-            available=(str(found.described()),),
+            available=(str(feature.described()),),
         )

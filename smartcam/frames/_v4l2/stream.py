@@ -133,9 +133,9 @@ class CaptureStream:
         return steps
 
     def _no_pictures(self, full: FilledBuffer) -> FrameFormatError:
-        came = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
+        content = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
         return FrameFormatError(
             f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
-            f"{self._least} bytes or more, got {came} {self._bad} times in a row",
+            f"{self._least} bytes or more, got {content} {self._bad} times in a row",
             source=self._name,
         )

@@ -43,8 +43,8 @@ def pages(device: int, length: int, offset: int) -> mmap.mmap:
 
 def nodes() -> dict[str, str]:
     """Return the names of the existing video devices by path; none is opened."""
-    found = sorted(SYSFS.glob("video*"), key=lambda one: (len(one.name), one.name))
-    return {f"/dev/{one.name}": _name(one) for one in found}
+    paths = sorted(SYSFS.glob("video*"), key=lambda path: (len(path.name), path.name))
+    return {f"/dev/{path.name}": _name(path) for path in paths}
 
 
 def now() -> float:

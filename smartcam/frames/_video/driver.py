@@ -330,8 +330,8 @@ def _split(address: FrameAddress) -> tuple[str, str]:
         if address.host not in ("", "localhost"):
             raise address.wrong("file", "file:///PATH, or the path alone", address.shown)
         return address.path, address.fragment
-    found = re.fullmatch(r"(.*)#(\w+=[^#/]*)", address.path, re.DOTALL)
-    return (found[1], found[2]) if found else (address.path, "")
+    match = re.fullmatch(r"(.*)#(\w+=[^#/]*)", address.path, re.DOTALL)
+    return (match[1], match[2]) if match else (address.path, "")
 
 
 def _name(address: FrameAddress, path: str) -> str:
@@ -345,12 +345,12 @@ def wanted_format(address: FrameAddress, given: str | None) -> PixelFormat | Non
     if given is None:
         return None
     try:
-        found = find_format(given)
+        pixel_format = find_format(given)
     except FrameFormatError:
-        found = None
-    if found is None or found.name not in known:
+        pixel_format = None
+    if pixel_format is None or pixel_format.name not in known:
         raise address.wrong("format", f"one of {', '.join(known)}", given)
-    return found
+    return pixel_format
 
 
 def one_of(address: FrameAddress, name: str, given: dict[str, str], known: tuple[str, ...]) -> str:

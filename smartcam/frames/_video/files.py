@@ -251,8 +251,8 @@ class VideoReading(PictureReading):
             raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
         stream = streams[0]
         if stream.codec_context is None:
-            got = self._container.format.long_name
-            raise self.plan.wrong(f"expected video that FFmpeg decodes here, got {got}")
+            actual = self._container.format.long_name
+            raise self.plan.wrong(f"expected video that FFmpeg decodes here, got {actual}")
         stream.codec_context.thread_count = 1  # more threads delay frames
         if stream.codec_context.name not in _EXPLODES_AT_TAGS:
             stream.codec_context.options = {"err_detect": "explode"}  # refuse incomplete pictures
@@ -285,12 +285,12 @@ class VideoReading(PictureReading):
                     "expected a picture, got bytes that make no picture for "
                     f"{self.plan.timeout:g} s"
                 )
-            asked = time.monotonic()
+            asked_at = time.monotonic()
             packet = self._tried(lambda: next(self._packets, None))
             if packet is None:
                 self._end()
                 return None
-            self._take(packet, self._arrival(asked, time.monotonic()))
+            self._take(packet, self._arrival(asked_at, time.monotonic()))
         if not self._pictures or self.stopped.is_set():
             return None
         picture, arrived = self._pictures.popleft()
@@ -301,11 +301,11 @@ class VideoReading(PictureReading):
         clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
         return ReadPicture(self._pixels(picture), at, arrived, lost, clock)
 
-    def _arrival(self, asked: float, now: float) -> float:
+    def _arrival(self, asked_at: float, now: float) -> float:
         """Return a packet's arrival, or the earliest possible time if FFmpeg buffered it."""
         if self._is_buffered:
             drained = now - self._open_from > self._open_from - self._began
-            self._is_buffered = not drained and now - asked < UNBUFFERED_WAIT_TIME
+            self._is_buffered = not drained and now - asked_at < UNBUFFERED_WAIT_TIME
         return self._began if self._is_buffered else now
 
     def _end(self) -> None:
@@ -324,20 +324,20 @@ class VideoReading(PictureReading):
                 self._lost += self._given_any
             elif packet.size:
                 filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
-                self._pictures.extend((one, arrived) for one in filtered)
+                self._pictures.extend((picture, arrived) for picture in filtered)
             return
         damaged = bool(packet.is_corrupt)
         try:
             pictures = packet.decode()
         except load("av").FFmpegError as exc:
             damaged, pictures, self._failed = True, [], _reason(exc)
-        whole = [picture for picture in pictures if not picture.is_corrupt]
-        if damaged or len(whole) < len(pictures):
+        intact = [picture for picture in pictures if not picture.is_corrupt]
+        if damaged or len(intact) < len(pictures):
             self._lost += self._given_any  # a stream may begin midway
             if self._stream.codec_context.name not in _ONE_BY_ONE:
-                whole = []
+                intact = []
                 self._stream.codec_context.flush_buffers()  # dependent pictures are dropped
-        self._pictures.extend((picture, arrived) for picture in whole)
+        self._pictures.extend((picture, arrived) for picture in intact)
 
     def _pixels(self, picture: Any) -> Pixels:
         wanted = self.plan.format
@@ -414,11 +414,11 @@ class PictureFiles(PictureReading):
         if is_jpegxl(path):
             return ReadPicture(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
-        one = VideoReading(plan)
+        reading = VideoReading(plan)
         try:
-            read = one.read()
+            read = reading.read()
         finally:
-            one.close()
+            reading.close()
         return None if read is None else read._replace(time=None)
 
     def close(self) -> None:
@@ -431,8 +431,8 @@ def picture_files(path: str) -> list[str]:
     if Path(path).is_file():
         return [path]
     if Path(path).is_dir():
-        found = [str(one) for one in Path(path).iterdir() if one.suffix.lower() in PICTURES]
-        return sorted(found, key=natural)
+        paths = [str(path) for path in Path(path).iterdir() if path.suffix.lower() in PICTURES]
+        return sorted(paths, key=natural)
     return sorted(glob.glob(path), key=natural)  # noqa: PTH207 - a pattern with its folder in one string
 
 

@@ -63,7 +63,7 @@ CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
 """Formats of conversion on request, with FFmpeg's names."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
-_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
+_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # PyAV's names
 BT709, BT601, BT2020 = 1, 6, 9  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M, AVCOL_SPC_BT2020_NCL
 
 MATRIX_OF_SPACE: Final = {
@@ -141,21 +141,21 @@ def from_video(video: Any, *, apart: bool = False) -> Pixels:
         return _with_alpha(video)
     if name not in _SAMPLES and name not in _YUV:
         video = _repacked(video)
-    found = format_of(video.format.name, video.color_range, video.colorspace)
+    pixel_format = format_of(video.format.name, video.color_range, video.colorspace)
     planes = video.planes
     stride = planes[0].line_size
     if len(planes) == 1:
         data = memoryview(planes[0]).toreadonly()
-        return Pixels(found, video.width, video.height, stride, data)
-    layout = found.layout
+        return Pixels(pixel_format, video.width, video.height, stride, data)
+    layout = pixel_format.layout
     fits = isinstance(layout, Planes) and all(
         plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
     )
     if fits:
         joined: Any = PlanesApart(planes) if apart else b"".join(planes)
-        return Pixels(found, video.width, video.height, stride, joined)
-    joined = b"".join(_tight(plane, found) for plane in planes)
-    return Pixels(found, video.width, video.height, found.stride(video.width), joined)
+        return Pixels(pixel_format, video.width, video.height, stride, joined)
+    joined = b"".join(_tight(plane, pixel_format) for plane in planes)
+    return Pixels(pixel_format, video.width, video.height, pixel_format.stride(video.width), joined)
 
 
 def _repacked(video: Any) -> Any:
@@ -182,8 +182,8 @@ def _wider_grey(name: str, deep: int) -> str:
 def _with_supported_subsampling(video: Any, deep: int, *, alpha: bool) -> Any:
     """Return the frame with a supported chroma subsampling."""
     kind, size = video.format, (video.width, video.height)
-    across, down = (round(one / part) for one, part in zip(size, _chroma(video), strict=True))
-    bits = next(one for one in (8, 10, 12, 16) if deep <= one)
+    across, down = (round(side / part) for side, part in zip(size, _chroma(video), strict=True))
+    bits = next(bits for bits in (8, 10, 12, 16) if deep <= bits)
     end = "" if bits == 8 else f"{bits}le"
     digits = _SUBSAMPLING.get((across, down))
     if alpha and kind.name not in _TRANSPARENT:
@@ -203,10 +203,10 @@ def _with_supported_subsampling(video: Any, deep: int, *, alpha: bool) -> Any:
 
 def _chroma(video: Any) -> tuple[float, float]:
     """Return the ratios of the sizes of U and V to Y, measured on a large picture."""
-    kind, whole = video.format, 1 << 10
+    kind, one_unit = video.format, 1 << 10
     return (
-        video.width * kind.chroma_width(whole) / whole,
-        video.height * kind.chroma_height(whole) / whole,
+        video.width * kind.chroma_width(one_unit) / one_unit,
+        video.height * kind.chroma_height(one_unit) / one_unit,
     )
 
 
@@ -234,7 +234,11 @@ def converted(video: Any, name: str) -> Any:
     """
     kind, width = video.format, video.width
     wide = -(-width // RIGHT_WIDTH) * RIGHT_WIDTH
-    padded = wide != width and not kind.has_palette and max(one.bits for one in kind.components) > 8
+    padded = (
+        wide != width
+        and not kind.has_palette
+        and max(component.bits for component in kind.components) > 8
+    )
     try:
         made = (_resized(video, wide) if padded else video).reformat(format=name)
     except (OSError, ValueError) as exc:
@@ -278,19 +282,19 @@ def _rows(plane: Any) -> NDArray[np.uint8]:
     return rows[:, : plane.width]
 
 
-def _tight(plane: Any, found: PixelFormat) -> bytes:
+def _tight(plane: Any, pixel_format: PixelFormat) -> bytes:
     """Return the rows of a plane without padding."""
-    layout: Any = found.layout
+    layout: Any = pixel_format.layout
     size = layout.size_of * (2 if layout.interleaved and plane.index else 1)
     rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return rows[:, : plane.width * size].tobytes()
 
 
 @lru_cache(maxsize=256)  # called for each frame
-def colour_properties(found: PixelFormat) -> tuple[int, int]:
+def colour_properties(pixel_format: PixelFormat) -> tuple[int, int]:
     """Return AVColorRange and AVColorSpace of a format."""
-    matrix = getattr(found.layout, "matrix", "601 full")  # without a matrix: grey or RGB
-    space = next((one for one in (BT709, BT2020) if MATRIX_OF_SPACE[one] in matrix), BT601)
+    matrix = getattr(pixel_format.layout, "matrix", "601 full")  # without a matrix: grey or RGB
+    space = next((space for space in (BT709, BT2020) if MATRIX_OF_SPACE[space] in matrix), BT601)
     return FULL if matrix.endswith("full") else LIMITED, space
 
 
@@ -309,7 +313,11 @@ def to_video(frame: Frame, before: Any = None) -> Any:
     """
     name = _encodable(frame.format)
     if name is None:
-        known = tuple(one.name for one in PIXEL_FORMATS if _encodable(one) is not None)
+        known = tuple(
+            pixel_format.name
+            for pixel_format in PIXEL_FORMATS
+            if _encodable(pixel_format) is not None
+        )
         raise FrameFormatError(
             f"{frame.source}: {frame.format.name} cannot become video as it is; what can: "
             f"{', '.join(known)}; see Codecs.converted",
@@ -327,10 +335,10 @@ def to_video(frame: Frame, before: Any = None) -> Any:
     video = _filled(frame, name)
     if name in ("yuv420p", "nv12"):
         return video
-    kept, space = colour_properties(frame.format)
-    to = LIMITED if name in ("rgb24", "bgr24") else kept
+    properties, space = colour_properties(frame.format)
+    to = LIMITED if name in ("rgb24", "bgr24") else properties
     made = video.reformat(
-        format="yuv420p", src_color_range=_RANGES[kept], dst_color_range=_RANGES[to]
+        format="yuv420p", src_color_range=_RANGES[properties], dst_color_range=_RANGES[to]
     )
     made.color_range, made.colorspace = to, space
     return made
@@ -347,7 +355,11 @@ def to_lossless_video(frame: Frame) -> Any:
     """
     name = _lossless(frame.format)
     if name is None:
-        known = tuple(one.name for one in PIXEL_FORMATS if _lossless(one) is not None)
+        known = tuple(
+            pixel_format.name
+            for pixel_format in PIXEL_FORMATS
+            if _lossless(pixel_format) is not None
+        )
         raise FrameFormatError(
             f"{frame.source}: {frame.format.name} cannot become a video without loss; what can: "
             f"{', '.join(known)}",
@@ -374,31 +386,31 @@ _REPACKED: Final = {
 """Formats of FFV1 that hold the same values in another order."""
 
 
-def _lossless(found: PixelFormat) -> str | None:
+def _lossless(pixel_format: PixelFormat) -> str | None:
     """Return FFmpeg's name for the unpacked values of a format, if a video can express them."""
-    layout = found.layout
-    if found.name.startswith("Mono"):
-        return "gray" if found.depth == 8 else f"gray{_DEPTHS[found.depth]}le"
+    layout = pixel_format.layout
+    if pixel_format.name.startswith("Mono"):
+        return "gray" if pixel_format.depth == 8 else f"gray{_DEPTHS[pixel_format.depth]}le"
     if isinstance(layout, Planes) and layout.depth > 8:
         digits = _SUBSAMPLING[layout.across, layout.down]
         return f"yuv{digits}p{layout.depth}le"
-    if found.name in ("RGBa8", "BGRa8"):
-        return "rgba" if found.name == "RGBa8" else "bgra"
-    return _encodable(found)
+    if pixel_format.name in ("RGBa8", "BGRa8"):
+        return "rgba" if pixel_format.name == "RGBa8" else "bgra"
+    return _encodable(pixel_format)
 
 
 _DEPTHS: Final = {10: 10, 12: 12, 14: 16, 16: 16}
 """Bits of FFV1's grey format, by bits of a sample."""
 
 
-def _encodable(found: PixelFormat) -> str | None:
+def _encodable(pixel_format: PixelFormat) -> str | None:
     """Return FFmpeg's name for the bytes of a format that can become video, or None."""
-    layout = found.layout
+    layout = pixel_format.layout
     if isinstance(layout, YuvPairs):
         return "uyvy422" if layout.y else "yuyv422"
     if isinstance(layout, Planes) and layout.depth == 8:
         return "nv12" if layout.interleaved else f"yuv{_SUBSAMPLING[layout.across, layout.down]}p"
-    return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(found.name)
+    return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(pixel_format.name)
 
 
 def _new(width: int, height: int, name: str) -> Any:
@@ -445,5 +457,5 @@ def _fill(plane: Any, rows: Any) -> None:
     if rows.flags.c_contiguous and rows.nbytes == plane.buffer_size:
         plane.update(rows)  # a single copy
         return
-    whole = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-    whole[: rows.shape[0], : rows.shape[1]] = rows
+    plane_rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    plane_rows[: rows.shape[0], : rows.shape[1]] = rows

@@ -53,7 +53,7 @@ class PictureCutter:
     def __init__(self) -> None:
         self.damaged = 0
         self._data = bytearray()
-        self._seen = 0  # number of examined bytes
+        self._searched = 0  # number of examined bytes
         self._between = 0
         self._begun = self._in_scan = self._over = False
         self._length: int | None = None  # length of the current picture from the header of its part
@@ -78,21 +78,21 @@ class PictureCutter:
             else:
                 self.damaged += 1
                 del self._data[: max(-end, len(START))]
-            self._seen = 0
+            self._searched = 0
 
     def _begins(self) -> bool:
         """Find the next picture; bytes before it are dropped."""
-        place = self._data.find(START, self._seen)
+        place = self._data.find(START, self._searched)
         if place < 0:
-            self._seen = max(0, len(self._data) - 1)
-            surplus = max(0, self._seen - MAX_HEAD_BYTES)
+            self._searched = max(0, len(self._data) - 1)
+            surplus = max(0, self._searched - MAX_HEAD_BYTES)
             self._drop(surplus)
-            self._seen -= surplus
+            self._searched -= surplus
             return False
-        found = _LENGTH.findall(self._data[max(0, place - MAX_HEAD_BYTES) : place])
-        self._length = int(found[-1]) if found else None
+        lengths = _LENGTH.findall(self._data[max(0, place - MAX_HEAD_BYTES) : place])
+        self._length = int(lengths[-1]) if lengths else None
         self._drop(place)
-        self._begun, self._in_scan, self._seen = True, False, len(START)
+        self._begun, self._in_scan, self._searched = True, False, len(START)
         return True
 
     def _drop(self, count: int) -> None:
@@ -111,7 +111,7 @@ class PictureCutter:
                 return self._length
             if after < 0 or self._over:
                 return after
-            self._seen = after
+            self._searched = after
         if self._length is not None and self._ends_at_length():
             return self._length
         if len(self._data) > MAX_PICTURE_BYTES:
@@ -128,23 +128,23 @@ class PictureCutter:
 
         Encoded data after the header of a scan are skipped.
         """
-        data, at = self._data, self._seen
+        data, at = self._data, self._searched
         if self._in_scan:
-            found = _NEXT_MARKER.search(data, at)
-            self._seen = at = found.start() if found else max(at, len(data) - 1)
-            self._in_scan = found is None
-            if found is None:
+            match = _NEXT_MARKER.search(data, at)
+            self._searched = at = match.start() if match else max(at, len(data) - 1)
+            self._in_scan = match is None
+            if match is None:
                 return None
         while data[at : at + 2] == b"\xff\xff":
             at += 1
         if len(data) > at + 1 and (data[at] != 0xFF or not data[at + 1]):  # as some webcams send
             if data.find(PICTURE_START, len(START), at + len(PICTURE_START) - 1) >= 0:
                 return -at  # a cut segment ran into another picture
-            found = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
-            if found is None:
+            match = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
+            if match is None:
                 return None if len(data) < at + MAX_STRAY_BYTES else -at
-            at = found.start()
-        self._seen = at
+            at = match.start()
+        self._searched = at
         self._over = data[at : at + 2] == END
         if self._over:
             return at + 2

@@ -60,7 +60,7 @@ def follow_redirects(
     end = time.monotonic() + timeout
     for _ in range(MAX_REDIRECTS):
         try:
-            answer = _asked(urlsplit(url), end, tls)
+            answer = _first_answer(urlsplit(url), end, tls)
         except TimeoutError:
             text = f"{name}: expected an answer, got none within {timeout:g} s"
             raise FrameSourceError(text, source=name) from None
@@ -98,11 +98,11 @@ def followed(url: str, location: str, peer: str, name: str) -> str:
     before = urlsplit(url)
     try:
         after = urlsplit(urljoin(url, location))
-        there, here = _place(after), _place(before)
+        target, source = _place(after), _place(before)
     except ValueError:
-        after, there, here = before, None, None
-    hosts = {here[1], peer} if here is not None else set[str]()
-    if there is None or here is None or there[::2] != here[::2] or there[1] not in hosts:
+        after, target, source = before, None, None
+    hosts = {source[1], peer} if source is not None else set[str]()
+    if target is None or source is None or target[::2] != source[::2] or target[1] not in hosts:
         raise FrameSourceError(
             f"{name}: expected pictures, or a redirect on the same host and port, got one to "
             f"{re.sub('//[^/]*@', '//***@', location)[:200]!r}; #elsewhere=yes follows it",
@@ -117,7 +117,7 @@ def _place(parts: SplitResult) -> tuple[str, str, int]:
     return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
 
 
-def _asked(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
+def _first_answer(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
     """Send FFmpeg's first requests; return the first redirect, or the last answer.
 
     Raises:
@@ -177,7 +177,7 @@ def _authorization(
             request = urllib.request.Request(plain.geturl(), method=method)  # noqa: S310 - not sent
             if method != "GET":
                 request.selector = plain.geturl()
-            words = (one.partition("=") for one in urllib.request.parse_http_list(text))
+            words = (parameter.partition("=") for parameter in urllib.request.parse_http_list(text))
             parts = {key: value.removeprefix('"').removesuffix('"') for key, _, value in words}
             made = urllib.request.HTTPDigestAuthHandler(passwords).get_authorization(request, parts)
             return f"Authorization: Digest {made}" if made else ""
@@ -214,14 +214,14 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
     head = bytearray()  # without carriage returns
     size = 0
     while True:
-        came = _receive(link, end, size)
-        size += len(came)
+        received = _receive(link, end, size)
+        size += len(received)
         begin = max(0, len(head) - 1)
-        head += came.replace(b"\r", b"")
-        found = head.find(b"\n\n", begin)
-        if found >= 0:
+        head += received.replace(b"\r", b"")
+        end_of_head = head.find(b"\n\n", begin)
+        if end_of_head >= 0:
             break
-    status, *lines = head[:found].decode("latin-1").split("\n")
+    status, *lines = head[:end_of_head].decode("latin-1").split("\n")
     headers: dict[str, list[str]] = {}
     for line in lines:
         key, _, value = line.partition(":")
@@ -230,12 +230,12 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
     if not web:
         left = int(headers.get("content-length", ("0",))[0])
         # the last piece also holds the begin of the body, with carriage returns
-        lines_of_head = came.count(b"\n") - head.count(b"\n", found + 2)
-        left -= len(came.split(b"\n", lines_of_head)[-1])
+        lines_of_head = received.count(b"\n") - head.count(b"\n", end_of_head + 2)
+        left -= len(received.split(b"\n", lines_of_head)[-1])
         while left > 0:
-            came = _receive(link, end, size)
-            size += len(came)
-            left -= len(came)
+            received = _receive(link, end, size)
+            size += len(received)
+            left -= len(received)
     return answer
 
 
@@ -246,7 +246,7 @@ def _receive(link: socket.socket, end: float, before: int) -> bytes:
         OSError, ValueError: there are no bytes, or too many.
     """
     link.settimeout(_left(end))
-    came = link.recv(4096)
-    if not came or before + len(came) > MAX_HEAD_BYTES:
+    received = link.recv(4096)
+    if not received or before + len(received) > MAX_HEAD_BYTES:
         raise ValueError("no end of an answer")
-    return came
+    return received

@@ -56,7 +56,7 @@ class WebDriver(VideoDriver):
                 return await super().open()
             if self._fps:
                 raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
-            frame = await first.came
+            frame = await first.outcome
         finally:
             await self.stop()
         self._size = (frame.width, frame.height)
@@ -139,14 +139,14 @@ class _PartsStream:
         self._loop = asyncio.get_running_loop()
         self._decoding = UnitDecoding(plan, sink)
         self._tasks: list[asyncio.Task[None]] = []
-        self._shown = self._heard = self._loop.time()
+        self._shown = self._received_at = self._loop.time()
 
     async def begin(self) -> None:
         """Start cutting and decoding pictures."""
         await self._decoding.begin(self)
         self._tasks = [
-            asyncio.create_task(work, name=f"{what} of {self._name}")
-            for work, what in ((self._read(), "parts"), (self._watch(), "silence"))
+            asyncio.create_task(work, name=f"{label} of {self._name}")
+            for work, label in ((self._read(), "parts"), (self._watch(), "silence"))
         ]
 
     async def end(self) -> None:
@@ -177,10 +177,10 @@ class _PartsStream:
         try:
             async with contextlib.aclosing(self._stream.pieces()) as pieces:
                 async for piece in pieces:
-                    self._heard = self._loop.time()
+                    self._received_at = self._loop.time()
                     for picture in cutter.feed(piece):
                         damaged, cutter.damaged = cutter.damaged, 0
-                        unit = AccessUnit(picture, 0, 0, damaged, self._heard, begins)
+                        unit = AccessUnit(picture, 0, 0, damaged, self._received_at, begins)
                         self._decoding.take([unit])
                         begins = False
             error = FrameSourceError(f"{self._name}: the server ended the stream")
@@ -194,7 +194,7 @@ class _PartsStream:
         while (left := self._shown + self._timeout - self._loop.time()) > 0:  # noqa: ASYNC110
             await asyncio.sleep(left)
         seconds = f"{self._timeout:g} s"
-        if self._loop.time() - self._heard < self._timeout:
+        if self._loop.time() - self._received_at < self._timeout:
             text = f"expected a picture, got bytes that make no picture for {seconds}"
             self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
         else:

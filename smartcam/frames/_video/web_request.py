@@ -75,7 +75,7 @@ class WebStream:
         self._name, self._url, self._tls = name, url, tls
         self._writer: asyncio.StreamWriter | None = None
         self._reader: asyncio.StreamReader | None = None
-        self._rest = b""
+        self._unread = b""
 
     async def open(self) -> None:
         """Send the request; follow redirects on the same host and port, and answer challenges.
@@ -124,12 +124,12 @@ class WebStream:
             OSError: the connection is lost.
         """
         if "chunked" not in self.answer.header("transfer-encoding").lower():
-            while piece := await self._some():
+            while piece := await self._read_piece():
                 yield piece
             return
         while size := await self._chunk_size():
             while size:
-                piece = await self._some(size)
+                piece = await self._read_piece(size)
                 if not piece:
                     return
                 size -= len(piece)
@@ -152,7 +152,7 @@ class WebStream:
             *([f"Authorization: {shown}"] if shown else ()),
         ]
         self._writer.write("\r\n".join((*lines, "", "")).encode())
-        self._rest = b""
+        self._unread = b""
         answer = await self._head()
         for _ in range(MAX_INTERIM_ANSWERS):
             if answer.status not in INTERIM:
@@ -161,20 +161,20 @@ class WebStream:
         return answer
 
     async def _head(self) -> WebAnswer:
-        came = bytearray()
+        received = bytearray()
         looked = 0
-        while (ends := _HEAD_ENDS.search(came, max(0, looked - 10))) is None:
-            looked = len(came)
-            piece = await self._some()
-            came += piece
-            if not piece or len(came) > MAX_HEAD_BYTES:
+        while (ends := _HEAD_ENDS.search(received, max(0, looked - 10))) is None:
+            looked = len(received)
+            piece = await self._read_piece()
+            received += piece
+            if not piece or len(received) > MAX_HEAD_BYTES:
                 raise ValueError("no head")
-        self._rest = bytes(came[ends.end() :])
-        return _answer(bytes(came[: ends.start()]))
+        self._unread = bytes(received[ends.end() :])
+        return _answer(bytes(received[: ends.start()]))
 
-    async def _some(self, most: int = PIECE_BYTES) -> bytes:
-        if self._rest:
-            piece, self._rest = self._rest[:most], self._rest[most:]
+    async def _read_piece(self, most: int = PIECE_BYTES) -> bytes:
+        if self._unread:
+            piece, self._unread = self._unread[:most], self._unread[most:]
             return piece
         return b"" if self._reader is None else await self._reader.read(most)
 
@@ -182,7 +182,7 @@ class WebStream:
         """Return the size of the next chunk; 0 at the end."""
         line = bytearray()
         while not line.strip() or not line.endswith(b"\n"):
-            byte = await self._some(1)
+            byte = await self._read_piece(1)
             line += byte
             if not byte:
                 return 0
@@ -196,12 +196,12 @@ class WebStream:
 
 def _answer(head: bytes) -> WebAnswer:
     first, *lines = head.decode("latin-1").replace("\r", "").split("\n")
-    found = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
-    if found is None:
+    match = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
+    if match is None:
         raise ValueError("no answer")
     headers: dict[str, list[str]] = {}
     for line in lines:
         key, colon, value = line.partition(":")
         if colon:
             headers.setdefault(key.strip().lower(), []).append(value.strip())
-    return WebAnswer(int(found[1]), found[2].strip(), headers)
+    return WebAnswer(int(match[1]), match[2].strip(), headers)

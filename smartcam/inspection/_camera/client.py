@@ -17,7 +17,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.inspection._camera.device import SoftwareDevice
-from smartcam.inspection._camera.pairing import MAX_KEPT, JudgedResults
+from smartcam.inspection._camera.pairing import MAX_PICTURES_KEPT, JudgedResults
 from smartcam.inspection._camera.pictures import png_of
 from smartcam.inspection._cell import load_cell
 from smartcam.models import Capabilities, Result, ValueT
@@ -58,11 +58,13 @@ class SoftwareCamera(SmartCamera[ValueT]):
         usual = {
             "name": camera.name,
             "interpret_as": self._device.interpret_as,
-            "application_names": {one.name: number for number, one in camera.programs.items()},
+            "application_names": {
+                program.name: number for number, program in camera.programs.items()
+            },
         }
         given = {
             **usual,
-            **{name: one for name, one in options.items() if one or name not in usual},
+            **{name: value for name, value in options.items() if value or name not in usual},
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
@@ -90,7 +92,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
     async def open(self) -> Self:
         try:
             await self._device.start()
-            self._go_to(self.settings.address._replace(port=self._device.emulator.port))
+            self._use_address(self.settings.address._replace(port=self._device.emulator.port))
         except BaseException:
             await finish(self._device.stop)
             raise
@@ -157,7 +159,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         if judged is None:
             raise UnsupportedError(
                 f"{self.name}: the picture of result {result.number} is not here: expected one of "
-                f"the last {MAX_KEPT} results of this camera"
+                f"the last {MAX_PICTURES_KEPT} results of this camera"
             )
         return await self._png(judged, limit, drawn=drawn)
 

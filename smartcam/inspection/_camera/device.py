@@ -169,7 +169,7 @@ class SoftwareDevice(Server):
     @property
     def interpret_as(self) -> dict[int, str]:
         """Layout of the results of each application."""
-        return {number: one.interpret_as for number, one in self.camera.programs.items()}
+        return {number: program.interpret_as for number, program in self.camera.programs.items()}
 
     def last_sent(self) -> tuple[int, LastReport | None]:
         """Return the session's number (0: no session), and the last report of a run.
@@ -195,7 +195,7 @@ class SoftwareDevice(Server):
         try:
             await self.emulator.start()
         except BaseException:
-            await self._rest()
+            await self._stop_parts()
             raise
 
     async def stop(self) -> None:
@@ -206,9 +206,9 @@ class SoftwareDevice(Server):
         try:
             await self.emulator.stop()
         finally:
-            await self._rest()
+            await self._stop_parts()
 
-    async def _rest(self) -> None:
+    async def _stop_parts(self) -> None:
         """Stop the inspector and the keeper of pictures."""
         try:
             await self.inspector.stop()
@@ -261,11 +261,11 @@ class _CellInspector(Inspector):
         """Start an inspection, whose values are converted."""
         number = None if self._layout.sequence_field is None else order.number & 0x7FFFFFFF
 
-        def converted(found: Values | None) -> None:
+        def converted(found_values: Values | None) -> None:
             values: Values | None = None
             try:
-                if found is not None:
-                    data = self._layout.build(found, sequence=number)
+                if found_values is not None:
+                    data = self._layout.build(found_values, sequence=number)
                     values = _as_mapping(self._plain.parse(data))
             except Exception:  # noqa: BLE001 - the run has to end
                 _log.exception("%s ! a result does not fit its cells", self._inspector.name)
@@ -281,7 +281,7 @@ class _CellInspector(Inspector):
 def _as_mapping(record: Any) -> dict[str, Any]:
     """Return a record with its nested records as mappings."""
     return {
-        name: [_as_mapping(one) for one in value] if isinstance(value, list) else value
+        name: [_as_mapping(item) for item in value] if isinstance(value, list) else value
         for name, value in record._asdict().items()
     }
 

@@ -228,7 +228,7 @@ class FrameInspector(Inspector):
 
     async def _follow(self, source: FrameSource) -> bool:
         """Pass frames to waiting runs until the source ends; return whether any frame came."""
-        came = False
+        arrived = False
         held: Frame | None = None  # frame of a recording, whose run was cancelled
         async with source.reader(timeout=None) as reader:
             while True:
@@ -237,8 +237,8 @@ class FrameInspector(Inspector):
                 try:
                     frame: Frame = await anext(reader) if held is None else held
                 except StopAsyncIteration:
-                    return came
-                came, held = True, None
+                    return arrived
+                arrived, held = True, None
                 if self._recorded and frame.lost:  # a run with a damaged picture has no result
                     held = dataclasses.replace(frame, lost=0)
                     why = f"{frame.lost} damaged pictures before picture {frame.sequence}"
@@ -310,7 +310,7 @@ class FrameInspector(Inspector):
         """Return the thread for tools, or a new thread if it is busy with a cancelled run."""
         thread = self._thread
         if thread is not None and thread.at_work:
-            self._hung_threads = [one for one in self._hung_threads if one.at_work]
+            self._hung_threads = [thread for thread in self._hung_threads if thread.at_work]
             if len(self._hung_threads) < MAX_HUNG_THREADS:
                 self._hung_threads.append(thread)
                 thread.close()

@@ -46,7 +46,7 @@ class PictureKeeper:
     def __init__(self, name: str, folder: Path, keep: Keep) -> None:
         self._name, self._folder, self._keep = name, folder, keep
         self._file_prefix = _FORBIDDEN.sub("-", name)  # in the names of its files
-        self._own = re.compile(
+        self._own_names = re.compile(
             rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._file_prefix)}-\d+-(ok|bad)\.png"
         )
         self.missed: int = 0
@@ -109,8 +109,10 @@ class PictureKeeper:
             (self._folder / f"{stem}.png").write_bytes(png_of(judged, drawn=False))
             text = json.dumps(record, indent=1)
             (self._folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
-            kept = sorted(one for one in self._folder.iterdir() if self._own.fullmatch(one.name))
-            for old in kept[: max(0, len(kept) - self._keep.most)]:
+            pictures_kept = sorted(
+                path for path in self._folder.iterdir() if self._own_names.fullmatch(path.name)
+            )
+            for old in pictures_kept[: max(0, len(pictures_kept) - self._keep.most)]:
                 old.unlink(missing_ok=True)
                 old.with_suffix(".json").unlink(missing_ok=True)
         except (OSError, ValueError, SmartCamError) as exc:

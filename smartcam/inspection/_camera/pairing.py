@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._camera.frame_inspector import Judged
     from smartcam.models import CameraEvent, Result
 
-MAX_KEPT: Final = 8
+MAX_PICTURES_KEPT: Final = 8
 """Number of last results whose pictures are kept, which bounds the memory."""
 
 MAX_PENDING: Final = 64
@@ -40,8 +40,8 @@ class JudgedResults(Observer):
         session: function that returns the number of the device's session (0: no session) and the
             last report of a run.
         received: function that returns the number of containers that the client has received.
-        found: function that is called with each result and its picture, before other observers get
-            the result.
+        on_found: function that is called with each result and its picture, before other observers
+            get the result.
         max_kept: number of last results whose pictures are kept for :meth:`judged_of`.
     """
 
@@ -49,18 +49,18 @@ class JudgedResults(Observer):
         self,
         session: Callable[[], tuple[int, LastReport | None]],
         received: Callable[[], int],
-        found: Callable[[Result, Judged], None],
+        on_found: Callable[[Result, Judged], None],
         *,
-        max_kept: int = MAX_KEPT,
+        max_kept: int = MAX_PICTURES_KEPT,
     ) -> None:
-        self._session, self._received, self._found = session, received, found
+        self._session, self._received, self._on_found = session, received, on_found
         self._max_kept = max_kept
         self._number = 0  # number of the session
         self._sent = 0  # number of containers sent in the session
         self._report: LastReport | None = None
         self._before = 0  # number of containers that the client received before the session
         self._pending: dict[int, _SentContainer] = {}  # containers by their count in the session
-        self._kept: collections.OrderedDict[tuple[int, datetime], Judged] = (
+        self._judged: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
         )
 
@@ -87,15 +87,15 @@ class JudgedResults(Observer):
         """Find the picture of a result."""
         count = result.number - self._before
         sent = self._pending.pop(count, None)
-        for older in [one for one in self._pending if one < count]:
+        for older in [count_before for count_before in self._pending if count_before < count]:
             del self._pending[older]  # their results were not awaited
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return
-        self._kept[result.number, result.received_at] = sent.judged
-        if len(self._kept) > self._max_kept:
-            self._kept.popitem(last=False)
-        self._found(result, sent.judged)
+        self._judged[result.number, result.received_at] = sent.judged
+        if len(self._judged) > self._max_kept:
+            self._judged.popitem(last=False)
+        self._on_found(result, sent.judged)
 
     def judged_of(self, result: Result) -> Judged | None:
         """Return the picture of a recent result; None if it is no longer kept."""
-        return self._kept.get((result.number, result.received_at))
+        return self._judged.get((result.number, result.received_at))

@@ -140,7 +140,7 @@ class Ranges:
 
 
 class PyramidLevel:
-    """One level of a picture's pyramid; what is worked out of it is kept."""
+    """One level of a picture's pyramid; computed values are kept."""
 
     def __init__(self, grey: NDArray[np.uint8], noise: float) -> None:
         self.grey = grey
@@ -159,7 +159,7 @@ class PyramidLevel:
     def unit_gradient(self, contrast: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the gradient with a length of 1, or 0 where it has no direction, (H, W)."""
         cv2 = load("cv2", "inspection needs")
-        across, down = (one.astype(np.float32) for one in self.gradient)
+        across, down = (component.astype(np.float32) for component in self.gradient)
         size = cv2.magnitude(across, down)
         least = np.float32(self.least_response(contrast))
         size[size < least] = np.inf
@@ -168,22 +168,22 @@ class PyramidLevel:
     def agreement(self, contrast: float, *, any_polarity: bool) -> list[NDArray[np.uint8]]:
         """Return maps (H, W) of the agreement around each pixel with each direction, 0 to 4."""
         cv2 = load("cv2", "inspection needs")
-        across, down = (one.astype(np.float32) for one in self.gradient)
+        across, down = (component.astype(np.float32) for component in self.gradient)
         size, angle = cv2.cartToPolar(across, down)
         number = (angle * (DIRECTIONS / (2 * math.pi)) + 0.5).astype(np.uint8) % DIRECTIONS
         count = DIRECTIONS // 2 if any_polarity else DIRECTIONS
         number %= count
         number[size < self.least_response(contrast)] = 255
         around = np.ones((3, 3), np.uint8)
-        there = [cv2.dilate((number == k).view(np.uint8), around) for k in range(count)]
-        found = []
+        spread_directions = [cv2.dilate((number == k).view(np.uint8), around) for k in range(count)]
+        agreements = []
         for k in range(count):
-            best = there[k] * AGREEMENT[0]
+            best = spread_directions[k] * AGREEMENT[0]
             for apart in (1, 2):
-                both = there[(k + apart) % count] | there[k - apart]
+                both = spread_directions[(k + apart) % count] | spread_directions[k - apart]
                 best = np.maximum(best, both * AGREEMENT[apart])
-            found.append(best)
-        return found
+            agreements.append(best)
+        return agreements
 
 
 class PicturePyramid:
@@ -236,17 +236,19 @@ def find_candidates(
     The error of a place is about a pixel.
     """
     top = model.top
-    found = list(_everywhere(pyramid, model, ranges))
+    candidates = list(_everywhere(pyramid, model, ranges))
     refused: RoughPlace | None = None
-    found, refused = _best(found, TOP_SHARE * ranges.least_score, 2.0**top, MAX_CANDIDATES, None)
+    candidates, refused = _best(
+        candidates, TOP_SHARE * ranges.least_score, 2.0**top, MAX_CANDIDATES, None
+    )
     for level in range(top - 1, 0, -1):
-        if not found:
+        if not candidates:
             break
-        found = _followed(pyramid, model, ranges, level, found)
-        kept = max(2 * most + 8, MAX_CANDIDATES >> (2 * (top - level)))
+        candidates = _followed(pyramid, model, ranges, level, candidates)
+        most_kept = max(2 * most + 8, MAX_CANDIDATES >> (2 * (top - level)))
         least = LOWER_SHARE * ranges.least_score
-        found, refused = _best(found, least, 2.0**level, kept, refused)
-    return found, refused
+        candidates, refused = _best(candidates, least, 2.0**level, most_kept, refused)
+    return candidates, refused
 
 
 def _everywhere(
@@ -281,8 +283,8 @@ class _AgreementTable:
         self._start = border * self._row + border
         self._border = border
         # a row more: the last sums reach beyond their line
-        padded = [np.pad(one, ((border, border + 1), (border, border))) for one in maps]
-        self._flat = [one.ravel() for one in padded]
+        padded = [np.pad(map_, ((border, border + 1), (border, border))) for map_ in maps]
+        self._flat = [map_.ravel() for map_ in padded]
         self.bytes = self._row * self._height
 
     def sums(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
@@ -309,7 +311,7 @@ class _AgreementTable:
         """Return the highest peaks: index of the angle, row, column, and sum."""
         cv2 = load("cv2", "inspection needs")
         flat = stack.reshape(len(stack), -1)
-        found: list[tuple[int, int, int, int]] = []
+        peaks_found: list[tuple[int, int, int, int]] = []
         around = np.ones((3, 3), np.uint8)
         for turn in np.flatnonzero(flat.max(axis=1) >= least).tolist():
             high = np.flatnonzero(flat[turn] >= least)
@@ -320,23 +322,23 @@ class _AgreementTable:
                     highest &= totals >= flat[other % len(stack)][high]
             high, totals = high[highest], totals[highest]
             rows, columns = np.divmod(high, self._row)
-            mine = columns < self._width
-            found += zip(
-                [turn] * int(np.count_nonzero(mine)),
-                rows[mine].tolist(),
-                columns[mine].tolist(),
-                totals[mine].tolist(),
+            inner = columns < self._width
+            peaks_found += zip(
+                [turn] * int(np.count_nonzero(inner)),
+                rows[inner].tolist(),
+                columns[inner].tolist(),
+                totals[inner].tolist(),
                 strict=True,
             )
-        return sorted(found, key=lambda one: -one[3])[: 4 * MAX_CANDIDATES]
+        return sorted(peaks_found, key=lambda peak: -peak[3])[: 4 * MAX_CANDIDATES]
 
 
 def _thinned(points: Array, normals: Array, most: int) -> tuple[Array, Array]:
     """Return at most a number of the points, evenly spread."""
     if len(points) <= most:
         return points, normals
-    kept = np.linspace(0, len(points) - 1, most).round().astype(int)
-    return points[kept], normals[kept]
+    chosen = np.linspace(0, len(points) - 1, most).round().astype(int)
+    return points[chosen], normals[chosen]
 
 
 def _followed(
@@ -355,18 +357,18 @@ def _followed(
     turns = np.array([-1.0, 0.0, 1.0]) * step
     sizes = np.array([1 - step, 1.0, 1 + step]) if ranges.scales[1] > ranges.scales[0] else [1.0]
     ways = np.array([(turn, size) for turn in turns for size in sizes])
-    start = np.array([(one.x, one.y, one.angle, one.scale) for one in places])
+    start = np.array([(place.x, place.y, place.angle, place.scale) for place in places])
     angles = (start[:, 2, None] + ways[:, 0]).ravel()
     scales = (start[:, 3, None] * ways[:, 1]).ravel()
     at = np.rint(start[:, :2] / 2**level).astype(int).repeat(len(ways), axis=0)
     scores = _scores((nx, ny), points, normals, (angles, scales), at, ranges.any_polarity)
     best = scores.reshape(len(places), -1).argmax(axis=1)
-    found = []
+    followed = []
     for number, which in enumerate(best.tolist()):
-        way, offset = divmod(which, scores.shape[1])
-        row = number * len(ways) + way
+        turn_index, offset = divmod(which, scores.shape[1])
+        row = number * len(ways) + turn_index
         x, y = at[row] + OFFSETS[offset]
-        found.append(
+        followed.append(
             RoughPlace(
                 float(x) * 2**level,
                 float(y) * 2**level,
@@ -375,7 +377,7 @@ def _followed(
                 float(scores[row, offset]),
             )
         )
-    return found
+    return followed
 
 
 OFFSETS: Final = np.array([(x, y) for y in range(-2, 3) for x in range(-2, 3)])
@@ -399,8 +401,8 @@ def _scores(
     rows = np.rint(poses[1][:, None] * (sin * x + cos * y)).astype(np.int32) + at[:, 1:]
     ahead = (cos * u - sin * v).astype(np.float32)
     down = (sin * u + cos * v).astype(np.float32)
-    found = np.empty((len(at), len(OFFSETS)), np.float32)
-    flat = [np.pad(one, ((0, 1), (0, 0))).ravel() for one in units]  # nothing behind the last row
+    scores_found = np.empty((len(at), len(OFFSETS)), np.float32)
+    flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]  # nothing behind the last row
     nothing = height * width
     for number, (dx, dy) in enumerate(OFFSETS.tolist()):
         column, row = columns + dx, rows + dy
@@ -408,8 +410,8 @@ def _scores(
         index = np.where(inside, row * width + column, nothing)
         agreed = flat[0].take(index) * ahead + flat[1].take(index) * down
         agreed = np.abs(agreed) if any_polarity else np.maximum(agreed, 0)
-        found[:, number] = agreed.mean(axis=1)
-    return found.astype(np.float64)
+        scores_found[:, number] = agreed.mean(axis=1)
+    return scores_found.astype(np.float64)
 
 
 def _best(
@@ -420,20 +422,20 @@ def _best(
     refused: RoughPlace | None,
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places without duplicates, and the best place with too low a score."""
-    kept: list[RoughPlace] = []
-    for one in sorted(places, key=lambda one: -one.score):
-        if one.score < least:
-            if refused is None or one.score > refused.score:
-                refused = one
+    best: list[RoughPlace] = []
+    for place in sorted(places, key=lambda place: -place.score):
+        if place.score < least:
+            if refused is None or place.score > refused.score:
+                refused = place
             break
-        if len(kept) == most:
+        if len(best) == most:
             break
-        if not any(_alike(one, other, pixel) for other in kept):
-            kept.append(one)
-    return kept, refused
+        if not any(_alike(place, other, pixel) for other in best):
+            best.append(place)
+    return best, refused
 
 
 def _alike(one: RoughPlace, other: RoughPlace, pixel: float) -> bool:
-    near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel
+    is_near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel
     turned = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
-    return near and turned < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1
+    return is_near and turned < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1

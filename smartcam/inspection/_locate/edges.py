@@ -31,11 +31,12 @@ SMOOTH_PX: Final = 1.0
 HALF_LENGTH_PX: Final = 4.0
 """Largest half length of a segment, pixels."""
 
-BESIDE_PX: Final = 1.0
+MAX_LINE_DISTANCE_PX: Final = 1.0
 """Largest distance of a segment's points from a straight line through its middle, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle, radians, between the direction of a segment's point and that of its middle."""
+"""Largest angle, radians, between the direction of a segment's point and the direction of its
+middle."""
 
 MIN_POINTS: Final = 4
 """Least number of points of a segment."""
@@ -87,10 +88,10 @@ def edge_points(grey: NDArray[np.uint8], contrast: float) -> EdgePoints:
     """Return the edge pixels of a picture (H, W) with at least a contrast in grey levels."""
     cv2 = load("cv2", "inspection needs")
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTH_PX)
-    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
-    whole = (np.rint(4 * one).astype(np.int16) for one in (across, down))
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *direction) for direction in ((1, 0), (0, 1)))
+    quarters = (np.rint(4 * gradient).astype(np.int16) for gradient in (across, down))
     most = 4 * STEP_SLOPE * contrast
-    edges = cv2.Canny(*whole, 0.5 * most, most, L2gradient=True)
+    edges = cv2.Canny(*quarters, 0.5 * most, most, L2gradient=True)
     edges[:2], edges[-2:], edges[:, :2], edges[:, -2:] = 0, 0, 0, 0
     rows, columns = np.nonzero(edges)
     slope = np.hypot(across[rows, columns], down[rows, columns]).astype(np.float64)
@@ -99,8 +100,8 @@ def edge_points(grey: NDArray[np.uint8], contrast: float) -> EdgePoints:
     size = cv2.magnitude(across, down)
     before, after = (_sampled(size, at + side * normals) for side in (-1.0, 1.0))
     bend = before - 2 * slope + after
-    off = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
-    return EdgePoints(at + off.clip(-1, 1)[:, None] * normals, normals, slope)
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    return EdgePoints(at + shift.clip(-1, 1)[:, None] * normals, normals, slope)
 
 
 def _sampled(image: NDArray[Any], at: Array) -> Array:
@@ -112,34 +113,36 @@ def _sampled(image: NDArray[Any], at: Array) -> Array:
     padded = np.zeros((2, (len(x) // wide + 1) * wide), np.float32)
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, -1, wide)
-    found: Array = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).ravel()[: len(x)]
-    return found.astype(np.float64)
+    sampled: Array = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).ravel()[: len(x)]
+    return sampled.astype(np.float64)
 
 
-def segments_of(found: EdgePoints) -> Segments:
+def segments_of(edges: EdgePoints) -> Segments:
     """Divide edge pixels into segments, the strongest first."""
-    points, normals = found.points, found.normals
+    points, normals = edges.points, edges.normals
     if not len(points):
         return _no_segments()
     index = load("scipy.spatial", "locate needs").cKDTree(points)
     free = np.ones(len(points), dtype=np.bool_)
     rows: list[tuple[Array, Array, float, float]] = []
-    for start in np.argsort(-found.slopes, kind="stable").tolist():
+    for start in np.argsort(-edges.slopes, kind="stable").tolist():
         if not free[start] or len(rows) == MAX_SEGMENTS:
             continue
-        near = np.array(index.query_ball_point(points[start], HALF_LENGTH_PX + 0.5))
+        around = np.array(index.query_ball_point(points[start], HALF_LENGTH_PX + 0.5))
         normal = normals[start]
-        off = points[near] - points[start]
-        alike = normals[near] @ normal >= math.cos(MAX_TURN)
-        mine = near[free[near] & alike & (np.abs(off @ normal) <= BESIDE_PX)]
+        offsets = points[around] - points[start]
+        alike = normals[around] @ normal >= math.cos(MAX_TURN)
+        own_places = around[
+            free[around] & alike & (np.abs(offsets @ normal) <= MAX_LINE_DISTANCE_PX)
+        ]
         free[start] = False
-        if len(mine) < MIN_POINTS:
+        if len(own_places) < MIN_POINTS:
             continue
-        free[mine] = False
-        rows.append(_segment(points[mine], normals[mine]))
+        free[own_places] = False
+        rows.append(_segment(points[own_places], normals[own_places]))
     if not rows:
         return _no_segments()
-    middles, directions, bends, halves = (np.array(one) for one in zip(*rows, strict=True))
+    middles, directions, bends, halves = (np.array(column) for column in zip(*rows, strict=True))
     ones = np.ones(len(rows))
     moves = np.zeros((len(rows), len(BLURS_PX2)))
     return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones, moves)
@@ -201,7 +204,7 @@ def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Ar
     bands = make_bands(segments, points)
     identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     exact = levels.astype(np.float64)
-    found = []
+    moves = []
     for variance in BLURS_PX2:
         more = cv2.GaussianBlur(exact, (0, 0), math.sqrt(variance), borderType=cv2.BORDER_REPLICATE)
         pixels = pixels_in(bands, identity, more)
@@ -211,8 +214,8 @@ def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Ar
             across, _ = segments.places(pixels.points, pixels.owners)
             fit = fit_bands(across - moved[pixels.owners], blurs, pixels, len(moved))
             moved = moved + np.where(np.isfinite(fit.sigmas), fit.shifts, 0.0).clip(-0.5, 0.5)
-        found.append(moved.clip(-MAX_SHIFT_PX, MAX_SHIFT_PX))
-    return np.column_stack(found)
+        moves.append(moved.clip(-MAX_SHIFT_PX, MAX_SHIFT_PX))
+    return np.column_stack(moves)
 
 
 def _fitted(

@@ -40,7 +40,7 @@ SCORE_MARGIN: Final = 0.1
 """Score by which a fit may raise the coarse score: once enough parts are found, a place is not
 fitted if its coarse score is lower than theirs by more."""
 
-SAME_SCORE: Final = 0.02
+EQUAL_SCORE_DIFFERENCE: Final = 0.02
 """Largest difference of two scores that count as equal."""
 
 RANGE_MARGIN: Final = math.radians(1.0)
@@ -91,7 +91,7 @@ class LocatedPart:
         missing: places of edges that are not visible, (M, 2), pixels.
         noise: standard deviation of the picture's noise, grey levels.
         blur: standard deviation of the edges' blur, pixels.
-        chi_square: ratio of the edges' squared residuals to those that the noise explains.
+        chi_square: ratio of the edges' squared residuals to the squares that noise explains.
         refusal: why the part counts as not found; "" for a found part.
         doubt: why the rotation may be another one; mostly "".
         hull: convex hull of the part, (K, 2), pixels of the picture.
@@ -154,12 +154,12 @@ def locate(
         area = _area(picture, box, model.radius * search.scales[1])
         if area not in searched:
             searched[area] = _SearchedPicture(picture, area)
-        found, bad = searched[area].find(model, search, end, allowed)
-        parts += found
+        parts_found, bad = searched[area].find(model, search, end, allowed)
+        parts += parts_found
         refused += bad
-    kept = _apart(parts, search.overlap)
-    refused.sort(key=lambda one: -one.score)
-    return Located(tuple(kept), refused[0] if refused else None)
+    parts_kept = _apart(parts, search.overlap)
+    refused.sort(key=lambda part: -part.score)
+    return Located(tuple(parts_kept), refused[0] if refused else None)
 
 
 def _area(
@@ -202,25 +202,29 @@ class _SearchedPicture:
         ranges = ranges_of(model, search)
         candidates, refused = find_candidates(self._pyramid, model.coarse, ranges, search.most)
         bad = [] if refused is None else [_unfitted(model, self._moved(refused), search, "")]
-        found: list[LocatedPart] = []
+        parts: list[LocatedPart] = []
         for number, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
-            one = self._moved(candidate)
+            moved_part = self._moved(candidate)
             if time.monotonic() > end and number:
-                bad.append(_unfitted(model, one, search, "there was no time left to look at it"))
+                bad.append(
+                    _unfitted(model, moved_part, search, "there was no time left to look at it")
+                )
                 break
-            if _is_enough(found, one, search) or any(_is_near(one, other) for other in found):
+            if _is_enough(parts, moved_part, search) or any(
+                _is_near(moved_part, other) for other in parts
+            ):
                 continue
-            part = self._fitted(model, one, search, allowed)
+            part = self._fitted(model, moved_part, search, allowed)
             if part.refusal:
                 bad.append(part)
             else:
-                found.append(part)
-        kept = _apart(found, search.overlap)[: search.most]
-        return [self._without_doubt(model, one, search) for one in kept], bad
+                parts.append(part)
+        parts_kept = _apart(parts, search.overlap)[: search.most]
+        return [self._without_doubt(model, part, search) for part in parts_kept], bad
 
-    def _moved(self, one: RoughPlace) -> RoughPlace:
+    def _moved(self, place: RoughPlace) -> RoughPlace:
         """Return a candidate in the whole picture's pixels."""
-        return one._replace(x=one.x + self._corner[0], y=one.y + self._corner[1])
+        return place._replace(x=place.x + self._corner[0], y=place.y + self._corner[1])
 
     def _fit(self, model: PartModel, start: PixelPose, search: PartSearch) -> FinePose | None:
         use = FineSettings(
@@ -236,15 +240,15 @@ class _SearchedPicture:
     def _fitted(
         self,
         model: PartModel,
-        one: RoughPlace,
+        place: RoughPlace,
         search: PartSearch,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
         """Return the part at a place, with a refusal if it does not count as found."""
-        start = PixelPose(one.x, one.y, one.angle, one.scale)
+        start = PixelPose(place.x, place.y, place.angle, place.scale)
         fine = self._fit(model, start, search)
         if fine is None:
-            return _unfitted(model, one, search, "too few of its edges agree on a pose")
+            return _unfitted(model, place, search, "too few of its edges agree on a pose")
         part = _part(model, fine)
         pose = part.pose
         refusal = ""
@@ -269,11 +273,11 @@ class _SearchedPicture:
     ) -> LocatedPart:
         """Return a part, with a doubt if another rotation fits as well."""
         for angle, share in model.symmetry.alike:
-            if part.score >= share + SAME_SCORE:
+            if part.score >= share + EQUAL_SCORE_DIFFERENCE:
                 continue
             turned = _turned(part.pose, model.symmetry.about, angle)
             other = self._fit(model, turned, search)
-            if other is not None and other.score >= part.score - SAME_SCORE:
+            if other is not None and other.score >= part.score - EQUAL_SCORE_DIFFERENCE:
                 doubt = (
                     f"as much of it is seen if it is turned by {math.degrees(angle):.0f} degrees"
                 )
@@ -320,7 +324,7 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
         blur=fine.blur,
         chi_square=fine.chi_square,
         hull=fine.pose.to_picture(model.hull),
-        contours=tuple(fine.pose.to_picture(one) for one in model.contours),
+        contours=tuple(fine.pose.to_picture(contour) for contour in model.contours),
     )
 
 
@@ -339,15 +343,17 @@ def _too_little(score: float, fine: FinePose, search: PartSearch) -> str:
     return text
 
 
-def _unfitted(model: PartModel, one: RoughPlace, search: PartSearch, why: str) -> LocatedPart:
-    pose = PixelPose(one.x, one.y, math.remainder(one.angle, model.symmetry.period), one.scale)
+def _unfitted(model: PartModel, place: RoughPlace, search: PartSearch, why: str) -> LocatedPart:
+    pose = PixelPose(
+        place.x, place.y, math.remainder(place.angle, model.symmetry.period), place.scale
+    )
     return LocatedPart(
         name=model.name,
         pose=pose,
         covariance=np.full((4, 4), np.nan),
-        score=one.score,
+        score=place.score,
         refusal=why
-        or f"about {100 * one.score:.0f} % of its edges agree, expected "
+        or f"about {100 * place.score:.0f} % of its edges agree, expected "
         f"{100 * search.least_score:.0f} %",
         hull=pose.to_picture(model.hull),
     )
@@ -358,8 +364,8 @@ def _is_in_angles(pose: PixelPose, model: PartModel, search: PartSearch) -> bool
     low, high = search.angles
     if not model.symmetry.fold or high - low >= model.symmetry.period - 1e-9:
         return True
-    off = math.remainder(pose.angle - (low + high) / 2, model.symmetry.period)
-    return abs(off) <= (high - low) / 2 + RANGE_MARGIN
+    deviation = math.remainder(pose.angle - (low + high) / 2, model.symmetry.period)
+    return abs(deviation) <= (high - low) / 2 + RANGE_MARGIN
 
 
 def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
@@ -369,25 +375,25 @@ def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
     return least * (1 - margin) <= pose.scale <= most * (1 + margin)
 
 
-def _is_enough(found: Sequence[LocatedPart], one: RoughPlace, search: PartSearch) -> bool:
+def _is_enough(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
     """Return True if a place cannot be better than the parts found so far."""
-    best = sorted(part.score for part in found)[-search.most :]
-    return len(best) == search.most and one.score < best[0] - SCORE_MARGIN
+    best = sorted(part.score for part in parts)[-search.most :]
+    return len(best) == search.most and place.score < best[0] - SCORE_MARGIN
 
 
-def _is_near(one: RoughPlace, other: LocatedPart) -> bool:
+def _is_near(place: RoughPlace, other: LocatedPart) -> bool:
     """Return True if a candidate is the place of a part that was already found."""
-    turned = abs(math.remainder(one.angle - other.pose.angle, 2 * math.pi))
-    return math.hypot(one.x - other.pose.x, one.y - other.pose.y) < 4 and turned < 0.1
+    turned = abs(math.remainder(place.angle - other.pose.angle, 2 * math.pi))
+    return math.hypot(place.x - other.pose.x, place.y - other.pose.y) < 4 and turned < 0.1
 
 
 def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
     """Return the best parts whose overlaps are at most as large as allowed."""
-    kept: list[LocatedPart] = []
-    for one in sorted(parts, key=lambda one: (-one.score, one.chi_square)):
-        if all(_covered(one.hull, other.hull) <= overlap for other in kept):
-            kept.append(one)
-    return kept
+    parts_kept: list[LocatedPart] = []
+    for part in sorted(parts, key=lambda part: (-part.score, part.chi_square)):
+        if all(_covered(part.hull, other.hull) <= overlap for other in parts_kept):
+            parts_kept.append(part)
+    return parts_kept
 
 
 def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:

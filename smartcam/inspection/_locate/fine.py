@@ -32,76 +32,78 @@ MAX_STEPS: Final = 12
 """Largest number of steps of a fit."""
 
 GROUND_STEPS: Final = 2
-"""Steps of a fit beside a ground that is not of one level."""
+"""Number of further steps of a fit if the brightness beside the edges varies."""
 
-STILL_PX: Final = 2e-4
-"""Pixels that no segment moves by any more when a fit has come to rest."""
+CONVERGENCE_PX: Final = 2e-4
+"""A fit ends when no segment moves by more than this many pixels."""
 
 MAX_SHIFT_PX: Final = 2.0
-"""Pixels that a segment says in one step at most that it should move."""
+"""Largest shift of a segment that one step of the fit takes into account, pixels."""
 
 MAX_BLUR_PX: Final = 4.0
-"""Blur of a picture's edges up to which they are fitted, in pixels."""
+"""Largest blur of edges that are fitted, pixels."""
 
-CUT: Final = 4.0
-"""Standard deviations beside its place from which on a segment is another edge."""
+MAX_DEVIATION_SIGMAS: Final = 4.0
+"""Least distance from its place, in standard deviations, at which a segment is another edge."""
 
 EDGE_SIGNIFICANCE: Final = 4.0
 """Least height of an edge, standard deviations of the height."""
 
-SEEN_PX: Final = 1.0
-"""Pixels beside its place, besides the noise, from which on a segment counts nothing as seen."""
+SCORED_DISTANCE_PX: Final = 1.0
+"""Distance from its place, in pixels beyond the noise, at which a segment adds nothing to the
+score."""
 
 MAX_MISFIT: Final = 0.3
-"""Rms about a step beyond the noise, in parts of the edge's height, up to which it is an edge."""
+"""Largest RMS around an edge's step beyond the noise, as a part of the step's height."""
 
-MIN_SEEN: Final = 6
-"""Least number of segments that a pose is worked out from."""
+MIN_SEGMENTS: Final = 6
+"""Least number of segments that determine a pose."""
 
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
-"""Standard deviation of an angle of which nothing is known, in radians."""
+"""Standard deviation of an unknown angle, radians."""
 
 SIZE_SIGMA: Final = 0.02
-"""Standard deviation, in parts of its size, of a part that is looked for in one size only: another
-height or another camera makes it larger or smaller, and a pose of the wrong size is off."""
+"""Standard deviation of the size of a part that is searched in one size only, as a part of it:
+another height or another camera changes the size, and a wrong size shifts the pose."""
 
 STRETCH_SIGMA: Final = 0.01
-"""Standard deviation of what a part is longer in one direction and shorter across, in parts of its
-size, as seen by a camera that is tilted."""
+"""Standard deviation of a part's stretch, longer in one direction and shorter across it, as a part
+of its size: a tilted camera causes it."""
 
 GROWTH_SIGMA_PX: Final = 0.3
-"""Standard deviation of what all edges lie nearer to their brighter side, pixels: too much light,
-or a camera that tells bright levels less well, makes what is bright larger."""
+"""Standard deviation of a common shift of all edges towards one side, pixels: with too much light,
+or a camera with little contrast in bright levels, bright areas look larger."""
 
 CHANGE_SIGNIFICANCE: Final = 3.0
-"""Standard deviations by which the edges must show a change of the part, or there is none. With 1.0
-a bolt's errors were 1.32 times the bound, since each change that is fitted costs certainty."""
+"""Least significance, in standard deviations, of a change of the part's shape that is fitted. With
+1.0 a bolt's errors were 1.32 times the bound, since each fitted change costs certainty."""
 
 FIRST_CHANGED_STEP: Final = 2
-"""Number of the first step that fits what may differ from the taught part, too."""
+"""Number of the first step that also fits changes of the part's shape."""
 
 MAX_INVERSE: Final = 1e8
-"""Largest element of the inverse of the scaled equations; above it the edges leave a pose open."""
+"""Largest element of the inverse of the scaled equations; above it the edges do not determine the
+pose."""
 
 
 class FineSettings(NamedTuple):
     """Settings of a fit."""
 
-    contrast: Array  # (N,), grey levels from the darker to the brighter side at least
+    contrast: Array  # (N,), least difference of grey levels between an edge's sides
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
-    scaled: bool = False  # whether the scale is anything; else it is near that of the start
-    least_score: float = 0.0  # of a pose whose ground matters
-    turned: bool = True  # whether the angle is fitted; that of a round part is not
+    scaled: bool = False  # whether any scale is allowed; else only one near the start's
+    least_score: float = 0.0  # least score of a pose for which uneven ground is fitted, too
+    turned: bool = True  # whether the angle is fitted; for a round part it is not
 
 
 class PartShape(NamedTuple):
-    """The pose of a part, and how else it differs from the taught one."""
+    """The pose of a part, and the changes of its shape against the taught part."""
 
     pose: PixelPose
-    stretch: float = 0.0  # longer along the taught x and shorter along y, in parts
-    shear: float = 0.0  # the same along the diagonals
-    growth: float = 0.0  # pixels of the picture that edges are nearer to their brighter side
+    stretch: float = 0.0  # part by which it is longer along the taught x and shorter along y
+    shear: float = 0.0  # shear: the stretch along the diagonals
+    growth: float = 0.0  # shift of all edges towards their brighter side, pixels of the picture
 
     def moved(self, move: Array) -> PartShape:
         """Return the shape after a move (7,)."""
@@ -111,20 +113,20 @@ class PartShape(NamedTuple):
         return PartShape(pose, self.stretch + stretch, self.shear + shear, self.growth + growth)
 
     def offsets(self, segments: Segments) -> Array:
-        """Return the shifts of the edges across by the changes, (N,), pixels of the picture."""
+        """Return the edges' shifts (N,) that the shape's changes cause, pixels of the picture."""
         changes = _changes(segments, self.pose.scale)
         offsets: Array = changes @ [self.stretch, self.shear, self.growth]
         return offsets
 
 
 class Expected(NamedTuple):
-    """The scale of a part, and how little it is changed, as known before it is seen."""
+    """The scale of a part, and the usual sizes of its changes, before the part is seen."""
 
     scale: float
     sigmas: Array  # (4,), of size, stretch, shear (parts) and growth (pixels); infinite: unknown
 
-    def off(self, shape: PartShape) -> Array:
-        """Return the differences (4,) of a shape from what is expected."""
+    def deviations(self, shape: PartShape) -> Array:
+        """Return the deviations (4,) of a shape's size, stretch, shear and growth."""
         size = shape.pose.scale / self.scale - 1
         return np.array([size, shape.stretch, shape.shear, shape.growth])
 
@@ -136,17 +138,17 @@ class FinePose(NamedTuple):
     covariance: Array  # (4, 4), of x, y (pixels), angle (radians), scale
     score: float  # part of the edges that were seen, by length
     seen: NDArray[np.bool_]  # (N,), segments that were seen
-    kept: NDArray[np.bool_]  # (N,), segments that the pose follows from
+    kept: NDArray[np.bool_]  # (N,), segments that the pose was fitted to
     noise: float  # standard deviation of the pixels, grey levels
     chi_square: float  # chi-square of the kept segments around the pose, per degree of freedom
-    reversed: float  # part of the edges that are there with the other polarity
+    reversed: float  # part of the edges that were seen with the other polarity
     blur: float  # median standard deviation of the edges' blur, pixels
 
 
 def fit_pose(
     levels: NDArray[Any], segments: Segments, bands: Bands, start: PixelPose, use: FineSettings
 ) -> FinePose | None:
-    """Return the pose that fits best, from one that is known to two pixels; None: there is none.
+    """Return the best pose near a start that is right within two pixels; None: none fits.
 
     ``levels`` (H, W) is the picture.
     """
@@ -163,20 +165,22 @@ def fit_pose(
         rows, weights, _, _ = _equations((fit, blurs), segments, shape.pose, use, number)
         changed = number >= FIRST_CHANGED_STEP
         free = np.array([True, True, use.turned, use.scaled or changed, *[changed] * 3])
-        solved = _solve((rows, fit.shifts, weights), free, expected.off(shape), expected.sigmas)
+        solved = _solve(
+            (rows, fit.shifts, weights), free, expected.deviations(shape), expected.sigmas
+        )
         if solved is None:
             return None
         move, _ = solved
         shape = shape.moved(move)
         if first is None:
             widened = _widened(widened, fit.widening, float(np.median(blurs)))
-        if number >= 4 and float(np.abs(rows @ move).max()) < STILL_PX:
+        if number >= 4 and float(np.abs(rows @ move).max()) < CONVERGENCE_PX:
             break
     return _result(pixels, segments, shape, widened, use, expected)
 
 
 def _changes(segments: Segments, scale: float) -> Array:
-    """Return the shifts (N, 3) of edges across by one of stretch, shear and growth each."""
+    """Return the derivatives (N, 3) of the edges' shifts by stretch, shear and growth."""
     (x, y), (u, v) = segments.middles.T, segments.normals.T
     return np.column_stack([scale * (u * x - v * y), scale * (u * y + v * x), np.ones_like(x)])
 
@@ -196,14 +200,14 @@ def _steps(
     ground: Ground | None = None,
     noise: float = 0.0,
 ) -> tuple[StepFit, Array]:
-    """Return the steps in all bands of a part, and the blurs that they were fitted with."""
+    """Fit a step of brightness in each band of a part; return the fits, and the blurs used."""
     places, blurs = _places(pixels, segments, shape, widened)
     if first is not None:
         blurs = np.full_like(blurs, first)
-    count, own = len(segments.halves), blurs[pixels.owners]
+    count, blurs_of_pixels = len(segments.halves), blurs[pixels.owners]
     if ground is None:
-        return fit_bands(places[0], own, pixels, count), blurs
-    return fit_on_ground(places, own, pixels, ground, noise), blurs
+        return fit_bands(places[0], blurs_of_pixels, pixels, count), blurs
+    return fit_on_ground(places, blurs_of_pixels, pixels, ground, noise), blurs
 
 
 def _places(
@@ -219,7 +223,7 @@ def _places(
 
 
 def _widened(widened: float, growth: float, blur: float) -> float:
-    """Return the variance that the picture's blur has beyond that of the taught picture."""
+    """Return the new difference between the squared blurs of the picture and the taught one."""
     grown = blur * (1 + min(max(growth, -0.3), 0.3))
     widened += min(grown, MAX_BLUR_PX) ** 2 - blur**2
     return min(max(widened, -(blur**2)), MAX_BLUR_PX**2)
@@ -232,7 +236,7 @@ def _equations(
     use: FineSettings,
     number: int,
 ) -> tuple[Array, Array, float, NDArray[np.bool_]]:
-    """Return the rows (N, 7) and weights (N,) of the steps, the noise, and which are edges."""
+    """Return rows (N, 7) and weights (N,) of the equations, the noise, and the mask of edges."""
     fit, blurs = steps
     edges, noise = _edges(fit, use)
     cos, sin = math.cos(pose.angle), math.sin(pose.angle)
@@ -244,7 +248,7 @@ def _equations(
     rows = np.column_stack([normals, crossed, sized, _changes(segments, pose.scale)])
     sigmas = _sigmas(fit, segments, pose, noise, blurs)
     weights = np.where(edges & np.isfinite(sigmas), 1 / np.maximum(sigmas, 1e-6) ** 2, 0.0)
-    if number < 3:  # before the pose is near, what is noisy says as much as what is not
+    if number < 3:  # far from the solution, noisy edges count like others
         weights = (weights > 0).astype(np.float64)
     return rows, weights, noise, edges
 
@@ -259,8 +263,8 @@ def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
 
 
 def _misfits(fit: StepFit, use: FineSettings) -> Array:
-    """Return the rms about each step beyond the noise, in parts of what an edge may have."""
-    # by chance a band's pixels stray more or less than others
+    """Return the RMS around each step beyond the noise, as a part of the largest allowed one."""
+    # the scatter of a band's pixels varies by chance
     noise = use.noise**2 * (1 + 3 * np.sqrt(2 / fit.freedoms))
     beyond = np.sqrt(np.maximum(fit.variances - noise, 0.0))
     misfits: Array = beyond / np.maximum(MAX_MISFIT * np.abs(fit.heights), 1e-6)
@@ -268,7 +272,7 @@ def _misfits(fit: StepFit, use: FineSettings) -> Array:
 
 
 def _noise(fit: StepFit, finite: NDArray[np.bool_]) -> float:
-    """Return the standard deviation of the bands' pixels; most of the bands have nothing else."""
+    """Return the pixels' noise: the median over the bands, most of which have no misfit."""
     if not finite.any():
         return ROUNDING
     freedom = float(np.median(fit.freedoms[finite]))
@@ -277,14 +281,14 @@ def _noise(fit: StepFit, finite: NDArray[np.bool_]) -> float:
 
 
 def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blurs: Array) -> Array:
-    """Return the standard deviation of each shift: of both pictures' noise, and of a misfit."""
-    # a band whose pixels stray more than by chance from a step has more than noise in it
+    """Return the standard deviation of each shift, from both pictures' noise and from misfits."""
+    # a larger scatter than by chance shows a structure besides the step
     beyond = fit.variances > noise**2 * (1 + 2.5 * np.sqrt(2 / fit.freedoms))
-    own = np.where(beyond, fit.variances, noise**2)
-    # and what it has may move the edge, by as much as it is at the steepest place
+    variances = np.where(beyond, fit.variances, noise**2)
+    # the structure may move the edge by its height over the step's steepest slope
     steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)
     misfit = np.where(beyond, fit.variances - noise**2, 0.0) / steepest**2
-    return np.sqrt(own * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
+    return np.sqrt(variances * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
 
 
 Equations = tuple["Array", "Array", "Array"]
@@ -292,36 +296,37 @@ Equations = tuple["Array", "Array", "Array"]
 
 
 def _solve(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
-    """Return the robust solution (7,) and its covariance (7, 7); None: too little is seen.
+    """Return the robust solution (7,) and its covariance (7, 7); None: too few edges.
 
-    ``off`` (4,): how far size, stretch, shear and growth are off what is expected, by ``sigmas``.
+    ``residuals`` (4,): how far size, stretch, shear and growth are off their expected values, by
+    ``sigmas``.
     """
     rows, shifts, weights = equations
     used = weights > 0
-    if np.count_nonzero(used) < MIN_SEEN:
+    if np.count_nonzero(used) < MIN_SEGMENTS:
         return None
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
     for _ in range(4):
-        solved = _least_squares((a, y, w * robust), free, off, sigmas)
+        solved = _least_squares((a, y, w * robust), free, residuals, sigmas)
         if solved is None:
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
-        robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
-    return _least_squares((a, y, w * robust), free, off, sigmas)
+        robust = np.maximum(1 - (scaled / (MAX_DEVIATION_SIGMAS * 1.5 * spread)) ** 2, 0.0) ** 2
+    return _least_squares((a, y, w * robust), free, residuals, sigmas)
 
 
 def _least_squares(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
     rows, values, weights = equations
     weighted = rows * weights[:, None]
     square, right = rows.T @ weighted, weighted.T @ values
     square[range(3, 7), range(3, 7)] += 1 / sigmas**2
-    right[3:] -= off / sigmas**2
+    right[3:] -= residuals / sigmas**2
     square, right = square[np.ix_(free, free)], right[free]
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
@@ -332,10 +337,10 @@ def _least_squares(
     if not np.abs(inverse).max() < MAX_INVERSE:
         return None
     inverse = inverse / np.outer(scale, scale)
-    found, covariance = np.zeros(7), np.zeros((7, 7))
-    found[free] = inverse @ right
+    solution, covariance = np.zeros(7), np.zeros((7, 7))
+    solution[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
-    return found, covariance
+    return solution, covariance
 
 
 def _result(
@@ -346,15 +351,17 @@ def _result(
     use: FineSettings,
     expected: Expected,
 ) -> FinePose | None:
-    """Return the pose with what the steps at it say."""
+    """Return the final pose, its covariance and its score; None: too few edges agree."""
     free = np.array([True, True, use.turned, True, True, True, True])
     fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
-    # as much of each edge counts as it is where it should be, and a step
-    off = np.abs(fit.shifts) / (SEEN_PX + CUT * np.minimum(_of_weights(weights), 1.0))
-    seen = edges & (off <= 1)
+    # an edge counts more the nearer it is to its place, and the better it fits a step
+    deviations = np.abs(fit.shifts) / (
+        SCORED_DISTANCE_PX + MAX_DEVIATION_SIGMAS * np.minimum(_of_weights(weights), 1.0)
+    )
+    seen = edges & (deviations <= 1)
     lengths = segments.halves / segments.halves.sum()
-    score = float((lengths * (1 - off**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
+    score = float((lengths * (1 - deviations**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
     wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     ground = None
     if score >= use.least_score:
@@ -365,17 +372,17 @@ def _result(
             again = _equations((fit, blurs), segments, shape.pose, use, MAX_STEPS)
             rows, weights, noise = again[0], np.where(seen, again[1], 0.0), again[2]
             weighted = rows, fit.shifts, weights
-            solved = _solve(weighted, free, expected.off(shape), expected.sigmas)
+            solved = _solve(weighted, free, expected.deviations(shape), expected.sigmas)
             if solved is None:
                 return None
             shape = shape.moved(solved[0])
     weighted = rows, fit.shifts, np.where(seen, weights, 0.0)
-    settled = _settled(weighted, free, expected.off(shape), expected.sigmas)
+    settled = _settled(weighted, free, expected.deviations(shape), expected.sigmas)
     if settled is None:
         return None
-    move, covariance, kept, chi_square = settled
+    move, covariance, used, chi_square = settled
     left = (fit.shifts - rows @ move) * np.sqrt(weights)
-    covariance = covariance * common_error(segments, left, kept, sure=ground is not None)
+    covariance = covariance * common_error(segments, left, used, sure=ground is not None)
     pose = shape.moved(move).pose
     if covariance[3, 3] == 0:
         pose = pose._replace(scale=expected.scale)
@@ -388,7 +395,7 @@ def _result(
         covariance,
         score,
         seen,
-        kept,
+        used,
         noise,
         chi_square,
         float(lengths[wrong].sum()),
@@ -397,56 +404,60 @@ def _result(
 
 
 def _settled(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
-    """Return the last move (7,), the pose's covariance (4, 4), and the segments it follows from.
+    """Return the last move (7,), the pose's covariance (4, 4), the used segments and chi-square.
 
-    Besides, the squares of their shifts in parts of what they may have; None: too few agree.
+    Chi-square is per degree of freedom. None: too few segments agree.
     """
     rows, shifts, weights = equations
     away = np.abs(shifts) * np.sqrt(weights)
-    kept, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
-    if kept.any():  # where the whole part is not quite the taught one, as in too much light
-        spread = max(1.4826 * float(np.median(away[kept])), 1.0)
+    used, freedom, chi_square, spread = weights > 0, 1, 1.0, 1.0
+    if used.any():  # if the whole part differs from the taught one, as in too much light
+        spread = max(1.4826 * float(np.median(away[used])), 1.0)
     for _ in range(3):
-        kept = (weights > 0) & (away <= CUT * spread)
-        if np.count_nonzero(kept) < MIN_SEEN:
+        used = (weights > 0) & (away <= MAX_DEVIATION_SIGMAS * spread)
+        if np.count_nonzero(used) < MIN_SEGMENTS:
             return None
-        freedom = max(int(kept.sum()) - 4, 1)
-        chi_square = float((away[kept] ** 2).sum()) / freedom
+        freedom = max(int(used.sum()) - 4, 1)
+        chi_square = float((away[used] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
-    misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part is not quite the taught one
-    weighted = rows[kept], shifts[kept], weights[kept]
-    solved = _changed(weighted, free, off, sigmas, max(chi_square, 1.0))
+    misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part differs from the taught one
+    weighted = rows[used], shifts[used], weights[used]
+    solved = _changed(weighted, free, residuals, sigmas, max(chi_square, 1.0))
     if solved is None:
         return None
     move, covariance = solved
-    return move, covariance[:4, :4] * (chi_square if misfit else 1.0), kept, chi_square
+    return move, covariance[:4, :4] * (chi_square if misfit else 1.0), used, chi_square
 
 
 def _changed(
-    equations: Equations, free: NDArray[np.bool_], off: Array, sigmas: Array, chi_square: float
+    equations: Equations,
+    free: NDArray[np.bool_],
+    residuals: Array,
+    sigmas: Array,
+    chi_square: float,
 ) -> tuple[Array, Array] | None:
-    """Return the solution in which the part is as it is expected where it may be.
+    """Return the solution in which the part has its expected shape, as far as that is allowed.
 
-    What the edges say of a change beyond their own error says how large that change may be.
+    A change is fitted only if it is significant; its size then bounds it in the second fit.
     """
     rows, shifts, weights = equations
-    solved = _least_squares(equations, free, off, sigmas)
+    solved = _least_squares(equations, free, residuals, sigmas)
     if solved is None:
         return None
     move, covariance = solved
     by_edges = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
-    beyond = (off + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
+    beyond = (residuals + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
     none = (beyond <= 0) & np.isfinite(sigmas)
     known = np.minimum(np.sqrt(np.maximum(beyond, 1e-12)), sigmas)
     known = np.where(np.isfinite(sigmas), known, sigmas)
-    shifts = shifts + rows[:, 3:] @ np.where(none, off, 0.0)
-    kept = free.copy()
-    kept[3:] &= ~none
-    solved = _least_squares((rows, shifts, weights), kept, off, known)
+    shifts = shifts + rows[:, 3:] @ np.where(none, residuals, 0.0)
+    freed = free.copy()
+    freed[3:] &= ~none
+    solved = _least_squares((rows, shifts, weights), freed, residuals, known)
     if solved is not None:
-        solved[0][3:][none] = -off[none]
+        solved[0][3:][none] = -residuals[none]
     return solved
 
 

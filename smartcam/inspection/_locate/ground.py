@@ -34,7 +34,7 @@ have at least where the ground is not of one level; by noise alone it is 1.3."""
 MIN_BANDS: Final = 12
 """Least number of bands from which the light on the ground is computed."""
 
-NEAR_PX: Final = 10.0
+GROUND_DISTANCE_PX: Final = 10.0
 """Standard deviation of the distance of the bands from which the ground beside a band is measured,
 in pixels of the taught picture."""
 
@@ -75,18 +75,18 @@ def ground_beside(
     if np.count_nonzero(measured) < MIN_BANDS:
         return None
     by_noise = float(np.median(variances[measured])) * np.diagonal(inverse, axis1=1, axis2=2)
-    found = []
-    for side, way in ((3, -0.5), (4, 0.5)):
+    grounds = []
+    for side, shift in ((3, -0.5), (4, 0.5)):
         squares, noise = values[measured, side] ** 2, by_noise[measured, side]
         if float(np.percentile(squares / noise, 75)) < GROUND_SQUARE:
-            found.append(np.zeros(len(used)))
+            grounds.append(np.zeros(len(used)))
             continue
-        at = segments.middles + way * BAND_PX * segments.normals
-        far = np.linalg.norm(at[:, None] - at[measured], axis=2)
-        near = np.exp(-0.5 * (far / NEAR_PX) ** 2) / noise
-        beyond = (near @ (squares - noise)) / np.maximum(near.sum(axis=1), 1e-9)
-        found.append(np.sqrt(np.maximum(beyond, 0.0)))
-    return Ground(*found) if any(one.any() for one in found) else None
+        at = segments.middles + shift * BAND_PX * segments.normals
+        distances = np.linalg.norm(at[:, None] - at[measured], axis=2)
+        closeness = np.exp(-0.5 * (distances / GROUND_DISTANCE_PX) ** 2) / noise
+        beyond = (closeness @ (squares - noise)) / np.maximum(closeness.sum(axis=1), 1e-9)
+        grounds.append(np.sqrt(np.maximum(beyond, 0.0)))
+    return Ground(*grounds) if any(ground.any() for ground in grounds) else None
 
 
 def fit_on_ground(
@@ -97,7 +97,7 @@ def fit_on_ground(
     columns, known = [np.ones_like(rise), rise, slope], [np.zeros_like(ground.dark)] * 3
     for side, steep in ((1 - rise, ground.dark), (rise, ground.bright)):
         if steep.any():
-            columns += [side * way / BAND_PX for way in places]
+            columns += [side * place / BAND_PX for place in places]
             known += [1 / np.maximum(steep / noise, LEAST_PART) ** 2] * 2
     values, inverse, variances, freedoms = _solved(
         np.stack(columns), pixels, np.column_stack(known)
@@ -118,19 +118,19 @@ def fit_on_ground(
 
 
 def common_error(
-    segments: Segments, shifts: Array, kept: NDArray[np.bool_], *, sure: bool
+    segments: Segments, shifts: Array, used: NDArray[np.bool_], *, sure: bool
 ) -> float:
     """Return the factor of a pose's variance for errors that neighbours have in common.
 
     ``shifts`` (N,): in parts of their standard deviations. ``sure``: there are such errors; else
     there are where they are more than chance.
     """
-    middles, normals, z = segments.middles[kept], segments.normals[kept], shifts[kept]
-    near = np.linalg.norm(middles[:, None] - middles, axis=2) <= COMMON_PX
-    near &= normals @ normals.T >= COMMON_DIRECTION
-    np.fill_diagonal(near, val=False)
-    common = float(z @ near @ z) / max(float(z @ z), 1e-9)
-    chance = math.sqrt(2 * int(near.sum())) / max(len(z), 1)
+    middles, normals, z = segments.middles[used], segments.normals[used], shifts[used]
+    is_near = np.linalg.norm(middles[:, None] - middles, axis=2) <= COMMON_PX
+    is_near &= normals @ normals.T >= COMMON_DIRECTION
+    np.fill_diagonal(is_near, val=False)
+    common = float(z @ is_near @ z) / max(float(z @ z), 1e-9)
+    chance = math.sqrt(2 * int(is_near.sum())) / max(len(z), 1)
     return 1 + max(common, 0.0) if sure or common > CHANCES * chance else 1.0
 
 
@@ -144,7 +144,8 @@ def _solved(columns: Array, pixels: BandPixels, known: Array) -> tuple[Array, Ar
     """Return the values (N, K) of bands, and their covariance for noise of one grey level.
 
     Besides, the pixels' variance about them, 0 where a band has too few, and degrees of freedom.
-    ``known`` (N, K): the variance of the noise in parts of that of each value; 0: it is unknown.
+    ``known`` (N, K): the variance of the noise relative to the variance of each value; 0: it is
+    unknown.
     """
     owners, (count, size) = pixels.owners, known.shape
     number = np.bincount(owners, minlength=count).astype(np.float64)

@@ -201,16 +201,16 @@ class PartModel:
             ConfigurationError: an argument is wrong.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
-        who = "PartModel.from_outline"
-        path = check_path(path, "path", who)
-        scale = check_number(pixels_per_mm, "pixels_per_mm", 0, 1e4, who, above=True)
-        name = check_text(name, "name", who, least=1)
-        bright = check_flag(bright, "bright", who)
+        caller = "PartModel.from_outline"
+        path = check_path(path, "path", caller)
+        scale = check_number(pixels_per_mm, "pixels_per_mm", 0, 1e4, caller, above=True)
+        name = check_text(name, "name", caller, least=1)
+        bright = check_flag(bright, "bright", caller)
         if unit is not None:
-            check_choice(unit, "unit", tuple(MM), who)
+            check_choice(unit, "unit", tuple(MM), caller)
         if isinstance(layers, str | bytes) or not isinstance(layers, Sequence):
-            raise wrong_argument("layers", "a sequence of names", layers, who)
-        layers = [check_text(one, "layers", who, least=1) for one in layers]
+            raise wrong_argument("layers", "a sequence of names", layers, caller)
+        layers = [check_text(layer, "layers", caller, least=1) for layer in layers]
         picture, (x, y) = drawn_outline(read_outline(path, scale, unit, layers), bright=bright)
         model = _taught(Picture.of(picture), None, name, None)
         return replace(model, reference=(model.reference[0] + x, model.reference[1] + y))
@@ -284,8 +284,10 @@ class PartModel:
     @cached_property
     def coarse(self) -> CoarseModel:
         """The points for the coarse search."""
-        some = [self.segments.selected(one) for one in self.levels]
-        return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
+        levels = [self.segments.selected(level) for level in self.levels]
+        return CoarseModel(
+            tuple(level.middles for level in levels), tuple(level.normals for level in levels)
+        )
 
     def bands_at(self, scale: float) -> Bands:
         """Return the bands of the segments, wider for a smaller part, so that pixels suffice."""
@@ -302,8 +304,10 @@ class PartModel:
     def hull(self) -> Array:
         """The convex hull of the outline, (K, 2)."""
         cv2 = load("cv2", "inspection needs")
-        found: Array = cv2.convexHull(self.outline.astype(np.float32))[:, 0].astype(np.float64)
-        return found
+        hull_points: Array = cv2.convexHull(self.outline.astype(np.float32))[:, 0].astype(
+            np.float64
+        )
+        return hull_points
 
     @cached_property
     def contours(self) -> tuple[Array, ...]:
@@ -314,21 +318,25 @@ class PartModel:
         mask = np.zeros(at.max(axis=0)[::-1] + 4, np.uint8)
         mask[at[:, 1], at[:, 0]] = 1
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        found, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        outer = [one for one, (_, _, _, parent) in zip(found, tree, strict=True) if parent < 0]
+        outlines, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        outer = [
+            outline for outline, (_, _, _, parent) in zip(outlines, tree, strict=True) if parent < 0
+        ]
         outer.sort(key=len, reverse=True)
-        polygons = [_simpler(one) for one in outer[:MAX_CONTOURS] if len(one) >= MIN_CONTOUR_PX]
-        return tuple(one.astype(np.float64) + low for one in polygons)
+        polygons = [
+            _simpler(outline) for outline in outer[:MAX_CONTOURS] if len(outline) >= MIN_CONTOUR_PX
+        ]
+        return tuple(polygon.astype(np.float64) + low for polygon in polygons)
 
 
 def _simpler(contour: NDArray[Any]) -> NDArray[Any]:
     """Return a polygon (K, 2) of few corners along a contour (N, 1, 2)."""
     cv2 = load("cv2", "inspection needs")
-    off = 0.7
-    while len(polygon := cv2.approxPolyDP(contour, off, True)) > MAX_CONTOUR_CORNERS:
-        off *= 1.5
-    found: NDArray[Any] = polygon[:, 0]
-    return found
+    tolerance = 0.7
+    while len(polygon := cv2.approxPolyDP(contour, tolerance, True)) > MAX_CONTOUR_CORNERS:
+        tolerance *= 1.5
+    corners: NDArray[Any] = polygon[:, 0]
+    return corners
 
 
 # ---------------------------------------------------------------------- teaching
@@ -348,17 +356,17 @@ def _taught(
     top = float(2**picture.depth - 1)
     noise = noise_of(levels) * 255 / top
     least = max(DEFAULT_CONTRAST, MIN_CONTRAST_NOISES * noise) if contrast is None else contrast
-    found = edge_points(grey, least)
-    kept, border = _inside(found.points, mask)
-    found = type(found)(*(one[kept] for one in found))
+    image_edges = edge_points(grey, least)
+    inside_mask, border = _inside(image_edges.points, mask)
+    image_edges = type(image_edges)(*(array[inside_mask] for array in image_edges))
     if border > MAX_BORDER_SHARE:
         raise TeachingError(
             TeachingTrouble.BORDER,
             f"{100 * border:.0f} % of the edges lie at the border of the region: expected a region "
             "that goes around the part, some pixels away from it",
         )
-    rough = segments_of(found)
-    edges = fit_segments(levels, rough, found.points, top) if len(rough.halves) else None
+    rough = segments_of(image_edges)
+    edges = fit_segments(levels, rough, image_edges.points, top) if len(rough.halves) else None
     exact = np.zeros(0, int) if edges is None else np.flatnonzero(edges.exact)
     if edges is None or len(exact) < MIN_SEGMENTS:
         raise TeachingError(
@@ -367,19 +375,21 @@ def _taught(
             f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
         )
     segments = edges.segments.selected(exact)
-    moves = blurred_moves(levels, segments, found.points)
+    moves = blurred_moves(levels, segments, image_edges.points)
     segments = segments._replace(moves=moves)
     _check_directions(segments)
-    centre = found.points.mean(axis=0)
+    centre = image_edges.points.mean(axis=0)
     segments = _ordered(segments._replace(middles=segments.middles - centre))
-    symmetry, off = find_symmetry(segments, found.points - centre, found.normals)
-    segments, centre = segments._replace(middles=segments.middles - off), centre + off
-    off = _off_middle(segments, found.points - centre, symmetry.fold, (levels, centre, noise))
-    segments, centre = segments._replace(middles=segments.middles - off), centre + off
+    symmetry, asymmetry = find_symmetry(segments, image_edges.points - centre, image_edges.normals)
+    segments, centre = segments._replace(middles=segments.middles - asymmetry), centre + asymmetry
+    asymmetry = _off_middle(
+        segments, image_edges.points - centre, symmetry.fold, (levels, centre, noise)
+    )
+    segments, centre = segments._replace(middles=segments.middles - asymmetry), centre + asymmetry
     return PartModel(
         name=name,
         segments=segments,
-        outline=found.points - centre,
+        outline=image_edges.points - centre,
         levels=_levels(segments, grey, centre),
         symmetry=symmetry,
         reference=(float(centre[0]) + corner[0], float(centre[1]) + corner[1]),
@@ -399,14 +409,14 @@ def _off_middle(
     levels, (x, y), noise = taught
     turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
     use = FineSettings(np.full(len(segments.halves), MIN_SELF_CONTRAST), noise, turned=fold != 0)
-    found = []
+    offsets = []
     for number in range(turns if fold != 1 else 0):
         start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
         fine = fit_pose(levels, segments, bands, start, use)
         if fine is None:
             return np.zeros(2)
-        found.append((fine.pose.x - x, fine.pose.y - y))
-    return np.mean(found, axis=0) if found else np.zeros(2)
+        offsets.append((fine.pose.x - x, fine.pose.y - y))
+    return np.mean(offsets, axis=0) if offsets else np.zeros(2)
 
 
 def _mask(
@@ -447,9 +457,9 @@ def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
     at = np.rint(points).astype(int)
     at = at.clip(0, np.array(mask.shape[::-1]) - 1)
     inside = depth[at[:, 1], at[:, 0]]
-    kept = inside > BORDER_PX
-    touching = int(np.count_nonzero((inside > 0) & ~kept))
-    return kept, touching / max(touching + int(np.count_nonzero(kept)), 1)
+    inside_border = inside > BORDER_PX
+    touching = int(np.count_nonzero((inside > 0) & ~inside_border))
+    return inside_border, touching / max(touching + int(np.count_nonzero(inside_border)), 1)
 
 
 def _ordered(segments: Segments) -> Segments:
@@ -477,15 +487,15 @@ def _levels(
 ) -> tuple[NDArray[np.intp], ...]:
     """Return the segments that are visible at each level of the pyramid, from level 0."""
     cv2 = load("cv2", "inspection needs")
-    found = [np.arange(len(segments.halves))]
+    levels = [np.arange(len(segments.halves))]
     radius = float(np.linalg.norm(segments.middles, axis=1).max())
     for level in range(1, MAX_LEVELS):
         grey = cv2.pyrDown(grey)
         seen = _seen_at(segments, grey, centre, level)
         if len(seen) < MIN_TOP_POINTS or radius / 2**level < MIN_RADIUS_PX:
             break
-        found.append(seen)
-    return tuple(found)
+        levels.append(seen)
+    return tuple(levels)
 
 
 def _seen_at(
@@ -493,7 +503,7 @@ def _seen_at(
 ) -> NDArray[np.intp]:
     """Return the segments whose direction is visible at a level, at most one for each pixel."""
     cv2 = load("cv2", "inspection needs")
-    across, down = (cv2.Sobel(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *direction) for direction in ((1, 0), (0, 1)))
     exact = (segments.middles + centre) / 2**level
     limit = np.array(grey.shape[::-1]) - 1
     agreed = np.zeros(len(exact), dtype=np.bool_)
@@ -559,9 +569,17 @@ class _ModelFile(BaseModel):
     @classmethod
     def of(cls, model: PartModel) -> _ModelFile:
         """Return the file of a model; places are rounded to a ten-thousandth of a pixel."""
-        one = model.segments
+        segments = model.segments
         rows = np.column_stack(
-            [one.middles, one.normals, one.bends, one.halves, one.heights, one.blurs, one.sigmas]
+            [
+                segments.middles,
+                segments.normals,
+                segments.bends,
+                segments.halves,
+                segments.heights,
+                segments.blurs,
+                segments.sigmas,
+            ]
         )
         return cls(
             name=model.name,
@@ -572,8 +590,8 @@ class _ModelFile(BaseModel):
             alike=list(model.symmetry.alike),
             about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
-            moves=one.moves.round(5).tolist(),
-            levels=[one.tolist() for one in model.levels],
+            moves=segments.moves.round(5).tolist(),
+            levels=[level.tolist() for level in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
         )
 
@@ -586,7 +604,7 @@ class _ModelFile(BaseModel):
             name=self.name,
             segments=Segments(rows[:, :2], normals, *numbers, np.array(self.moves)),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
-            levels=tuple(np.array(one, np.intp) for one in self.levels),
+            levels=tuple(np.array(level, np.intp) for level in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
             reference=self.reference,
             border=self.border,

@@ -42,7 +42,7 @@ MAX_FILE_BYTES: Final = 1 << 24
 """Largest number of bytes of an outline's file."""
 
 MAX_POINTS: Final = 200_000
-"""Largest number of corners of an outline, those of curves included."""
+"""Largest number of corners of an outline, including corners of curves."""
 
 MAX_NESTED: Final = 30
 """Largest depth of nested groups in SVG."""
@@ -103,7 +103,7 @@ def read_outline(
         raise TeachingError(
             TeachingTrouble.UNREADABLE, f"{path}: expected a file with the ending .dxf or .svg"
         )
-    found: list[Array] = []
+    outline_lines: list[Array] = []
     count = 0
     for line in lines:
         count += len(line)
@@ -113,28 +113,28 @@ def read_outline(
                 f"{path}: expected {MAX_POINTS} corners at most, all of them finite numbers",
             )
         if len(line) > 1:
-            found.append(line)
-    return Outline(_closed(path, found, pixels_per_mm))
+            outline_lines.append(line)
+    return Outline(_closed(path, outline_lines, pixels_per_mm))
 
 
 def _closed(path: Path, lines: list[Array], pixels_per_mm: float) -> list[Array]:
     """Join lines (K, 2) to loops."""
     loops: list[Array] = []
-    rest = list(lines)
-    while rest:
-        loop = rest.pop()
+    open_lines = list(lines)
+    while open_lines:
+        loop = open_lines.pop()
         while np.linalg.norm(loop[0] - loop[-1]) > JOIN_PX or len(loop) < 3:
-            ends = np.array([one[[0, -1]] for one in rest]).reshape(-1, 2)
-            off = np.linalg.norm(ends - loop[-1], axis=1)
-            if not len(off) or off.min() > JOIN_PX:
+            ends = np.array([line[[0, -1]] for line in open_lines]).reshape(-1, 2)
+            distances = np.linalg.norm(ends - loop[-1], axis=1)
+            if not len(distances) or distances.min() > JOIN_PX:
                 x, y = loop[-1] / pixels_per_mm * [1.0, -1.0]
                 raise TeachingError(
                     TeachingTrouble.NO_OUTLINE,
                     f"{path}: expected closed outlines, got a line that ends at {x:.4g}, {y:.4g} mm"
                     " (y up) and meets no other one there",
                 )
-            nearest = int(np.argmin(off))
-            other = rest.pop(nearest // 2)
+            nearest = int(np.argmin(distances))
+            other = open_lines.pop(nearest // 2)
             loop = np.concatenate([loop, other[::-1] if nearest % 2 else other])
         loops.append(loop)
     if not loops:
@@ -176,7 +176,9 @@ def _dxf_lines(
                     "the outline",
                 ) from exc
             for part in curve.sub_paths():
-                corners = np.array([tuple(one) for one in part.flattening(FLATNESS_PX / scale, 16)])
+                corners = np.array(
+                    [tuple(point) for point in part.flattening(FLATNESS_PX / scale, 16)]
+                )
                 if len(corners) and np.ptp(corners[:, 2]) * scale > JOIN_PX:
                     raise TeachingError(
                         TeachingTrouble.UNSUPPORTED,
@@ -220,17 +222,21 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
     if unit is not None:
         return MM[unit]
     sizes = [_length(root.get(name, "")) for name in ("width", "height")]
-    box = [float(one) for one in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if one]
+    box = [
+        float(number) for number in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if number
+    ]
     if None in sizes:
         raise TeachingError(
             TeachingTrouble.UNIT,
             f'{path}: its width and height have no unit, such as width="50mm": set unit to one of '
             f"{', '.join(MM)}",
         )
-    millimetres = [(one[0] * MM[one[1]], one[1]) for one in sizes if one is not None]
+    millimetres = [(size[0] * MM[size[1]], size[1]) for size in sizes if size is not None]
     if not box:
         return MM["px"]
-    across, down = (one[0] / side for one, side in zip(millimetres, box[2:], strict=True))
+    across, down = (
+        millimetre[0] / side for millimetre, side in zip(millimetres, box[2:], strict=True)
+    )
     if not (across > 0 and abs(down / across - 1) < 1e-3):
         raise TeachingError(
             TeachingTrouble.UNIT,
@@ -241,8 +247,8 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
 
 
 def _length(text: str) -> tuple[float, str] | None:
-    found = re.fullmatch(r"\s*([\d.eE+-]+)\s*(mm|cm|in|px)\s*", text)
-    return None if found is None else (float(found[1]), SVG_UNITS[found[2]])
+    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(mm|cm|in|px)\s*", text)
+    return None if match is None else (float(match[1]), SVG_UNITS[match[2]])
 
 
 class _SvgReader:
@@ -298,7 +304,9 @@ class _SvgReader:
         if tag == "path":
             yield from _path_lines(element.get("d", ""), flat)
         elif tag in {"polygon", "polyline"}:
-            numbers = [float(one) for one in re.split(r"[\s,]+", element.get("points", "")) if one]
+            numbers = [
+                float(number) for number in re.split(r"[\s,]+", element.get("points", "")) if number
+            ]
             corners = np.array(numbers).reshape(-1, 2)
             yield corners if tag == "polyline" else _loop(corners)
         elif tag == "line":
@@ -325,7 +333,7 @@ class _SvgReader:
 
 def _style(element: ElementTree.Element) -> dict[str, str]:
     """Return the values of an element's style, by name."""
-    pairs = (one.partition(":") for one in element.get("style", "").split(";"))
+    pairs = (declaration.partition(":") for declaration in element.get("style", "").split(";"))
     return {name.strip(): value.strip() for name, _, value in pairs if name.strip()}
 
 
@@ -355,15 +363,15 @@ def _path_lines(text: str, flat: float) -> Iterator[Array]:
     pen = load("fontTools.pens.recordingPen").RecordingPen()
     load("fontTools.svgLib.path").parse_path(text, pen)
     line: list[Any] = []
-    for what, places in pen.value:
-        if what == "moveTo":
+    for command, places in pen.value:
+        if command == "moveTo":
             line = list(places)
-        elif what == "lineTo":
+        elif command == "lineTo":
             line += places
-        elif what in {"curveTo", "qCurveTo"}:
+        elif command in {"curveTo", "qCurveTo"}:
             line += _curve(np.array([line[-1], *places], np.float64), flat)
         else:
-            yield _loop(np.array(line)) if what == "closePath" else np.array(line)
+            yield _loop(np.array(line)) if command == "closePath" else np.array(line)
 
 
 def _curve(corners: Array, flat: float) -> list[Any]:
@@ -373,7 +381,9 @@ def _curve(corners: Array, flat: float) -> list[Any]:
     part = np.linspace(0, 1, count + 1)[1:, None]
     order = len(corners) - 1
     weights = [math.comb(order, k) * part**k * (1 - part) ** (order - k) for k in range(order + 1)]
-    return [*np.sum([one * corner for one, corner in zip(weights, corners, strict=True)], axis=0)]
+    return [
+        *np.sum([weight * corner for weight, corner in zip(weights, corners, strict=True)], axis=0)
+    ]
 
 
 _TRANSFORM: Final = re.compile(r"\s*(\w+)\s*\(([^)]*)\)\s*,?")
@@ -384,12 +394,12 @@ def _matrix(text: str) -> Array:
     matrix = np.eye(3)
     at = 0
     while at < len(text):
-        found = _TRANSFORM.match(text, at)
-        if found is None:
+        match = _TRANSFORM.match(text, at)
+        if match is None:
             raise ValueError(f"transform: expected functions, got {text[at:]!r:.60}")
-        at = found.end()
+        at = match.end()
         matrix = matrix @ _one_matrix(
-            found[1], [float(x) for x in re.findall(r"[^\s,]+", found[2])]
+            match[1], [float(x) for x in re.findall(r"[^\s,]+", match[2])]
         )
     return matrix
 

@@ -52,7 +52,7 @@ class Segments(NamedTuple):
 
     def selected(self, which: NDArray[Any]) -> Segments:
         """Return some of the segments."""
-        return Segments(*(one[which] for one in self))
+        return Segments(*(array[which] for array in self))
 
     @property
     def tangents(self) -> Array:
@@ -80,15 +80,17 @@ class Segments(NamedTuple):
         known = np.column_stack([np.zeros(len(self.moves)), self.moves])
         low, high = (0.0, *BLURS_PX2)[above : above + 2]
         part = (at - low) / (high - low)
-        found: Array = (1 - part) * known[:, above] + part * known[:, above + 1]
-        return found
+        moved: Array = (1 - part) * known[:, above] + part * known[:, above + 1]
+        return moved
 
     def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the coordinates of points (P, 2) in their segments: across and along the edge."""
-        off = points - self.middles[owners]
+        offsets = points - self.middles[owners]
         nx, ny = self.normals[owners].T
-        along = nx * off[:, 1] - ny * off[:, 0]
-        return nx * off[:, 0] + ny * off[:, 1] - 0.5 * self.bends[owners] * along * along, along
+        along = nx * offsets[:, 1] - ny * offsets[:, 0]
+        return nx * offsets[:, 0] + ny * offsets[:, 1] - 0.5 * self.bends[
+            owners
+        ] * along * along, along
 
 
 class Bands(NamedTuple):
@@ -110,10 +112,10 @@ def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Ban
     seeds = np.full((int(size[1]), int(size[0])), -2, np.int32)
     at = np.rint(points - low).astype(int)
     seeds[at[:, 1], at[:, 0]] = owners
-    own = cv2.dilate((seeds >= 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    own_area = cv2.dilate((seeds >= 0).astype(np.uint8), np.ones((3, 3), np.uint8))
     beside = np.rint(others - low).astype(int)
     beside = beside[((beside >= 0) & (beside < size)).all(axis=1)]
-    beside = beside[own[beside[:, 1], beside[:, 0]] == 0]
+    beside = beside[own_area[beside[:, 1], beside[:, 0]] == 0]
     seeds[beside[:, 1], beside[:, 0]] = -1
     free = (seeds == -2).astype(np.uint8)
     distance, nearest = cv2.distanceTransformWithLabels(
@@ -123,12 +125,12 @@ def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Ban
     owner_of[nearest[free == 0]] = seeds[free == 0]
     labels = owner_of[nearest]
     rows, columns = np.nonzero((labels >= 0) & (distance <= reach + 1))
-    mine = labels[rows, columns].astype(np.intp)
-    across, along = segments.places(np.column_stack([columns, rows]) + low, mine)
-    within = (np.abs(across) <= reach) & (np.abs(along) <= segments.halves[mine] + 0.5)
-    kept = np.full(labels.shape, -1, np.int16)
-    kept[rows[within], columns[within]] = mine[within]
-    return Bands(kept, (int(low[0]), int(low[1])))
+    owners_in_band = labels[rows, columns].astype(np.intp)
+    across, along = segments.places(np.column_stack([columns, rows]) + low, owners_in_band)
+    within = (np.abs(across) <= reach) & (np.abs(along) <= segments.halves[owners_in_band] + 0.5)
+    numbers = np.full(labels.shape, -1, np.int16)
+    numbers[rows[within], columns[within]] = owners_in_band[within]
+    return Bands(numbers, (int(low[0]), int(low[1])))
 
 
 class BandPixels(NamedTuple):
@@ -152,11 +154,11 @@ def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
     high = np.minimum(np.ceil(box.max(axis=0)).astype(int) + 1, levels.shape[::-1])
     if (high <= low).any():
         return BandPixels(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp))
-    way = matrix.copy()
-    way[:, 2] += matrix[:, :2] @ bands.corner - low
+    axes = matrix.copy()
+    axes[:, 2] += matrix[:, :2] @ bands.corner - low
     labels = cv2.warpAffine(
         bands.labels,
-        way,
+        axes,
         tuple(map(int, high - low)),
         flags=cv2.INTER_NEAREST,
         borderMode=cv2.BORDER_CONSTANT,

@@ -109,8 +109,8 @@ class LocateSettings(ToolSettings):
     def _goes_together(self) -> LocateSettings:
         given = [name for name in ("model", "taught", "outline") if getattr(self, name) is not None]
         if len(given) != 1:
-            got = " and ".join(given) or "none of them"
-            raise ValueError(f"expected a model, a taught picture or an outline, got {got}")
+            actual = " and ".join(given) or "none of them"
+            raise ValueError(f"expected a model, a taught picture or an outline, got {actual}")
         if (self.outline is None) != (self.pixels_per_mm is None):
             raise ValueError("expected outline: and pixels_per_mm: together")
         if self.unit is not None and self.outline is None:

@@ -23,11 +23,11 @@ MIN_ALIKE_SHARE: Final = 0.75
 MAX_FOLD: Final = 24
 """Largest fold of a symmetry that is distinguished from a round part."""
 
-NEAR_PX: Final = 1.5
+OUTLINE_DISTANCE_PX: Final = 1.5
 """Largest distance of a turned point from the outline, pixels."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Largest angle between the direction of a turned edge and that of the edge that it lies on."""
+"""Largest angle between the direction of a turned edge and the direction of the edge below it."""
 
 CENTRE_STEPS: Final = 6
 """Number of iterations that find the centre of a part's turns."""
@@ -91,7 +91,7 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
     ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
     is measured to a fraction of a pixel.
 
-    The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
+    The place (2,) is the centre of a symmetric part; for other parts the reference, (0, 0).
     """
     shares = _shares(points, normals)
     best, most = Symmetry(1, _alike(shares, 1)), MIN_ALIKE_SHARE
@@ -123,7 +123,7 @@ def _centre(segments: Segments, count: int) -> Array:
     centre = np.zeros(2)
     index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
     for step in range(CENTRE_STEPS):
-        near = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
+        reach = max(CENTRE_PX * (1 - step / 4), OUTLINE_DISTANCE_PX)
         rows, values = [], []
         for number in range(1, count):
             angle = 2 * math.pi * number / count
@@ -131,12 +131,12 @@ def _centre(segments: Segments, count: int) -> Array:
             turn = np.array([[cos, -sin], [sin, cos]])
             moved = (segments.middles - centre) @ turn.T + centre
             met = index.query(moved)[1]
-            off, along = segments.places(moved, met)
+            across, along = segments.places(moved, met)
             agreed = (segments.normals @ turn.T * segments.normals[met]).sum(axis=1)
-            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(off) <= near)
+            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(across) <= reach)
             used &= np.abs(along) <= segments.halves[met] + 1
             rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
-            values.append(-off[used])
+            values.append(-across[used])
         if sum(map(len, values)) < MIN_PAIRED_SEGMENTS:
             return np.zeros(2)
         centre = centre + np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
@@ -163,7 +163,7 @@ def _shares(points: Array, normals: Array) -> Array:
         columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
         met = point_of[nearest[rows, columns]]
         agreed = (normals[met] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(MAX_TURN)
-        shares[number] = (agreed & (distance[rows, columns] <= NEAR_PX)).mean()
+        shares[number] = (agreed & (distance[rows, columns] <= OUTLINE_DISTANCE_PX)).mean()
     return shares
 
 
@@ -173,6 +173,8 @@ def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
     inside = shares[:period]
     before, after = np.roll(inside, 1), np.roll(inside, -1)
     peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= MIN_ALIKE_SHARE))
-    far = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
-    order = far[np.argsort(-inside[far], kind="stable")][:8]
-    return tuple((2 * math.pi * one / ANGLE_COUNT, float(shares[one])) for one in order.tolist())
+    distant = peaks[(peaks > ANGLE_COUNT // 36) & (peaks < period - ANGLE_COUNT // 36)]
+    order = distant[np.argsort(-inside[distant], kind="stable")][:8]
+    return tuple(
+        (2 * math.pi * place / ANGLE_COUNT, float(shares[place])) for place in order.tolist()
+    )

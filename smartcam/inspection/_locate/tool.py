@@ -67,7 +67,7 @@ class Locate(Tool[LocateSettings]):
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
         load("scipy.special", "locate needs")  # saves the first picture the import
-        self.models = [PartModel.read(setup.folder / one) for one in settings.models]
+        self.models = [PartModel.read(setup.folder / model) for model in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
             model = PartModel.teach(Picture.read(file), settings.part, name=file.stem)
@@ -145,50 +145,50 @@ class Locate(Tool[LocateSettings]):
         """Return the parts, the best first."""
         region = view.region
         box = (region.left, region.top, region.right, region.below)
-        whole = self.settings.region is None
-        found = locate(
+        everywhere = self.settings.region is None
+        located = locate(
             view.picture,
             self.models,
             self._search,
-            box=None if whole else box,
-            allowed=None if whole else region.contains,
+            box=None if everywhere else box,
+            allowed=None if everywhere else region.contains,
         )
         try:
-            poses = [in_plane(part, self._plane) for part in found.parts]
+            poses = [in_plane(part, self._plane) for part in located.parts]
         except NotMeasuredError as trouble:
             return Finding(
                 ok=False,
                 reason=f"{trouble.why.value}: {trouble.text}",
-                values=_values(found),
-                drawings=self._drawn(view, found, wrong=True),
-                details=found,
+                values=_values(located),
+                drawings=self._drawn(view, located, wrong=True),
+                details=located,
             )
-        reason = self._complaint(found, poses)
+        reason = self._complaint(located, poses)
         return Finding(
             ok=not reason,
             reason=reason,
-            values=_values(found),
+            values=_values(located),
             records=[
                 _record(part, pose, self._plane.unit)
-                for part, pose in zip(found.parts, poses, strict=True)
+                for part, pose in zip(located.parts, poses, strict=True)
             ],
-            drawings=self._drawn(view, found, wrong=bool(reason)),
-            reference=found.parts[0].pose if found.parts else None,
-            details=found,
+            drawings=self._drawn(view, located, wrong=bool(reason)),
+            reference=located.parts[0].pose if located.parts else None,
+            details=located,
         )
 
-    def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
+    def _complaint(self, located: Located, poses: list[PlanePose]) -> str:
         """Return the reason why the found parts are not ok; "" if they are ok."""
         least, most = self._wanted
-        count, nearest = len(found.parts), found.nearest
+        count, nearest = len(located.parts), located.nearest
         if not least <= count <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
             wanted = f"{least} or more" if self.settings.count is None else wanted
             text = f"{count} found, expected {wanted}"
             if count < least:
-                text += _near(nearest, len(self.models) > 1)
+                text += _nearest_text(nearest, len(self.models) > 1)
             return text
-        for part, pose in zip(found.parts, poses, strict=True):
+        for part, pose in zip(located.parts, poses, strict=True):
             if part.doubt:
                 return f"{part.name}: {part.doubt}"
             sigma = math.sqrt(float(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1]))
@@ -198,14 +198,14 @@ class Locate(Tool[LocateSettings]):
                 return f"{part.name}: sigma is {sigma:.3g} {unit}, {limit:g} {unit} are allowed"
         return ""
 
-    def _drawn(self, view: View, found: Located, *, wrong: bool) -> list[Drawing]:
+    def _drawn(self, view: View, located: Located, *, wrong: bool) -> list[Drawing]:
         marks = [Drawing("polygon", _points(view.region.corners), "region")]
-        for part in found.parts:
+        for part in located.parts:
             marks += _marks(part, "wrong" if wrong else "found")
-        if not found.parts and found.nearest is not None:
-            near = found.nearest
-            text = f"{near.name}: {100 * near.score:.0f} %"
-            marks.append(Drawing("polygon", _points(near.hull), "hint", text))
+        if not located.parts and located.nearest is not None:
+            nearest_part = located.nearest
+            text = f"{nearest_part.name}: {100 * nearest_part.score:.0f} %"
+            marks.append(Drawing("polygon", _points(nearest_part.hull), "hint", text))
         return marks
 
 
@@ -214,16 +214,16 @@ def in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
     start = np.array([part.pose.x, part.pose.y, part.pose.angle])
     values = _pose_in(start, plane)
     columns = []
-    for way in np.diag(POSE_STEPS):
-        off = _pose_in(start + way, plane) - _pose_in(start - way, plane)
-        off[2] = math.remainder(off[2], 2 * math.pi)
-        columns.append(off / (2 * way.max()))
+    for step in np.diag(POSE_STEPS):
+        difference = _pose_in(start + step, plane) - _pose_in(start - step, plane)
+        difference[2] = math.remainder(difference[2], 2 * math.pi)
+        columns.append(difference / (2 * step.max()))
     slopes = np.column_stack(columns)
     covariance = slopes @ part.covariance[:3, :3] @ slopes.T
     for variant in plane.variants:
-        off = _pose_in(start, plane._replace(map=variant, variants=())) - values
-        off[2] = math.remainder(off[2], 2 * math.pi)
-        covariance = covariance + np.outer(off, off)
+        difference = _pose_in(start, plane._replace(map=variant, variants=())) - values
+        difference[2] = math.remainder(difference[2], 2 * math.pi)
+        covariance = covariance + np.outer(difference, difference)
     return PlanePose(values, covariance)
 
 
@@ -244,14 +244,14 @@ def _record(part: LocatedPart, pose: PlanePose, unit: str) -> dict[str, Any]:
     }
 
 
-def _values(found: Located) -> dict[str, Any]:
-    best = found.parts[0].score if found.parts else None
-    if best is None and found.nearest is not None:
-        best = found.nearest.score
-    return {"count": len(found.parts), "best_score": 0.0 if best is None else best}
+def _values(located: Located) -> dict[str, Any]:
+    best = located.parts[0].score if located.parts else None
+    if best is None and located.nearest is not None:
+        best = located.nearest.score
+    return {"count": len(located.parts), "best_score": 0.0 if best is None else best}
 
 
-def _near(nearest: LocatedPart | None, named: bool) -> str:
+def _nearest_text(nearest: LocatedPart | None, named: bool) -> str:
     if nearest is None:
         return "; nothing in the picture resembles it"
     name = f"{nearest.name} " if named else ""
@@ -265,15 +265,17 @@ def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
     axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
     text = f"{part.name} {100 * part.score:.0f} %"
     marks = [
-        Drawing("polygon", _points(one), role, "" if number else text)
-        for number, one in enumerate(part.contours or (part.hull,))
+        Drawing("polygon", _points(contour), role, "" if number else text)
+        for number, contour in enumerate(part.contours or (part.hull,))
     ]
     marks.append(Drawing("line", _points(axes), role))
     shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
     for places, which in shown:
         if len(places):
-            kept = np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
-            marks.append(Drawing("points", _points(places[kept]), which))
+            chosen = (
+                np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
+            )
+            marks.append(Drawing("points", _points(places[chosen]), which))
     return marks
 
 

@@ -217,7 +217,7 @@ def find_edges(
     """
     number = len(strips.middles)
     fits = inside(image, strips)
-    found = [
+    edges_of_strips = [
         StripEdges(
             (), NotMeasuredError(NoValueReason.OUTSIDE, "a part of it is outside of the picture")
         )
@@ -225,7 +225,7 @@ def find_edges(
     ]
     crossed = np.flatnonzero(fits)
     if not len(crossed):
-        return found
+        return edges_of_strips
     part = strips.selected(crossed)
     samples = len(crossed) * steps_of(strips.length) * steps_of(strips.width)
     if samples > MAX_SAMPLES or strips.width > MAX_WIDTH_PX:
@@ -240,10 +240,12 @@ def find_edges(
     candidates, counts = _candidates(profiles(image, part), part, settings, noise)
     steps = _steps(image, part, candidates, settings, noise, tilted=tilted)
     for index, owner in enumerate(crossed.tolist()):
-        mine = [one for one in steps if one.owner == index]
-        crowded = sum(map(len, candidates[index : index + 1])) > len(mine)
-        found[owner] = _of_strip(mine, settings, noise, crowded=crowded, count=counts[index])
-    return found
+        own_steps = [step for step in steps if step.owner == index]
+        crowded = sum(map(len, candidates[index : index + 1])) > len(own_steps)
+        edges_of_strips[owner] = _of_strip(
+            own_steps, settings, noise, crowded=crowded, count=counts[index]
+        )
+    return edges_of_strips
 
 
 def _of_strip(
@@ -253,10 +255,10 @@ def _of_strip(
     if crowded:
         text = f"more than {MAX_GROUP_EDGES} edges that are too near to each other to be separated"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
-    judged = [one for one in steps if wanted(one.edge, settings) or not one.settled]
+    judged = [step for step in steps if wanted(step.edge, settings) or not step.settled]
     too_many = None
     # if a fitted edge has too little contrast, the weaker edges have, too
-    if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
+    if count > MAX_EDGES and all(abs(step.edge.height) >= settings.contrast for step in steps):
         text = f"{count} edges in one strip, {MAX_EDGES} at most can be separated"
         too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
     if not judged and too_many is not None:
@@ -265,7 +267,10 @@ def _of_strip(
         kind = {"any": "", "rising": " from dark to light", "falling": " from light to dark"}
         text = f"no edge{kind[settings.polarity]} of {settings.contrast:g} grey levels"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_EDGE, text))
-    edges = tuple(JudgedEdge(one.edge, _trouble(one, settings, noise)) for one in judged)
+    edges = tuple(
+        JudgedEdge(judged_edge.edge, _trouble(judged_edge, settings, noise))
+        for judged_edge in judged
+    )
     return StripEdges(edges, too_many=too_many)
 
 
@@ -291,14 +296,16 @@ def _candidates(
     of_mean = noise / math.sqrt(max(strips.width, 1.0))
     floor = of_mean / math.sqrt(4 * math.sqrt(math.pi) * smooth**3)
     middle = (levels.shape[1] - 1) / 2
-    found, counts = [], []
+    candidates, counts = [], []
     for row in slopes:
         least = max(MIN_EDGE_SIGMAS * floor, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max()))
         peaks = [(at, side) for side in (row, -row) for at in _peaks(side, least)]
-        strongest = sorted(peaks, key=lambda one: -one[1][one[0]])[:MAX_EDGES]
-        found.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
+        strongest = sorted(
+            peaks, key=lambda place_and_levels: -place_and_levels[1][place_and_levels[0]]
+        )[:MAX_EDGES]
+        candidates.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
         counts.append(len(peaks))
-    return found, counts
+    return candidates, counts
 
 
 def _slopes(levels: Array, smooth: float) -> Array:
@@ -358,13 +365,13 @@ class _FittedStep(NamedTuple):
     settled: bool
 
 
-def _groups(candidates: list[Array], half: float, near: Array, reach: Array) -> list[_EdgeGroup]:
-    """Return the groups of edges; ``near`` and ``reach`` (N,), pixels, of each strip."""
+def _groups(candidates: list[Array], half: float, centres: Array, reach: Array) -> list[_EdgeGroup]:
+    """Return the groups of edges; ``centres`` and ``reach`` (N,), pixels, of each strip."""
     groups = []
     for owner, places in enumerate(candidates):
         if not len(places):
             continue
-        parts = np.split(places, np.flatnonzero(np.diff(places) >= near[owner]) + 1)
+        parts = np.split(places, np.flatnonzero(np.diff(places) >= centres[owner]) + 1)
         between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(parts)]
         for part, before, after in zip(parts, [-half, *between], [*between, half], strict=True):
             low = max(float(part[0] - reach[owner]), before)
@@ -384,16 +391,16 @@ def _steps(
 ) -> list[_FittedStep]:
     """Return steps fitted in two passes: the first finds the blur, which sets the reach."""
     number, half = len(candidates), strips.length / 2
-    near, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
+    centres, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
     blurs = np.ones(number)
-    groups = _groups(candidates, half, near, reach)
-    for one in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
-        if one.settled:
-            seen = _seen_blur(min(one.edge.blur, settings.most_blur))
-            near[one.owner] = max(near[one.owner], MAX_GROUP_GAP_BLURS * seen)
-            reach[one.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
-            blurs[one.owner] = one.edge.blur
-    groups = _groups(candidates, half, near, reach)
+    groups = _groups(candidates, half, centres, reach)
+    for group in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
+        if group.settled:
+            seen = _seen_blur(min(group.edge.blur, settings.most_blur))
+            centres[group.owner] = max(centres[group.owner], MAX_GROUP_GAP_BLURS * seen)
+            reach[group.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
+            blurs[group.owner] = group.edge.blur
+    groups = _groups(candidates, half, centres, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
 
@@ -413,26 +420,26 @@ def _fit_groups(
     blurs: Array | None = None,
 ) -> list[_FittedStep]:
     """Return the fitted steps of all groups; ``blurs`` (N,) of the strips; None: unknown."""
-    found = []
-    for count in sorted({len(one.places) for one in groups}):
-        some = [one for one in groups if len(one.places) == count]
-        owners = np.array([one.owner for one in some])
-        low, high = (np.array([one[end] for one in some]) for end in (2, 3))
+    steps = []
+    for count in sorted({len(group.places) for group in groups}):
+        groups_of_count = [group for group in groups if len(group.places) == count]
+        owners = np.array([group.owner for group in groups_of_count])
+        low, high = (np.array([group[end] for group in groups_of_count]) for end in (2, 3))
         pixels = cut(image, strips.selected(owners), low, high)
         if count > MAX_GROUP_EDGES:
             continue
-        places = np.array([one.places for one in some])
+        places = np.array([group.places for group in groups_of_count])
         known = None if blurs is None else blurs[owners]
         fits = fit_steps(pixels, places, tilted=tilted, blurs=known)
-        cut_off = np.zeros((len(some), 2))
+        cut_off = np.zeros((len(groups_of_count), 2))
         if blurs is not None and not settings.cut_off:
             cut_off = _cut_off(pixels, settings)
             if settings.clipped is not None:
                 masks = cut(settings.clipped, strips.selected(owners), low, high)
                 cut_off[:, 1] = np.maximum(cut_off[:, 1], _part(masks.levels > 0, pixels))
             cut_off[:, 1] = np.maximum(cut_off[:, 1], _plateaus(pixels, fits))
-        found += _steps_of(some, fits, pixels, cut_off, strips.length / 2, noise)
-    return sorted(found, key=lambda one: (one.owner, one.edge.place))
+        steps += _steps_of(groups_of_count, fits, pixels, cut_off, strips.length / 2, noise)
+    return sorted(steps, key=lambda step: (step.owner, step.edge.place))
 
 
 def _steps_of(
@@ -446,7 +453,7 @@ def _steps_of(
     counts = np.maximum(pixels.counts, 1.0)
     noises = np.maximum(np.sqrt(fits.variance), ROUNDING)
     covariance = fits.unit_covariance()[:, : fits.steps + 1, : fits.steps + 1]
-    found = []
+    steps = []
     for i, group in enumerate(groups):
         shared = covariance[i]
         for k, place in enumerate(fits.places[i].tolist()):
@@ -461,7 +468,7 @@ def _steps_of(
                 0.0,
             )
             edge = edge._replace(misfit=_misfit(edge, noise))
-            found.append(
+            steps.append(
                 _FittedStep(
                     group.owner,
                     edge,
@@ -471,7 +478,7 @@ def _steps_of(
                     bool(fits.settled[i]) and group.low <= place <= group.high,
                 )
             )
-    return found
+    return steps
 
 
 def _part(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
@@ -511,7 +518,7 @@ def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
     distance = 2 * _seen_blur(float(fits.blurs[strip])) + 0.5
     flat = np.abs(along[:, None] - places).min(axis=1) > distance
     level = np.searchsorted(places, along)
-    dark, bright = (flat & (level == one) for one in (heights.argmin(), heights.argmax()))
+    dark, bright = (flat & (level == extreme) for extreme in (heights.argmin(), heights.argmax()))
     noise = MIN_BRIGHT_NOISE_SHARE * _noise_in_steps(levels[dark], along[dark], beside[dark])
     values, counts = np.unique(levels[bright], return_counts=True)
     if noise < MIN_BRIGHT_NOISE_SHARE * MIN_UNSATURATED_NOISE or not len(values):
@@ -536,9 +543,11 @@ def _noise_in_steps(levels: Array, along: Array, beside: Array) -> float:
     if len(values) < 2 or len(levels) < 8:
         return 0.0
     plane = np.column_stack([np.ones(len(levels)), along, beside])
-    off = levels - plane @ np.linalg.lstsq(plane, levels, rcond=None)[0]
-    twice = np.diff(off, 2)  # differences of neighbours, since JPEG's errors are correlated
-    variance = min(float(off @ off) / (len(levels) - 3), float(twice @ twice) / (6 * len(twice)))
+    residuals = levels - plane @ np.linalg.lstsq(plane, levels, rcond=None)[0]
+    twice = np.diff(residuals, 2)  # differences of neighbours, since JPEG's errors are correlated
+    variance = min(
+        float(residuals @ residuals) / (len(levels) - 3), float(twice @ twice) / (6 * len(twice))
+    )
     return math.sqrt(max(variance / float(np.diff(values).min()) ** 2 - ROUNDING**2, 0.0))
 
 
@@ -582,31 +591,31 @@ def wanted(edge: Edge, settings: EdgeSettings) -> bool:
     return rises and abs(edge.height) >= settings.contrast
 
 
-def choose(found: StripEdges, which: Choice) -> Edge:
+def choose(strip_edges: StripEdges, which: Choice) -> Edge:
     """Return the chosen edge; raise NotMeasuredError if there is none, or no clear choice."""
-    if found.trouble is not None:
-        raise found.trouble
-    if found.too_many is not None and which != "strongest":
-        raise found.too_many
-    edges = found.edges
+    if strip_edges.trouble is not None:
+        raise strip_edges.trouble
+    if strip_edges.too_many is not None and which != "strongest":
+        raise strip_edges.too_many
+    edges = strip_edges.edges
     if which == "single" and len(edges) > 1:
         raise _several(edges, "one was")
     if which == "strongest":
-        return sound(max(edges, key=lambda one: abs(one.edge.height)))
+        return sound(max(edges, key=lambda judged_edge: abs(judged_edge.edge.height)))
     if which == "nearest":
-        return sound(min(edges, key=lambda one: abs(one.edge.place)))
+        return sound(min(edges, key=lambda judged_edge: abs(judged_edge.edge.place)))
     return sound(edges[-1 if which == "last" else 0])
 
 
-def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
+def choose_pair(strip_edges: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
     """Return the two edges of a bar; raise NotMeasuredError as :func:`choose`."""
-    if found.trouble is not None:
-        raise found.trouble
-    if found.too_many is not None:
-        raise found.too_many
-    edges = found.edges
+    if strip_edges.trouble is not None:
+        raise strip_edges.trouble
+    if strip_edges.too_many is not None:
+        raise strip_edges.too_many
+    edges = strip_edges.edges
     if len(edges) < 2:
-        place = found.edges[0].edge.place
+        place = strip_edges.edges[0].edge.place
         text = f"only one edge where two were expected, {place:.1f} px from the middle"
         raise NotMeasuredError(NoValueReason.NO_EDGE, text)
     if which == "outermost":
@@ -614,9 +623,9 @@ def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
     if which == "single" and len(edges) > 2:
         raise _several(edges, "two were")
     pairs = [
-        (one, other)
-        for one, other in itertools.pairwise(edges)
-        if one.edge.height * other.edge.height < 0
+        (first, other)
+        for first, other in itertools.pairwise(edges)
+        if first.edge.height * other.edge.height < 0
     ]
     if not pairs:
         text = (
@@ -625,18 +634,18 @@ def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
         raise NotMeasuredError(NoValueReason.NO_EDGE, text)
     pair = pairs[-1 if which == "last" else 0]
     if which == "strongest":
-        pair = max(pairs, key=lambda two: min(abs(one.edge.height) for one in two))
+        pair = max(pairs, key=lambda two: min(abs(judged_edge.edge.height) for judged_edge in two))
     return sound(pair[0]), sound(pair[1])
 
 
-def sound(found: JudgedEdge) -> Edge:
+def sound(judged_edge: JudgedEdge) -> Edge:
     """Return the edge if its place is usable; else raise NotMeasuredError."""
-    if found.trouble is not None:
-        raise found.trouble
-    return found.edge
+    if judged_edge.trouble is not None:
+        raise judged_edge.trouble
+    return judged_edge.edge
 
 
 def _several(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
-    places = ", ".join(f"{one.edge.place:.1f}" for one in edges[:4])
+    places = ", ".join(f"{edge.edge.place:.1f}" for edge in edges[:4])
     text = f"{len(edges)} edges where {expected} expected, {places} px from the region's middle"
     return NotMeasuredError(NoValueReason.TWO_EDGES, text)

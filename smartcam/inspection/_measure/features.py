@@ -74,8 +74,8 @@ def strip_between(start: Array, end: Array, width: float) -> Strips:
 def find_point(image: Image, strip: Strips, settings: EdgeSettings, which: Choice) -> FoundPoint:
     """Return the edge that crosses a strip."""
     tilted = strip.width >= MIN_TILT_WIDTH_PX
-    found = find_edges(image, strip, settings, tilted=tilted)[0]
-    return FoundPoint(strip, choose(found, which))
+    edges = find_edges(image, strip, settings, tilted=tilted)[0]
+    return FoundPoint(strip, choose(edges, which))
 
 
 def find_pair(
@@ -109,15 +109,16 @@ def find_line(
     line = fit_line(first.edges, ahead).shape
     # strips again, at right angles to the found line, so that edges are not tilted
     begin, stop = (
-        line.at + ((one - line.at) @ line.direction) * line.direction for one in (start, end)
+        line.at + ((end_point - line.at) @ line.direction) * line.direction
+        for end_point in (start, end)
     )
     strips = _across(begin, stop - begin, parts, min(search, _short(first)), width)
     return _collected(image, strips, settings, "nearest")
 
 
-def _across(start: Array, way: Array, parts: Array, search: float, width: float) -> Strips:
-    direction = np.array([-way[1], way[0]]) / np.hypot(*way)
-    middles = start + parts[:, None] * way
+def _across(start: Array, along: Array, parts: Array, search: float, width: float) -> Strips:
+    direction = np.array([-along[1], along[0]]) / np.hypot(*along)
+    middles = start + parts[:, None] * along
     return Strips(middles, np.tile(direction, (len(parts), 1)), search, width)
 
 
@@ -142,8 +143,8 @@ def find_circle(
     strips = Sectors(centre, radius, angles, search, width)
     first = _collected(image, strips, settings, which)
     circle = fit_circle(first.edges).shape
-    off = strips.middles - circle.centre  # the same places, relative to the better centre
-    angles = np.arctan2(off[:, 1], off[:, 0])
+    radial = strips.middles - circle.centre  # places relative to the better centre
+    angles = np.arctan2(radial[:, 1], radial[:, 0])
     width *= min(circle.radius / radius, 1.0)
     strips = Sectors(circle.centre, circle.radius, angles, min(search, _short(first)), width)
     return _collected(image, strips, settings, "nearest")
@@ -154,9 +155,9 @@ def _collected(
 ) -> FoundShape:
     """Return the chosen edge of each strip; raise NotMeasuredError if too few strips have one."""
     owners, edges, troubles = [], [], []
-    for owner, found in enumerate(find_edges(image, strips, settings)):
+    for owner, strip_edges in enumerate(find_edges(image, strips, settings)):
         try:
-            edges.append(choose(found, which))
+            edges.append(choose(strip_edges, which))
         except NotMeasuredError as trouble:
             troubles.append(trouble)
         else:
@@ -164,30 +165,32 @@ def _collected(
     number = len(edges) + len(troubles)
     if len(edges) < MIN_FOUND_SHARE * number:
         raise _few(troubles, number)
-    places = np.array([one.place for one in edges])
-    noises = np.array([one.noise for one in edges])
+    places = np.array([edge.place for edge in edges])
+    noises = np.array([edge.noise for edge in edges])
     noise = float(np.median(noises))
     noises = np.where(noises > OWN_NOISE_FACTOR * noise, noises, noise)
-    blur = math.sqrt(float(np.median([one.blur for one in edges])) ** 2 + PIXEL_VARIANCE)
-    some, middle = strips.selected(np.array(owners)), np.zeros(len(owners))
+    blur = math.sqrt(float(np.median([edge.blur for edge in edges])) ** 2 + PIXEL_VARIANCE)
+    strips_used, middle = strips.selected(np.array(owners)), np.zeros(len(owners))
     if isinstance(strips, Sectors):
         # blur moves the rim of a disc inwards by s^2 / (2 r)
         places = places + blur**2 / (2 * (strips.radius + places))
-    unit = np.array([one.unit_sigma for one in edges])
-    seen = Edges(some.points(places, middle), np.array(some.ahead(middle)), unit * noises)
-    misfit = float(np.median([one.misfit for one in edges]))
+    unit = np.array([edge.unit_sigma for edge in edges])
+    seen = Edges(
+        strips_used.points(places, middle), np.array(strips_used.ahead(middle)), unit * noises
+    )
+    misfit = float(np.median([edge.misfit for edge in edges]))
     return FoundShape(seen, tuple(troubles), blur, misfit)
 
 
 def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
     """Return the error for a line or a circle with too few strips with an edge."""
-    kinds = [one.why for one in troubles]
+    kinds = [trouble.why for trouble in troubles]
     most = max(kinds, key=kinds.count)
-    example = next(one for one in troubles if one.why is most)
+    example = next(trouble for trouble in troubles if trouble.why is most)
     text = f"{len(troubles)} of {number} strips have no edge: {example.text}"
     return NotMeasuredError(most, text)
 
 
-def _short(found: FoundShape) -> float:
+def _short(shape: FoundShape) -> float:
     """Return the length of a strip that contains an edge and both sides, pixels."""
-    return 2 * (FIT_REACH_BLURS * found.blur + FIT_REACH_PX)
+    return 2 * (FIT_REACH_BLURS * shape.blur + FIT_REACH_PX)

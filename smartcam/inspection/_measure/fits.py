@@ -52,7 +52,7 @@ class Edges(NamedTuple):
 
     def selected(self, which: Mask) -> Edges:
         """Return a selection of the edges."""
-        return Edges(*(one[which] for one in self))
+        return Edges(*(array[which] for array in self))
 
 
 class Line(NamedTuple):
@@ -95,25 +95,27 @@ class ShapeFit(NamedTuple, Generic[ShapeT]):
     excess: float  # ratio of the residuals' spread to the edges' sigmas, at least 1
 
 
-def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[Line]:
+def fit_line(edges: Edges, ahead: Array, used: Mask | None = None) -> ShapeFit[Line]:
     """Return the line through edges, with its direction near ``ahead`` (2,).
 
-    ``kept`` (N,): the edges to use; None: the inliers.
+    ``used`` (N,): the edges to use; None: the inliers.
 
     Raises:
         NotMeasuredError: FEW_EDGES; NO_AGREEMENT.
     """
-    return _robust(edges, kept, _lines_through, lambda some, start: _line(some, start, ahead), 2)
+    return _robust(
+        edges, used, _lines_through, lambda edges_used, start: _line(edges_used, start, ahead), 2
+    )
 
 
-def fit_circle(edges: Edges, kept: Mask | None = None) -> ShapeFit[Circle]:
-    """Return the circle through edges; ``kept`` and errors as in :func:`fit_line`."""
-    return _robust(edges, kept, _circles_through, _circle, 3)
+def fit_circle(edges: Edges, used: Mask | None = None) -> ShapeFit[Circle]:
+    """Return the circle through edges; ``used`` and errors as in :func:`fit_line`."""
+    return _robust(edges, used, _circles_through, _circle, 3)
 
 
 def _robust(
     edges: Edges,
-    kept: Mask | None,
+    used: Mask | None,
     through: Callable[[Array], Array],
     fit: Callable[[Edges, Array], tuple[ShapeT, Array]],
     least: int,
@@ -123,61 +125,61 @@ def _robust(
     if number <= least:
         text = f"{number} edges, more than {least} are needed"
         raise NotMeasuredError(NoValueReason.FEW_EDGES, text)
-    if kept is not None:
-        return _fitted(edges, kept, fit, _start(edges.selected(kept), through, least), least)
+    if used is not None:
+        return _fitted(edges, used, fit, _start(edges.selected(used), through, least), least)
     start = _start(edges, through, least)
     all_edges = np.ones(number, dtype=np.bool_)
-    found = _fitted(edges, all_edges, fit, start, least)
-    far = np.abs(found.residuals) / edges.sigmas
-    if found.excess == 1.0 and far.max() <= OUTLIER_SIGMAS:
-        return found
+    fitted = _fitted(edges, all_edges, fit, start, least)
+    deviations = np.abs(fitted.residuals) / edges.sigmas
+    if fitted.excess == 1.0 and deviations.max() <= OUTLIER_SIGMAS:
+        return fitted
     # outliers of the start may be inliers of the fit
-    far = np.abs(_distances(start[None], edges)[0]) / edges.sigmas
-    agree = far <= OUTLIER_SIGMAS * max(
-        1.4826 * (1 + 5 / (number - least)) * float(np.median(far)), 1.0
+    deviations = np.abs(_distances(start[None], edges)[0]) / edges.sigmas
+    agree = deviations <= OUTLIER_SIGMAS * max(
+        1.4826 * (1 + 5 / (number - least)) * float(np.median(deviations)), 1.0
     )
     seen = set()
     for _ in range(MAX_ROUNDS):
         if np.count_nonzero(agree) < max(least, math.ceil((1 - MAX_OUTLIER_SHARE) * number)):
             text = f"{np.count_nonzero(agree)} of {number} edges agree, half of them are needed"
             raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
-        found = _fitted(edges, agree, fit, start, least)
-        far = np.abs(found.residuals) / edges.sigmas
-        again = far <= OUTLIER_SIGMAS * _spread(far[agree])
+        fitted = _fitted(edges, agree, fit, start, least)
+        deviations = np.abs(fitted.residuals) / edges.sigmas
+        again = deviations <= OUTLIER_SIGMAS * _spread(deviations[agree])
         if (again == agree).all() or again.tobytes() in seen:
             break
         seen.add(agree.tobytes())
         agree = again
-    return found
+    return fitted
 
 
-def _spread(far: Array) -> float:
+def _spread(deviations: Array) -> float:
     """Return the ratio of the edges' spread to their sigmas, 1 if chance may explain it.
 
-    ``far`` (N,): magnitudes of the residuals, in sigmas. Edges of real parts are not exactly
+    ``deviations`` (N,): magnitudes of the residuals, in sigmas. Edges of real parts are not exactly
     straight or round.
     """
-    spread = 1.4826 * float(np.median(far))
-    return spread if spread > 1 + 4 / math.sqrt(len(far)) else 1.0
+    spread = 1.4826 * float(np.median(deviations))
+    return spread if spread > 1 + 4 / math.sqrt(len(deviations)) else 1.0
 
 
 def _fitted(
     edges: Edges,
-    kept: Mask,
+    used: Mask,
     fit: Callable[[Edges, Array], tuple[ShapeT, Array]],
     start: Array,
     least: int,
 ) -> ShapeFit[ShapeT]:
-    some = edges.selected(kept)
-    shape, values = fit(some, start)
+    edges_used = edges.selected(used)
+    shape, values = fit(edges_used, start)
     residuals = _distances(values[None], edges)[0]
-    freedom = int(np.count_nonzero(kept)) - least
-    squares = float(((residuals[kept] / some.sigmas) ** 2).sum())
+    freedom = int(np.count_nonzero(used)) - least
+    squares = float(((residuals[used] / edges_used.sigmas) ** 2).sum())
     # by chance, a sum of squares exceeds three sigmas once in several hundred fits
     much = freedom > 0 and squares > freedom + 3 * math.sqrt(2 * freedom)
     excess = math.sqrt(squares / freedom) if much else 1.0
     shape = shape._replace(covariance=shape.covariance * excess**2)
-    return ShapeFit(shape, kept, residuals, excess)
+    return ShapeFit(shape, used, residuals, excess)
 
 
 def _start(edges: Edges, through: Callable[[Array], Array], least: int) -> Array:
@@ -191,8 +193,8 @@ def _start(edges: Edges, through: Callable[[Array], Array], least: int) -> Array
         drawn = np.argsort(random.random((MAX_STARTS, number)), axis=1)[:, :least]
     with np.errstate(all="ignore"):
         values = through(edges.points[drawn])
-        far = np.abs(_distances(values, edges)) / edges.sigmas
-        median = np.median(far, axis=1)
+        deviations = np.abs(_distances(values, edges)) / edges.sigmas
+        median = np.median(deviations, axis=1)
     median = np.where(np.isfinite(median), median, np.inf)
     best = int(np.argmin(median))
     if not math.isfinite(float(median[best])):
@@ -211,10 +213,14 @@ def _distances(values: Array, edges: Edges) -> Array:
     first, second, third = values.T[:, :, None]
     lines = np.isnan(third)
     normal = np.stack([np.cos(first), np.sin(first)], axis=-1)
-    off = points[None] - np.stack([first, second], axis=-1)
-    far = np.hypot(off[..., 0], off[..., 1])
-    across = np.where(lines[..., None], normal, off / np.maximum(far, 1e-12)[..., None])
-    beside = np.where(lines, (normal * points[None]).sum(axis=-1) - second, far - third)
+    offsets = points[None] - np.stack([first, second], axis=-1)
+    distances_of_points = np.hypot(offsets[..., 0], offsets[..., 1])
+    across = np.where(
+        lines[..., None], normal, offsets / np.maximum(distances_of_points, 1e-12)[..., None]
+    )
+    beside = np.where(
+        lines, (normal * points[None]).sum(axis=-1) - second, distances_of_points - third
+    )
     seen = np.abs((across * normals[None]).sum(axis=-1))
     distances: Array = beside / np.maximum(seen, 0.1)
     return distances
@@ -243,16 +249,16 @@ def _circles_through(points: Array) -> Array:
 def _line(edges: Edges, start: Array, ahead: Array) -> tuple[Line, Array]:
     weights = 1 / edges.sigmas**2
     middle = (weights[:, None] * edges.points).sum(axis=0) / weights.sum()
-    off = edges.points - middle
+    offsets = edges.points - middle
     angle = float(start[0])
     hessian: NDArray[Any] = np.eye(2)
     offset = float(start[1] - np.array([math.cos(angle), math.sin(angle)]) @ middle)
     for _ in range(MAX_STEPS):
         normal = np.array([math.cos(angle), math.sin(angle)])
-        along = off @ np.array([-normal[1], normal[0]])
+        along = offsets @ np.array([-normal[1], normal[0]])
         seen = edges.normals @ normal
-        jacobian = np.column_stack([np.ones(len(off)), -along]) / seen[:, None]
-        residuals = (off @ normal - offset) / seen
+        jacobian = np.column_stack([np.ones(len(offsets)), -along]) / seen[:, None]
+        residuals = (offsets @ normal - offset) / seen
         hessian = (jacobian * weights[:, None]).T @ jacobian
         move = np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
         offset, angle = offset + float(move[0]), angle + float(move[1])
@@ -263,7 +269,7 @@ def _line(edges: Edges, start: Array, ahead: Array) -> tuple[Line, Array]:
     covariance: Array = np.linalg.inv(hessian)
     if direction @ ahead < 0:  # offsets are along the normal, which flips with the direction
         direction, covariance = -direction, covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    along = off @ direction
+    along = offsets @ direction
     at = middle + offset * normal
     line = Line(at, direction, covariance, float(np.abs(along).max()))
     return line, np.array([angle, float(normal @ at), np.nan])
@@ -274,12 +280,12 @@ def _circle(edges: Edges, start: Array) -> tuple[Circle, Array]:
     values = start.copy()
     hessian: NDArray[Any] = np.eye(3)
     for _ in range(MAX_STEPS):
-        off = edges.points - values[:2]
-        far = np.maximum(np.hypot(off[:, 0], off[:, 1]), 1e-12)
-        across = off / far[:, None]
+        offsets = edges.points - values[:2]
+        distances = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
+        across = offsets / distances[:, None]
         seen = np.maximum(np.abs((across * edges.normals).sum(axis=1)), 0.1)
-        jacobian = np.column_stack([across, np.ones(len(off))]) / seen[:, None]
-        residuals = (far - values[2]) / seen
+        jacobian = np.column_stack([across, np.ones(len(offsets))]) / seen[:, None]
+        residuals = (distances - values[2]) / seen
         hessian = (jacobian * weights[:, None]).T @ jacobian
         if np.linalg.cond(hessian) > 1e14:
             raise NotMeasuredError(

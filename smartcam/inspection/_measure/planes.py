@@ -54,8 +54,8 @@ class Plane(NamedTuple):
     def slopes(self, pixels: Array) -> Array:
         """Return the derivatives (N, 2, 2) of points by pixels."""
         ends = [
-            (self.points(pixels + way) - self.points(pixels - way)) / (2 * STEP_PX)
-            for way in STEP_PX * np.eye(2)
+            (self.points(pixels + step) - self.points(pixels - step)) / (2 * STEP_PX)
+            for step in STEP_PX * np.eye(2)
         ]
         return np.stack(ends, axis=2)
 
@@ -108,11 +108,11 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
         return _with_variants(calibration, calibration, _plane_variants(calibration), robot=robot)
     if kind == "sheet":
         variants = [
-            dataclasses.replace(calibration, plane=one)
-            for one in _plane_variants(calibration.plane)
+            dataclasses.replace(calibration, plane=variant)
+            for variant in _plane_variants(calibration.plane)
         ] + [
-            dataclasses.replace(calibration, sheet=one)
-            for one in (*_view_variants(calibration.sheet), *calibration.lens_planes)
+            dataclasses.replace(calibration, sheet=sheet)
+            for sheet in (*_view_variants(calibration.sheet), *calibration.lens_planes)
         ]
         return _with_variants(calibration, calibration.plane, variants, robot=robot)
     raise ConfigurationError(
@@ -128,10 +128,10 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
     origin = np.zeros(3) if robot else middle
     flips_v = calibration.kind == "plane" and calibration.y_down
 
-    def mapped(one: Any) -> Callable[[Array], Array]:
+    def mapped(sheet: Any) -> Callable[[Array], Array]:
         def points(pixels: Array) -> Array:
             seen = pixels * [1.0, -1.0] if flips_v else pixels
-            flat: Array = MM * (one.transform(seen) - origin) @ axes
+            flat: Array = MM * (sheet.transform(seen) - origin) @ axes
             return flat
 
         return points
@@ -139,7 +139,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
     return Plane(
         "mm",
         mapped(calibration),
-        tuple(mapped(one) for one in variants),
+        tuple(mapped(variant) for variant in variants),
         _remark(calibration, plane),
     )
 

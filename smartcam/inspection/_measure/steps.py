@@ -165,9 +165,9 @@ def _best_start(pixels: StripPixels, places: Array, starts: Sequence[float | Arr
         cost, hessian, gradient = _normal_equations(pixels, values)
         linear = slice(steps + 2, None)
         ridge = 1e-9 * np.maximum(pixels.counts, 1.0)[:, None, None] * np.eye(steps + 1)
-        found = np.linalg.solve(hessian[:, linear, linear] + ridge, gradient[:, linear, None])
-        values[:, linear] = found[:, :, 0]
-        cost = cost - np.einsum("nm,nm->n", gradient[:, linear], found[:, :, 0])
+        solution = np.linalg.solve(hessian[:, linear, linear] + ridge, gradient[:, linear, None])
+        values[:, linear] = solution[:, :, 0]
+        cost = cost - np.einsum("nm,nm->n", gradient[:, linear], solution[:, :, 0])
         better = cost < least
         best[better], least[better] = values[better], cost[better]
     return best
@@ -183,13 +183,13 @@ def _normal_equations(pixels: StripPixels, values: Array) -> tuple[Array, Array,
     columns[:, steps : steps + 2] = 0.0
     model = values[:, [-1]] + np.zeros_like(pixels.along)
     for k in range(steps):
-        off = pixels.along - values[:, [k]] - tilt * pixels.beside
-        part, slope, by_blur = share(cosine * off, blur, sides)
+        misfit = pixels.along - values[:, [k]] - tilt * pixels.beside
+        part, slope, by_blur = share(cosine * misfit, blur, sides)
         height = values[:, [steps + 2 + k]]
         columns[:, k] = -height * cosine * slope
         # d = cosine (along - place - tilt beside) with cosine = (1 + tilt^2)^-1/2
         columns[:, steps] += (
-            height * slope * cosine * (-pixels.beside - cosine * cosine * tilt * off)
+            height * slope * cosine * (-pixels.beside - cosine * cosine * tilt * misfit)
         )
         columns[:, steps + 1] += height * by_blur
         columns[:, steps + 2 + k] = part

@@ -45,8 +45,8 @@ class Strips(NamedTuple):
 
     def places(self, at: Array) -> tuple[Array, Array]:
         """Return the places of points (N, P, 2) in each strip: along and beside, (N, P)."""
-        off = at - self.middles[:, None]
-        (du, dv), (u, v) = self.directions.T[:, :, None], (off[..., 0], off[..., 1])
+        offsets = at - self.middles[:, None]
+        (du, dv), (u, v) = self.directions.T[:, :, None], (offsets[..., 0], offsets[..., 1])
         return du * u + dv * v, du * v - dv * u
 
     def selected(self, which: NDArray[np.intp]) -> Strips:
@@ -80,10 +80,10 @@ class Sectors(NamedTuple):
 
     def places(self, at: Array) -> tuple[Array, Array]:
         """Return the places of points (N, P, 2) in each strip: along and beside, (N, P)."""
-        off = at - self.centre
-        turned = np.arctan2(off[..., 1], off[..., 0]) - self.angles[:, None]
+        offsets = at - self.centre
+        turned = np.arctan2(offsets[..., 1], offsets[..., 0]) - self.angles[:, None]
         turned -= 2 * np.pi * np.rint(turned / (2 * np.pi))
-        return np.hypot(off[..., 0], off[..., 1]) - self.radius, turned * self.radius
+        return np.hypot(offsets[..., 0], offsets[..., 1]) - self.radius, turned * self.radius
 
     def selected(self, which: NDArray[np.intp]) -> Sectors:
         """Return a selection of the strips."""
@@ -107,7 +107,7 @@ class StripPixels(NamedTuple):
 
     def selected(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> StripPixels:
         """Return the pixels of some strips."""
-        return StripPixels(*(one[which] for one in self))
+        return StripPixels(*(array[which] for array in self))
 
 
 def profiles(image: NDArray[np.generic], strips: Strips | Sectors) -> Array:

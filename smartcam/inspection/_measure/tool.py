@@ -142,21 +142,23 @@ class Measure(Tool[MeasureSettings]):
 
     def _judged(self, look: _EdgeFinder, measured: _MeasuredValue) -> Finding:
         settings, si = self.settings, SI_PER_UNIT[self._unit]
-        found = (
-            Value(*(one / si for one in measured.value)) if self._unit == "deg" else measured.value
+        value = (
+            Value(*(number / si for number in measured.value))
+            if self._unit == "deg"
+            else measured.value
         )
         reason = ""
         if settings.tolerance is not None:
-            reason = settings.tolerance.complaint(found.value, found.sigma, settings.guard)
+            reason = settings.tolerance.complaint(value.value, value.sigma, settings.guard)
         name = self.fields.partition(":")[0]
-        text = f"{found.value:.{digits_of(found.sigma)}f} {self._unit}"
+        text = f"{value.value:.{digits_of(value.sigma)}f} {self._unit}"
         return Finding(
             ok=not reason,
             reason=reason,
-            values={name: found.value * si, "sigma": found.sigma * si, **measured.values},
+            values={name: value.value * si, "sigma": value.sigma * si, **measured.values},
             drawings=look.drawn(text, wrong=bool(reason)),
             reference=measured.reference,
-            details=look.details(found, self._unit, None),
+            details=look.details(value, self._unit, None),
         )
 
 
@@ -219,34 +221,36 @@ class _EdgeFinder:
     def pair(self, search: AcrossPair) -> tuple[FoundPoint, FoundPoint]:
         """Return the two edges of a bar."""
         pair = find_pair(self._image, self._strip(search), self._settings(search), search.which)
-        self._edges += [one.pixel[None] for one in pair]
+        self._edges += [point.pixel[None] for point in pair]
         return pair
 
     def line(self, search: LineSearch) -> tuple[FoundShape, ShapeFit[Line]]:
         """Return the edges of a line, and the line in the picture's pixels."""
-        way, scale = self.at(search.along), self.reference.scale
-        across = (way[1] - way[0])[::-1] * [-1.0, 1.0] / math.dist(*way) * search.search / 2 * scale
-        self._regions.append(np.array([*(way - across), *(way[::-1] + across)]))
-        found = find_line(
+        ends, scale = self.at(search.along), self.reference.scale
+        across = (
+            (ends[1] - ends[0])[::-1] * [-1.0, 1.0] / math.dist(*ends) * search.search / 2 * scale
+        )
+        self._regions.append(np.array([*(ends - across), *(ends[::-1] + across)]))
+        found_line = find_line(
             self._image,
-            *way,
+            *ends,
             search=search.search * scale,
-            width=_width_of(search, math.dist(*way), scale),
+            width=_width_of(search, math.dist(*ends), scale),
             count=search.strips,
             settings=self._settings(search),
             which=search.which,
         )
-        found = found._replace(kept=line_of(found, way, self.plane).kept)
-        fit = line_of(found, way, PIXELS)
+        found_line = found_line._replace(kept=line_of(found_line, ends, self.plane).kept)
+        fit = line_of(found_line, ends, PIXELS)
         line = fit.shape
         self._shapes.append(line.at + np.outer([-line.reach, line.reach], line.direction))
-        self._keep(found, fit)
-        return found, fit
+        self._keep(found_line, fit)
+        return found_line, fit
 
     def circle(self, search: CircleSearch) -> tuple[FoundShape, ShapeFit[Circle]]:
         """Return the edges of a circle, and the circle in the picture's pixels."""
         centre, scale = self.at(search.centre), self.reference.scale
-        begin, end = (math.radians(one) + self.reference.angle for one in search.arc)
+        begin, end = (math.radians(degrees) + self.reference.angle for degrees in search.arc)
         radius, reach = search.radius * scale, search.search / 2 * scale
         turn = np.linspace(begin, end, CIRCLE_CORNERS + 1)
         rim = np.column_stack([np.cos(turn), np.sin(turn)])
@@ -268,15 +272,17 @@ class _EdgeFinder:
         self._keep(circle, fit)
         return circle, fit
 
-    def _keep(self, found: FoundShape, fit: ShapeFit[Any]) -> None:
-        self._edges.append(found.edges.points[fit.kept])
-        self._left_out.append(found.edges.points[~fit.kept])
-        self._missed += map(str, found.troubles)
+    def _keep(self, shape: FoundShape, fit: ShapeFit[Any]) -> None:
+        self._edges.append(shape.edges.points[fit.kept])
+        self._left_out.append(shape.edges.points[~fit.kept])
+        self._missed += map(str, shape.troubles)
 
-    def details(self, found: Value | None, unit: str, why: NoValueReason | None) -> Measurement:
+    def details(
+        self, found_value: Value | None, unit: str, why: NoValueReason | None
+    ) -> Measurement:
         """Return the details of the measurement."""
         none = [np.zeros((0, 2))]
-        value, sigma = (math.nan, math.nan) if found is None else found
+        value, sigma = (math.nan, math.nan) if found_value is None else found_value
         return Measurement(
             trouble=why,
             value=value,
@@ -291,10 +297,12 @@ class _EdgeFinder:
     def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:
         """Return the marks to draw."""
         role: Role = "wrong" if wrong else "found"
-        marks = [Drawing("polygon", _corners(one), "region") for one in self._regions]
-        marks += [Drawing("points", _corners(one), role) for one in self._edges]
-        marks += [Drawing("points", _corners(one), "hint") for one in self._left_out if len(one)]
-        marks += [Drawing("line", _corners(one), role) for one in self._shapes]
+        marks = [Drawing("polygon", _corners(region), "region") for region in self._regions]
+        marks += [Drawing("points", _corners(edge), role) for edge in self._edges]
+        marks += [
+            Drawing("points", _corners(edges), "hint") for edges in self._left_out if len(edges)
+        ]
+        marks += [Drawing("line", _corners(shape), role) for shape in self._shapes]
         if text and self._edges:
             marks.append(Drawing("text", _corners(self._edges[0][:1]), role, text))
         return marks
@@ -316,9 +324,9 @@ def _pose(at: Array, ahead: Array) -> PixelPose:
 
 
 def _fields(at: Array, fit: ShapeFit[Any]) -> Mapping[str, Any]:
-    kept = int(np.count_nonzero(fit.kept))
+    used = int(np.count_nonzero(fit.kept))
     x, y = at.tolist()
-    return {"x": x, "y": y, "edges": kept, "left_out": len(fit.kept) - kept}
+    return {"x": x, "y": y, "edges": used, "left_out": len(fit.kept) - used}
 
 
 def _width(look: _EdgeFinder, search: AcrossPair) -> _MeasuredValue:
@@ -329,37 +337,37 @@ def _width(look: _EdgeFinder, search: AcrossPair) -> _MeasuredValue:
 
 
 def _edge(look: _EdgeFinder, search: Across) -> _MeasuredValue:
-    found = look.edge(search)
+    edge = look.edge(search)
     start = look.at(search.across[0])
 
     def place(plane: Plane) -> Value:
-        point = point_of(found, plane)
-        way = point.at - plane.points(start[None])[0]
-        length = max(math.hypot(*way), 1e-12)
-        return Value(length, math.sqrt(float(way @ point.covariance @ way)) / length)
+        point = point_of(edge, plane)
+        sight_line = point.at - plane.points(start[None])[0]
+        length = max(math.hypot(*sight_line), 1e-12)
+        return Value(length, math.sqrt(float(sight_line @ point.covariance @ sight_line)) / length)
 
-    x, y = found.pixel.tolist()
-    pose = _pose(found.pixel, found.strip.directions[0])
+    x, y = edge.pixel.tolist()
+    pose = _pose(edge.pixel, edge.strip.directions[0])
     return _MeasuredValue(with_calibration(place, look.plane), {"x": x, "y": y}, pose)
 
 
 def _line(look: _EdgeFinder, search: LineSearch) -> _MeasuredValue:
-    found, fit = look.line(search)
-    way, line = look.at(search.along), fit.shape
+    found_line, fit = look.line(search)
+    ends, line = look.at(search.along), fit.shape
     axis = np.array([math.cos(look.reference.angle), math.sin(look.reference.angle)])
 
     def turned(plane: Plane) -> Value:
-        return direction(line_of(found, way, plane).shape, line.at, axis, plane)
+        return direction(line_of(found_line, ends, plane).shape, line.at, axis, plane)
 
     value = with_calibration(turned, look.plane)
     return _MeasuredValue(value, _fields(line.at, fit), _pose(line.at, line.direction))
 
 
 def _circle(look: _EdgeFinder, search: CircleSearch) -> _MeasuredValue:
-    found, fit = look.circle(search)
+    found_circle, fit = look.circle(search)
 
     def diameter(plane: Plane) -> Value:
-        circle = circle_of(found, plane).shape
+        circle = circle_of(found_circle, plane).shape
         return Value(2 * circle.radius, 2 * math.sqrt(float(circle.covariance[2, 2])))
 
     x, y = fit.shape.centre.tolist()
@@ -376,15 +384,15 @@ def _distance(look: _EdgeFinder, search: Between) -> _MeasuredValue:
 
 
 def _angle(look: _EdgeFinder, search: BetweenLines) -> _MeasuredValue:
-    first, second = (_line_in(look, one.line) for one in (search.first, search.second))
+    first, second = (_line_in(look, feature.line) for feature in (search.first, search.second))
     value = with_calibration(lambda plane: angle(first(plane), second(plane)), look.plane)
     return _MeasuredValue(value, {}, None)
 
 
 def _line_in(look: _EdgeFinder, search: LineSearch) -> Callable[[Plane], Line]:
-    found, _ = look.line(search)
-    way = look.at(search.along)
-    return lambda plane: line_of(found, way, plane).shape
+    line, _ = look.line(search)
+    ends = look.at(search.along)
+    return lambda plane: line_of(line, ends, plane).shape
 
 
 def _feature(look: _EdgeFinder, search: FeatureSearch) -> Callable[[Plane], Feature]:

@@ -55,31 +55,31 @@ class Value(NamedTuple):
     sigma: float
 
 
-def point_of(found: FoundPoint, plane: Plane) -> Point:
+def point_of(point: FoundPoint, plane: Plane) -> Point:
     """Return an edge as a point of a plane, with uncertainty along its strip only."""
-    pixel = found.pixel[None]
-    sigma = math.hypot(found.edge.sigma, found.edge.misfit)
-    way = plane.slopes(pixel)[0] @ found.strip.directions[0] * sigma
-    return Point(plane.points(pixel)[0], np.outer(way, way))
+    pixel = point.pixel[None]
+    sigma = math.hypot(point.edge.sigma, point.edge.misfit)
+    step = plane.slopes(pixel)[0] @ point.strip.directions[0] * sigma
+    return Point(plane.points(pixel)[0], np.outer(step, step))
 
 
-def line_of(found: FoundShape, ahead: Array, plane: Plane) -> ShapeFit[Line]:
+def line_of(line: FoundShape, ahead: Array, plane: Plane) -> ShapeFit[Line]:
     """Fit a line to edges in a plane.
 
     ``ahead`` (2, 2): pixels of two points that give the line's direction.
     """
     start, end = plane.points(ahead)
-    fit = fit_line(plane.edges(found.edges), end - start, found.kept)
-    return _checked(fit, found, plane, 0)
+    fit = fit_line(plane.edges(line.edges), end - start, line.kept)
+    return _checked(fit, line, plane, 0)
 
 
-def circle_of(found: FoundShape, plane: Plane) -> ShapeFit[Circle]:
+def circle_of(circle_points: FoundShape, plane: Plane) -> ShapeFit[Circle]:
     """Fit a circle to edges in a plane.
 
     Raises:
         NotMeasuredError: UNCERTAIN: the arc is too short to determine the radius.
     """
-    fit = fit_circle(plane.edges(found.edges), found.kept)
+    fit = fit_circle(plane.edges(circle_points.edges), circle_points.kept)
     circle = fit.shape
     sigma = math.sqrt(float(circle.covariance[2, 2]))
     if sigma > MAX_RELATIVE_RADIUS_SIGMA * circle.radius:
@@ -88,35 +88,35 @@ def circle_of(found: FoundShape, plane: Plane) -> ShapeFit[Circle]:
             f"{sigma:.2g} {plane.unit}"
         )
         raise NotMeasuredError(NoValueReason.UNCERTAIN, text)
-    return _checked(fit, found, plane, 2)
+    return _checked(fit, circle_points, plane, 2)
 
 
 def _checked(
-    fit: ShapeFit[ShapeT], found: FoundShape, plane: Plane, which: int
+    fit: ShapeFit[ShapeT], shape: FoundShape, plane: Plane, which: int
 ) -> ShapeFit[ShapeT]:
     """Return the fit with the edges' common error added to the variance of offset or radius.
 
     Raises:
         NotMeasuredError: NO_AGREEMENT: the edges belong to several lines or circles.
     """
-    scale = float(np.median(plane.edges(found.edges).sigmas / found.edges.sigmas))
+    scale = float(np.median(plane.edges(shape.edges).sigmas / shape.edges.sigmas))
     spread = float(np.sqrt(np.mean(fit.residuals[fit.kept] ** 2))) / scale
     if spread > MAX_RMS_PX:
         text = f"the edges are {spread:.1f} px (rms) from one line or circle"
         raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
     covariance = fit.shape.covariance.copy()
-    covariance[which, which] += (scale * found.misfit) ** 2
+    covariance[which, which] += (scale * shape.misfit) ** 2
     return fit._replace(shape=fit.shape._replace(covariance=covariance))
 
 
 def with_calibration(measure: Callable[[Plane], Value], plane: Plane) -> Value:
     """Return the measured value with a sigma that includes the calibration's errors."""
-    found = measure(plane)
-    variance = found.sigma**2
+    measured = measure(plane)
+    variance = measured.sigma**2
     for variant in plane.variants:
         other = measure(plane._replace(map=variant, variants=()))
-        variance += (other.value - found.value) ** 2
-    return Value(found.value, math.sqrt(variance))
+        variance += (other.value - measured.value) ** 2
+    return Value(measured.value, math.sqrt(variance))
 
 
 def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
@@ -139,7 +139,10 @@ def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
 
     values, covariance = _joint(first, second)
     slopes = np.array(
-        [(measured(values + way) - measured(values - way)) / (2 * STEP) for way in STEP * np.eye(4)]
+        [
+            (measured(values + step) - measured(values - step)) / (2 * STEP)
+            for step in STEP * np.eye(4)
+        ]
     )
     misfit = abs(slopes[0]) * first.edge.misfit + abs(slopes[2]) * second.edge.misfit
     return Value(measured(values), math.sqrt(float(slopes @ covariance @ slopes + misfit**2)))
@@ -148,14 +151,18 @@ def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
 def _joint(first: FoundPoint, second: FoundPoint) -> tuple[Array, Array]:
     """Return places and tilts of two edges (4,), and their covariance (4, 4)."""
     edges = first.edge, second.edge
-    values = np.array([one for edge in edges for one in (edge.place, edge.tilt)])
+    values = np.array([parameter for edge in edges for parameter in (edge.place, edge.tilt)])
     covariance = np.zeros((4, 4))
     together = edges[0].unit_covariance is edges[1].unit_covariance
-    for i, one in enumerate(edges):
+    for i, first_edge in enumerate(edges):
         for j, other in enumerate(edges):
             if i == j or together:
-                rows, columns = [one.number, -1], [other.number, -1]
-                part = one.unit_covariance[np.ix_(rows, columns)] * one.noise * other.noise
+                rows, columns = [first_edge.number, -1], [other.number, -1]
+                part = (
+                    first_edge.unit_covariance[np.ix_(rows, columns)]
+                    * first_edge.noise
+                    * other.noise
+                )
                 covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = part
     return values, covariance
 
@@ -176,12 +183,12 @@ def distance(first: Feature, second: Feature) -> Value:
     if isinstance(second, Line):
         return _from_line(second, _as_point(first))
     one, other = _as_point(first), _as_point(second)
-    way = other.at - one.at
-    length = math.hypot(*way)
+    towards = other.at - one.at
+    length = math.hypot(*towards)
     covariance = one.covariance + other.covariance
     if length == 0.0:
         return Value(0.0, math.sqrt(float(np.trace(covariance))))
-    ahead = way / length
+    ahead = towards / length
     return Value(length, math.sqrt(float(ahead @ covariance @ ahead)))
 
 

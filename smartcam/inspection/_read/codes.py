@@ -69,7 +69,10 @@ def kinds() -> dict[str, Any]:
         MissingExtraError: zxing-cpp is not installed.
     """
     zxing = load("zxingcpp", PURPOSE)
-    return {one.name: one for one in zxing.barcode_formats_list(zxing.BarcodeFormat.AllReadable)}
+    return {
+        symbology.name: symbology
+        for symbology in zxing.barcode_formats_list(zxing.BarcodeFormat.AllReadable)
+    }
 
 
 def formats_of(names: Sequence[str]) -> Any:
@@ -115,11 +118,13 @@ def read_codes(
         binarizer=getattr(zxing.Binarizer, binarizer),
     )
     is_gs1 = zxing.ContentType.GS1
-    return [_code(one, back, prepared, gs1=one.content_type == is_gs1) for one in barcodes]
+    return [
+        _code(barcode, back, prepared, gs1=barcode.content_type == is_gs1) for barcode in barcodes
+    ]
 
 
-def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:
-    place = one.position  # indices of pixels
+def _code(barcode: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:
+    place = barcode.position  # indices of pixels
     corners = [
         (float(x), float(y))
         for x, y in (
@@ -128,19 +133,19 @@ def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> R
         )
     ]
     (x1, y1), (x2, y2) = corners[:2]
-    extra = one.extra or {}
-    text = one.text
+    extra = barcode.extra or {}
+    text = barcode.text
     unused = extra.get("UEC")
     return ReadCode(
-        kind=one.format.name,
-        data=one.bytes,
+        kind=barcode.format.name,
+        data=barcode.bytes,
         text=text,
         gs1=elements(text) if gs1 else (),
-        symbology=one.symbology_identifier,
+        symbology=barcode.symbology_identifier,
         corners=(corners[0], corners[1], corners[2], corners[3]),
         angle=math.atan2(y2 - y1, x2 - x1),
         unused_correction=None if unused is None else float(unused),
-        level=one.ec_level or str(extra.get("ECLevel", "")),
+        level=barcode.ec_level or str(extra.get("ECLevel", "")),
         version=str(extra.get("Version", "")),
         prepared=prepared,
     )

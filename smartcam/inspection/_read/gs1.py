@@ -18,8 +18,8 @@ _PREDEFINED: Final = {
     "04": 18,
     "20": 4,
     "41": 16,
-    **{str(one): 8 for one in range(11, 20)},
-    **{str(one): 10 for one in range(31, 37)},
+    **{str(number): 8 for number in range(11, 20)},
+    **{str(number): 10 for number in range(31, 37)},
 }
 """Length of an element with its identifier, in characters, by the first two digits."""
 

@@ -80,19 +80,19 @@ class CodeSearch(NamedTuple):
 
 
 def read_again(
-    search: CodeSearch, found: Sequence[ReadCode], least: int, deadline: float, expected: float
+    search: CodeSearch, codes_read: Sequence[ReadCode], least: int, deadline: float, expected: float
 ) -> list[ReadCode]:
     """Return the codes found before and by the rungs, until there are enough.
 
     Args:
         search: the picture and the wanted codes.
-        found: codes found before.
+        codes_read: codes found before.
         least: number of codes that is enough.
         deadline: ``time.monotonic()`` at which no further rung begins; slower rungs are left out.
         expected: duration of reading without preparation, seconds.
     """
     grey, counts = search.grey, search.counts
-    codes = list(found)
+    codes = list(codes_read)
     waiting: list[ReadCode] = []
     for rung in RUNGS:
         if len(codes) >= least:
@@ -102,12 +102,12 @@ def read_again(
             continue
         smaller: list[ReadCode] | None = None
         for code in _by_rung(rung, search):
-            if not counts(code) or any(_is_same(code, one) for one in codes):
+            if not counts(code) or any(_is_same(code, known) for known in codes):
                 continue
-            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, one) for one in waiting):
+            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, known) for known in waiting):
                 if smaller is None:
                     smaller = _by_rung(rung, search, CONFIRMING_SCALE)
-                if not any(_is_same(code, one) for one in smaller):
+                if not any(_is_same(code, known) for known in smaller):
                     waiting.append(code)
                     continue
             codes.append(code)

@@ -195,5 +195,9 @@ class ReadTool(Tool[ReadSettings]):
         if code.unused_correction is not None:
             values["unused_correction"] = code.unused_correction
         if self.settings.corners:
-            values |= zip(_CORNERS, (one for corner in code.corners for one in corner), strict=True)
+            values |= zip(
+                _CORNERS,
+                (coordinate for corner in code.corners for coordinate in corner),
+                strict=True,
+            )
         return values

@@ -73,8 +73,8 @@ class IfmApplication:
         """Return a picture of an evaluation."""
         if isinstance(self.jpeg, bytes) and self.jpeg:
             size = re.search(rb"\xff[\xc0\xc2].{3}(..)(..)", self.jpeg, re.DOTALL)
-            found = size.groups() if size else (b"", b"")
-            height, width = (int.from_bytes(one, "big") for one in found)
+            sizes = size.groups() if size else (b"", b"")
+            height, width = (int.from_bytes(number, "big") for number in sizes)
             return ImageChunk(JPEG, width, height, count, time, self.jpeg)
         levels = np.add.outer(np.arange(48), np.arange(64) + count).astype(np.uint8)
         return ImageChunk(MONO8, 64, 48, count, time, levels.tobytes())
@@ -116,8 +116,10 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         **options: Any,
     ) -> None:
         made = applications_of(IfmApplication, applications, defaults)
-        self.set_up({one.id: one.parts for one in made}, active, 0)
-        self.applications: Mapping[int, IfmApplication] = {one.id: one for one in made}
+        self.set_up({application.id: application.parts for application in made}, active, 0)
+        self.applications: Mapping[int, IfmApplication] = {
+            application.id: application for application in made
+        }
         self.version: int = check_integer(version, "version", 1, 4)
         self.error = 0
         self.results: int = 0
@@ -177,7 +179,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         asker = None if call is None else cast("IfmClient", call).session
         if call is not None:
             call.answer(self._encoded(cast("IfmClient", call)))
-        self.tell(RESULTS, self._encoded, lambda one: one.outputs & 1 and one is not asker)
+        self.tell(RESULTS, self._encoded, lambda client: client.outputs & 1 and client is not asker)
 
     def _encoded(self, client: IfmClient) -> str:
         try:
@@ -191,13 +193,13 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     def overrun(self) -> None:
         """Report that a trigger came too early."""
-        self.tell(ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", lambda one: one.outputs & 2)
+        self.tell(ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", lambda client: client.outputs & 2)
 
     def activate(self, application: int) -> None:
         """Make another application the active one, and report that."""
         super().activate(application)
         text = json.dumps({"Index": application})
-        self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda one: one.outputs & 4)
+        self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda client: client.outputs & 4)
 
     def activated(self) -> None:
         """Start evaluating, if the active application runs continuously."""
@@ -237,7 +239,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def _apps(self, call: IfmClient) -> str:
         """Return the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
-        return "\t".join([*numbers, *(f"{one:02}" for one in self.applications)])
+        return "\t".join([*numbers, *(f"{application:02}" for application in self.applications)])
 
     @request(r"a(\d\d)")
     def _a(self, call: IfmClient, number: str) -> str:
@@ -256,10 +258,10 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def _stats(self, call: IfmClient) -> str:
         """Return the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
-        return "\t".join(f"{one:010}" for one in counts) if self.active else "!"
+        return "\t".join(f"{count:010}" for count in counts) if self.active else "!"
 
     @request(r"G\?")
-    def _who(self, call: IfmClient) -> str:
+    def _identity(self, call: IfmClient) -> str:
         """Return maker, article, name, place, description, address, ports and time settings."""
         return "\t".join(
             ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK)
@@ -269,7 +271,9 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def _help(self, call: IfmClient) -> str:
         """Return this list."""
         words = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
-        each = {words.sub("", form.pattern): one.__doc__ for form, one in self.requests.items()}
+        each = {
+            words.sub("", form.pattern): handler.__doc__ for form, handler in self.requests.items()
+        }
         return "\n".join(f"{form:<4} {text}" for form, text in each.items())
 
     @request(r"I(\d\d)\?")
@@ -279,7 +283,9 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         if kind != ("01" if application.jpeg else "02"):
             return "!"
         counts = range(self.results, self.results + application.images)
-        data = b"".join(application.picture(one, now).encoded for one in counts).decode("latin-1")
+        data = b"".join(application.picture(count, now).encoded for count in counts).decode(
+            "latin-1"
+        )
         return _counted(data) if data else "!"
 
     @request(r"c(\d{9})(.*)")

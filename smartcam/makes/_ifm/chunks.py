@@ -1,4 +1,4 @@
-"""Images as PCIC has them: chunks, each with a header of numbers and a picture."""
+"""Images in PCIC's form: chunks, each with a header of numbers and a picture."""
 
 from __future__ import annotations
 
@@ -47,10 +47,18 @@ class ImageChunk(NamedTuple):
     def encoded(self) -> bytes:
         """The chunk as a device sends it."""
         header_size = LEAST_HEADER_SIZE
-        seconds, rest = divmod(round(self.time * 1e9), 1_000_000_000)
+        seconds, nanoseconds = divmod(round(self.time * 1e9), 1_000_000_000)
         numbers = (
             *(self.type, header_size + len(self.data), header_size, VERSION, self.width),
-            *(self.height, 0, rest // 1000, self.number, 0, seconds & 0x7FFFFFFF, rest),
+            *(
+                self.height,
+                0,
+                nanoseconds // 1000,
+                self.number,
+                0,
+                seconds & 0x7FFFFFFF,
+                nanoseconds,
+            ),
         )
         return (HEADER.pack(*numbers) + b"{}").ljust(header_size, b"\0") + self.data
 
@@ -61,24 +69,26 @@ def read_chunks(data: bytes) -> list[ImageChunk]:
     Raises:
         FrameError: the chunks do not fit together.
     """
-    rest = data[9:]
-    if not data[:9].isdigit() or int(data[:9]) != len(rest):
+    remaining = data[9:]
+    if not data[:9].isdigit() or int(data[:9]) != len(remaining):
         raise FrameError(f"{data[:16]!r} begins no image of PCIC", data=data[:64])
-    found: list[ImageChunk] = []
+    chunks: list[ImageChunk] = []
     at = 0
-    while at < len(rest):
-        if len(rest) - at < LEAST_HEADER_SIZE:
-            raise FrameError(f"{len(rest) - at} bytes are no image chunk", data=rest[at : at + 64])
+    while at < len(remaining):
+        if len(remaining) - at < LEAST_HEADER_SIZE:
+            raise FrameError(
+                f"{len(remaining) - at} bytes are no image chunk", data=remaining[at : at + 64]
+            )
         kind, size, header, _, width, height, _, _, count, _, seconds, nano = HEADER.unpack_from(
-            rest, at
+            remaining, at
         )
-        if not LEAST_HEADER_SIZE <= header <= size <= len(rest) - at:
+        if not LEAST_HEADER_SIZE <= header <= size <= len(remaining) - at:
             raise FrameError(
                 f"an image chunk of {size} bytes with a header of {header} came, "
-                f"{len(rest) - at} are there",
-                data=rest[at : at + 64],
+                f"{len(remaining) - at} are there",
+                data=remaining[at : at + 64],
             )
-        picture = rest[at + header : at + size]
-        found.append(ImageChunk(kind, width, height, count, seconds + nano / 1e9, picture))
+        picture = remaining[at + header : at + size]
+        chunks.append(ImageChunk(kind, width, height, count, seconds + nano / 1e9, picture))
         at += size
-    return found
+    return chunks

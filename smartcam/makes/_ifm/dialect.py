@@ -135,9 +135,9 @@ def _reply(answer: str) -> LineReply:
 
 def _connect(dialect: PcicDialect, message: m.Connect) -> Script:
     """Ask for the device's maker, switch its messages on, and upload the layout."""
-    who = yield "G?"
-    if not who.upper().startswith("IFM"):
-        raise FrameError(f"{who[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
+    greeting = yield "G?"
+    if not greeting.upper().startswith("IFM"):
+        raise FrameError(f"{greeting[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
     code = CODES[(yield "p7" if dialect.tickets else "p0")]
     code = code or (yield from _upload(dialect))
     return m.ConnectAnswer(code=code, version=1)
@@ -261,9 +261,9 @@ class PcicDialect(TicketedDialect):
             )
         layout_json(layout)
         readers = {
-            one: _read_with(layout, one) for one in self.rows if one.answer is m.ResultContainer
+            row: _read_with(layout, row) for row in self.rows if row.answer is m.ResultContainer
         }
-        rows = tuple(one._replace(read=readers.get(one, one.read)) for one in self.rows)
+        rows = tuple(row._replace(read=readers.get(row, row.read)) for row in self.rows)
         return replace(self, layout=layout, rows=rows, split=None)
 
     def command(self, line: str) -> str:
@@ -335,13 +335,13 @@ PCIC = Protocol(
     schemes={"pcic": Transport.TCP},
     default_port=DEFAULT_PORT,
     models=("O2D5XX", "O2I5XX", "O2U5XX", "O3D3XX"),
-    dialects={one.name: one for one in _VERSIONS},
+    dialects={version.name: version for version in _VERSIONS},
     machine=LineMachine,
     parameters={
         "trigger": "sync (default): T?, answered by the result; async: t, the result comes later",
         "input": "number of the input container that input data goes to; default 0",
     },
-    detection={Transport.TCP: tuple((one,) for one in _VERSIONS)},
+    detection={Transport.TCP: tuple((version,) for version in _VERSIONS)},
     emulator="smartcam.makes._ifm.camera:EmulatedIfm",
     greeting=b"",
 )

@@ -68,7 +68,7 @@ def with_bools(layout: Layout, data: bytes) -> bytes:
     """Return a result's bytes with the bools of smartcam's layouts: 1 becomes 0xFF."""
     if not any(field.type == "bool" for field in (*layout.head, *layout.fields)):
         return data
-    begin, size = (sum(field.size for field in some) for some in (layout.head, layout.fields))
+    begin, size = (sum(field.size for field in fields) for fields in (layout.head, layout.fields))
     starts = range(begin, len(data), size) if layout.repeat is not None else (begin,)
     changed = bytearray(data)
     for start, fields in ((0, layout.head), *((start, layout.fields) for start in starts)):
@@ -91,12 +91,12 @@ def check_layout(text: str) -> dict[str, Any]:
 def _check(elements: object, depth: int) -> None:
     if not isinstance(elements, list) or depth < 1:
         raise ValueError("no elements")
-    for one in elements:
-        kind = one.get("type") if isinstance(one, dict) else None
+    for element in elements:
+        kind = element.get("type") if isinstance(element, dict) else None
         if kind == "records":
-            _check(one.get("elements"), depth - 1)
-        elif kind not in {"string", "blob", *_CODES} or not isinstance(one.get("id"), str):
-            raise ValueError(f"no element: {one!r:.80}")
+            _check(element.get("elements"), depth - 1)
+        elif kind not in {"string", "blob", *_CODES} or not isinstance(element.get("id"), str):
+            raise ValueError(f"no element: {element!r:.80}")
 
 
 def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
@@ -107,18 +107,18 @@ def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
 def _encode(
     elements: list[dict[str, Any]], values: Mapping[str, Any], default: Mapping[str, Any]
 ) -> Iterator[bytes]:
-    for one in elements:
-        form = {**default, **one.get("format", {})}
-        value = one.get("value", values.get(one.get("id", "")))
-        if one["type"] == "records":
+    for element in elements:
+        form = {**default, **element.get("format", {})}
+        value = element.get("value", values.get(element.get("id", "")))
+        if element["type"] == "records":
             for record in value or ():
-                yield from _encode(one["elements"], record, form)
-        elif one["type"] == "blob":
+                yield from _encode(element["elements"], record, form)
+        elif element["type"] == "blob":
             yield value or b""
-        elif one["type"] == "string" or form.get("dataencoding", "ascii") == "ascii":
-            yield _text(value, one["type"], form).encode()
+        elif element["type"] == "string" or form.get("dataencoding", "ascii") == "ascii":
+            yield _text(value, element["type"], form).encode()
         else:
-            code = _CODES[one["type"]]
+            code = _CODES[element["type"]]
             number = float(value or 0) if code in "fd" else int(value or 0)
             yield struct.pack(("<" if form.get("order") == "little" else ">") + code, number)
 

@@ -44,7 +44,7 @@ CODES = {
     3: CodeMeaning("not now", Verdict.BUSY),
     22: CodeMeaning("wrong parameter", Verdict.REFUSED),
 }
-"""Codes after ``ER,<command>``; those of other devices of the family (inferred)."""
+"""Codes after ``ER,<command>``; from other devices of the family (inferred)."""
 
 
 def read_result(line: str) -> m.ResultContainer:

@@ -66,8 +66,8 @@ class EmulatedSr(LineCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
         call = client.answer_later()
-        word, _, rest = line.partition(",")
-        bank = rest.isdecimal() and len(rest) == 2 and int(rest) <= LAST_BANK
+        word, _, argument = line.partition(",")
+        bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK
         if line == "LON" or (word == "LON" and bank):
             self._begin(call)
         elif line == "LOFF":
@@ -98,9 +98,9 @@ class EmulatedSr(LineCamera):
             return
         self._reading, self._code, self._run = call, None, self._run + 1
         run = self._run
-        self.after(self.reading_time, lambda: self._found(run))
+        self.after(self.reading_time, lambda: self._read_code(run))
 
-    def _found(self, run: int) -> None:
+    def _read_code(self, run: int) -> None:
         """Read the present code, in the current reading."""
         if run != self._run or self._reading is None:
             return
@@ -123,6 +123,6 @@ class EmulatedSr(LineCamera):
     def tell_all(self) -> None:
         """Read a code and send it to all clients."""
         code = next(self.codes)
-        row = next(number for number, one in enumerate(LINES.rows, 1) if one.line == "code")
+        row = next(number for number, row in enumerate(LINES.rows, 1) if row.line == "code")
         for client in list(self._clients.values()):
             client.say_bytes(self.lines.data(NOTHING_READ if code is None else code), row=row)

@@ -26,8 +26,8 @@ def error_code(line: str) -> int | None:
     Raises:
         ValueError: the line has no number.
     """
-    word, _, rest = line.partition(",")
-    return int(rest.rpartition(",")[2]) if word == "ER" else None
+    word, _, code_text = line.partition(",")
+    return int(code_text.rpartition(",")[2]) if word == "ER" else None
 
 
 def check_done(line: str) -> int:
@@ -42,6 +42,6 @@ def asked_word(line: str, others: Mapping[str, str]) -> str:
         line: the answer.
         others: commands whose answers begin with another word, and that word.
     """
-    first, _, rest = line.partition(",")
-    word = rest.partition(",")[0] if first in {"OK", "ER"} and rest else first
+    first, _, argument = line.partition(",")
+    word = argument.partition(",")[0] if first in {"OK", "ER"} and argument else first
     return others.get(word, word)

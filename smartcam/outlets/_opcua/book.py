@@ -42,31 +42,33 @@ class ResultBook:
 
     def __init__(self, most: int) -> None:
         self._most, self._characters = most, 0
-        self._kept: collections.OrderedDict[str, KeptResult] = collections.OrderedDict()
+        self._results: collections.OrderedDict[str, KeptResult] = collections.OrderedDict()
         self._handles: collections.OrderedDict[int, None] = collections.OrderedDict()
         self._last_handle = 0
 
-    def add(self, kept: KeptResult) -> None:
+    def add(self, kept_result: KeptResult) -> None:
         """Add a result; an earlier one with the same id is replaced."""
-        before = self._kept.pop(kept.result.id, None)
-        self._characters += len(kept.text) - (0 if before is None else len(before.text))
-        self._kept[kept.result.id] = kept
-        while len(self._kept) > self._most or (
-            self._characters > MAX_BOOK_CHARACTERS and len(self._kept) > 1
+        before = self._results.pop(kept_result.result.id, None)
+        self._characters += len(kept_result.text) - (0 if before is None else len(before.text))
+        self._results[kept_result.result.id] = kept_result
+        while len(self._results) > self._most or (
+            self._characters > MAX_BOOK_CHARACTERS and len(self._results) > 1
         ):
-            _, gone = self._kept.popitem(last=False)
+            _, gone = self._results.popitem(last=False)
             self._characters -= len(gone.text)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
         """Return a camera's result by its id; None if it is unknown, or no longer kept."""
-        found = self._kept.get(key)
-        return found if found is not None and found.result.camera == camera else None
+        kept_result = self._results.get(key)
+        return (
+            kept_result if kept_result is not None and kept_result.result.camera == camera else None
+        )
 
     def newest(self, camera: str, fits: Callable[[KeptResult], bool]) -> Iterator[KeptResult]:
         """Yield a camera's results that fit, the newest first."""
-        for kept in reversed(self._kept.values()):
-            if kept.result.camera == camera and fits(kept):
-                yield kept
+        for kept_result in reversed(self._results.values()):
+            if kept_result.result.camera == camera and fits(kept_result):
+                yield kept_result
 
     def handle(self, timeout: int) -> int:
         """Return a new handle; 0 for a client that needs none, since its ``timeout`` is 0."""

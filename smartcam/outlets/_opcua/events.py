@@ -92,9 +92,9 @@ class Events:
                 raise KeyError(f"{kind} has no field {field}")
             setattr(event, field, value)
         for node in (source, ua.NodeId(ua.ObjectIds.Server)):
-            one = copy.copy(event)
-            one.emitting_node = node
-            await self._server.iserver.subscription_service.trigger_event(one)
+            emitted = copy.copy(event)
+            emitted.emitting_node = node
+            await self._server.iserver.subscription_service.trigger_event(emitted)
 
     async def _template(self, kind: str) -> Any:
         known = self._templates.get(kind)
@@ -114,6 +114,6 @@ def _type_of(field: str, data_type: Any) -> ua.VariantType:
         return ua.VariantType.NodeId
     if field in _TYPES:
         return _TYPES[field]
-    if isinstance(data_type, ua.NodeId):  # of a time
+    if isinstance(data_type, ua.NodeId):  # type of a time
         return ua.VariantType.DateTime
     return ua.VariantType(data_type)

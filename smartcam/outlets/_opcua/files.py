@@ -41,11 +41,11 @@ class TransferFiles:
 
     Args:
         server: server of asyncua.
-        own: index of the namespace that contains the cameras' nodes.
+        own_index: index of the namespace that contains the cameras' nodes.
     """
 
-    def __init__(self, server: Any, own: int) -> None:
-        self._server, self._own = server, own
+    def __init__(self, server: Any, own_index: int) -> None:
+        self._server, self._own_index = server, own_index
         self._files: dict[int, _OpenFile] = {}
         self._numbers = itertools.count(1)
         self._closing: set[asyncio.Task[None]] = set()
@@ -69,10 +69,10 @@ class TransferFiles:
         await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
 
     async def _generate(self, nodes: CameraNodes, book: ResultBook, options: Any) -> Any:
-        asked = getattr(getattr(options, "Value", None), "Id", None)
-        key = getattr(asked, "Id", asked)
-        kept = book.get(key, nodes.name) if isinstance(key, str) else None
-        path = None if kept is None else kept.result.picture
+        key_asked = getattr(getattr(options, "Value", None), "Id", None)
+        key = getattr(key_asked, "Id", key_asked)
+        kept_result = book.get(key, nodes.name) if isinstance(key, str) else None
+        path = None if kept_result is None else kept_result.result.picture
         if path is None:
             return _status(ua.StatusCodes.BadNotFound)
         if len(self._files) >= MAX_FILES:
@@ -97,7 +97,7 @@ class TransferFiles:
             self._server.get_node(nodes.id(_TRANSFER)),
             self._server.get_node(ua.NodeId(ua.ObjectIds.FileType)),
             nodeid=root,
-            bname=ua.QualifiedName(f"File{number}", self._own),
+            bname=ua.QualifiedName(f"File{number}", self._own_index),
             instantiate_optional=False,
         )
         for name, value, of in (
@@ -106,10 +106,10 @@ class TransferFiles:
             ("Writable", False, ua.VariantType.Boolean),
             ("UserWritable", False, ua.VariantType.Boolean),
         ):
-            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
             await node.write_value(value, of)
         for name, call in self._calls(number).items():
-            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own_index))
             self._server.link_method(node, call)
         return self._server.get_node(root)
 
@@ -119,7 +119,7 @@ class TransferFiles:
         def guarded(do: Any) -> Any:
             async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
                 file = self._files.get(number)
-                values = [one.Value for one in arguments]
+                values = [argument.Value for argument in arguments]
                 if file is None or not values or values[0] != number:
                     return _status(ua.StatusCodes.BadInvalidArgument)
                 file.timer.cancel()

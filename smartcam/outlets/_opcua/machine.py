@@ -41,25 +41,25 @@ class VisionStates:
         Raises:
             WrongStateError: there is no such transition.
         """
-        found = self._find(target, cause)
-        if found is None:
+        transition = self._find(target, cause)
+        if transition is None:
             raise WrongStateError(f"{cause or 'nothing'} leads from {self.both} to {target}")
-        if found.machine == AUTOMATIC:
+        if transition.machine == AUTOMATIC:
             self.automatic = target
         else:
             self.vision = target
             self.automatic = "Initialized" if target == "Operational" else ""
-        return found
+        return transition
 
     def _find(self, target: str, cause: str) -> Transition | None:
         """Return the transition from the present state, one that stays within its machine."""
-        here = {VISION: self.vision, AUTOMATIC: self.automatic}
-        own = {(one.machine, one.source) for one in transitions()}
-        for one in transitions():
-            if here[one.machine] != one.source or one.cause != cause:
+        states = {VISION: self.vision, AUTOMATIC: self.automatic}
+        own_transitions = {(transition.machine, transition.source) for transition in transitions()}
+        for transition in transitions():
+            if states[transition.machine] != transition.source or transition.cause != cause:
                 continue
-            if (one.machine, one.target) not in own:
+            if (transition.machine, transition.target) not in own_transitions:
                 continue  # Preoperational to Initialized leads into the other machine
-            if target in ("", one.target):
-                return one
+            if target in ("", transition.target):
+                return transition
         return None

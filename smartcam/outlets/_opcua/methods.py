@@ -138,7 +138,7 @@ class Methods:
             codes = ua.StatusCodes
             return ua.StatusCode(codes.BadArgumentsMissing if few else codes.BadTooManyArguments)
         try:
-            given = [_argument(one, of) for one, of in zip(arguments, types, strict=True)]
+            given = [_argument(argument, of) for argument, of in zip(arguments, types, strict=True)]
         except MethodArgumentError:
             return _wrong_arguments(arguments, types)
         try:
@@ -190,24 +190,24 @@ class Methods:
             meas: Any, part: Any, recipe: Any, product: Any, _more: Any
         ) -> list[ua.Variant]:
             ids = (
-                self._given("MeasIdDataType", meas),
-                self._given("PartIdDataType", part),
-                self._given("ProductIdDataType", product),
+                self._client_id("MeasIdDataType", meas),
+                self._client_id("PartIdDataType", part),
+                self._client_id("ProductIdDataType", product),
             )
             job = self._system.start_job(ids, _text(recipe), single=single)
             return [self._id("JobIdDataType", job.id)]
 
         return start
 
-    def _given(self, kind: str, value: Any) -> Any:
+    def _client_id(self, kind: str, value: Any) -> Any:
         """Return the client's id, which the result will carry; None without one."""
         text, description = _text(value), getattr(value, "Description", None)
         if not text and description is None:
             return None
-        found = self._values.identity(kind, text)
+        identity = self._values.identity(kind, text)
         if description is not None and len(description.Text or "") <= MAX_TEXT_CHARACTERS:
-            found.Description = description
-        return found
+            identity.Description = description
+        return identity
 
     async def _start_plain(self, meas: str, part: str, recipe: str) -> list[ua.Variant]:
         """Start a single job for a client that does not support structures."""
@@ -221,14 +221,17 @@ class Methods:
 
     async def _result_plain(self, job: str) -> list[ua.Variant]:
         """Return state, values and error of a job's result as plain values."""
-        found = next(
-            self._book.newest(self._nodes.name, lambda one: one.result.job_id == job), None
+        kept_result = next(
+            self._book.newest(
+                self._nodes.name, lambda kept_result: kept_result.result.job_id == job
+            ),
+            None,
         )
-        if not job or found is None:
+        if not job or kept_result is None:
             raise KeyError(f"there is no result of job {job!r:.80}")
-        state = ua.Variant(found.result.state, ua.VariantType.Int32)
-        text = ua.Variant(found.text, ua.VariantType.String)
-        return [state, text, ua.Variant(found.result.error, ua.VariantType.String)]
+        state = ua.Variant(kept_result.result.state, ua.VariantType.Int32)
+        text = ua.Variant(kept_result.text, ua.VariantType.String)
+        return [state, text, ua.Variant(kept_result.result.error, ua.VariantType.String)]
 
     # ------------------------------------------------------------------ recipes
 
@@ -253,59 +256,62 @@ class Methods:
         if self._system.application:
             known[self._system.application] = None
         fits = [
-            one
-            for one in known
-            if prepared not in (0, 1) or (one == ready) == bool(prepared)
-            if not name or name in (self._system.recipe_name(one), str(one))
+            recipe
+            for recipe in known
+            if prepared not in (0, 1) or (recipe == ready) == bool(prepared)
+            if not name or name in (self._system.recipe_name(recipe), str(recipe))
             if not _text(product)
         ]
         page = fits[first : first + _most(most)]
-        listed = [self._values.identity("RecipeIdInternalDataType", str(one)) for one in page]
+        listed = [self._values.identity("RecipeIdInternalDataType", str(recipe)) for recipe in page]
         complete = first + len(page) >= len(fits)
         return [_boolean(complete), _number(len(page)), _number(0), _list(listed)]
 
     # ------------------------------------------------------------------ results
 
-    def _kept(self, result: Any) -> KeptResult:
+    def _kept_result(self, result: Any) -> KeptResult:
         text = _text(result)
-        found = self._book.get(text, self._nodes.name)
-        if found is None:
+        kept_result = self._book.get(text, self._nodes.name)
+        if kept_result is None:
             raise KeyError(f"there is no result {text!r:.120}")
-        return found
+        return kept_result
 
     async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
-        found = self._kept(result)
-        value = ua.Variant(found.value, ua.VariantType.ExtensionObject)
+        kept_result = self._kept_result(result)
+        value = ua.Variant(kept_result.value, ua.VariantType.ExtensionObject)
         return [_number(self._book.handle(timeout)), value]
 
     async def _components(self, result: Any, timeout: int) -> list[ua.Variant]:
-        value = self._kept(result).value
+        value = self._kept_result(result).value
         handle = _number(self._book.handle(timeout))
         outputs = [_boolean(bool(value.HasTransferableDataOnFile)), handle]
         for name, of in _COMPONENTS:
-            one = getattr(value, name)
-            outputs.append(ua.Variant() if one is None else ua.Variant(one, of))
+            component = getattr(value, name)
+            outputs.append(ua.Variant() if component is None else ua.Variant(component, of))
         return outputs
 
-    async def _results(self, state: int, *rest: Any) -> list[ua.Variant]:
-        *ids, most, first, timeout = rest
+    async def _results(self, state: int, *arguments: Any) -> list[ua.Variant]:
+        *ids, most, first, timeout = arguments
         wanted = [
-            (name, text) for name, one in zip(_FILTERS, ids, strict=True) if (text := _text(one))
+            (name, text)
+            for name, filter_id in zip(_FILTERS, ids, strict=True)
+            if (text := _text(filter_id))
         ]
 
-        def fits(kept: KeptResult) -> bool:
-            if state and kept.result.state != state:
+        def fits(kept_result: KeptResult) -> bool:
+            if state and kept_result.result.state != state:
                 return False
-            found = [getattr(kept.value, name) for name, _ in wanted]
+            identities = [getattr(kept_result.value, name) for name, _ in wanted]
             texts = [text for _, text in wanted]
             return all(
-                one is not None and one.Id == text for one, text in zip(found, texts, strict=True)
+                identity is not None and identity.Id == text
+                for identity, text in zip(identities, texts, strict=True)
             )
 
         limit = _most(most)
-        found = self._book.newest(self._nodes.name, fits)
-        page = [*itertools.islice(found, first, first + limit + 1)]
-        listed = [one.value for one in page[:limit]]
+        matching = self._book.newest(self._nodes.name, fits)
+        page = [*itertools.islice(matching, first, first + limit + 1)]
+        listed = [kept_result.value for kept_result in page[:limit]]
         handle = _number(self._book.handle(timeout))
         return [_boolean(len(page) <= limit), _number(len(listed)), handle, _list(listed)]
 
@@ -394,10 +400,10 @@ def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> u
     """Return the answer to a call with wrong types of arguments, with a status for each."""
     result = ua.CallMethodResult()
     result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-    for one, of in zip(arguments, types, strict=True):
+    for argument, of in zip(arguments, types, strict=True):
         status = ua.StatusCode()
         try:
-            _argument(one, of)
+            _argument(argument, of)
         except MethodArgumentError:
             status = ua.StatusCode(ua.StatusCodes.BadTypeMismatch)
         result.InputArgumentResults.append(status)

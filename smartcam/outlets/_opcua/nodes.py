@@ -91,7 +91,7 @@ class CameraNodes:
         parts: tuple[Events, VisionValues, PublishQueue],
     ) -> None:
         self._server, self.name = server, name
-        self._vision, self._own = spaces
+        self._vision, self._own_index = spaces
         self._events, self._values, self._outbox = parts
         self.root = self.id("")
         self._count = 0
@@ -101,11 +101,13 @@ class CameraNodes:
 
     def id(self, path: str) -> ua.NodeId:
         """Return the id of a node by its path of names below the camera's node."""
-        return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own)
+        return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own_index)
 
     async def make(self, states: VisionStates) -> None:
         """Make the nodes."""
-        await self._instance(self._server.nodes.objects, self.root, "VisionSystemType", self._own)
+        await self._instance(
+            self._server.nodes.objects, self.root, "VisionSystemType", self._own_index
+        )
         for path, kind in _PARTS:
             parent = self._node(path.rpartition(".")[0])
             await self._instance(parent, self.id(path), kind, self._vision)
@@ -116,18 +118,21 @@ class CameraNodes:
             [ua.EventNotifier.SubscribeToEvents]
         )
         await self._server.nodes.server.add_reference(self.root, ua.ObjectIds.HasNotifier)
-        plain_node = await self._node("").add_object(self.id("Plain"), f"{self._own}:Plain")
+        plain_node = await self._node("").add_object(self.id("Plain"), f"{self._own_index}:Plain")
         for name, (kind, first) in _PLAIN.items():
             await plain_node.add_variable(
-                self.id(f"Plain.{name}"), f"{self._own}:{name}", first, varianttype=kind
+                self.id(f"Plain.{name}"), f"{self._own_index}:{name}", first, varianttype=kind
             )
         for name, (inputs, outputs) in _PLAIN_METHODS.items():
             await plain_node.add_method(
                 self.id(f"Plain.{name}"),
-                ua.QualifiedName(name, self._own),
+                ua.QualifiedName(name, self._own_index),
                 _nothing,
-                [_argument(one, kind) for one, kind in inputs],
-                [_argument(one, kind) for one, kind in (*outputs, ("Error", ua.VariantType.Int32))],
+                [_argument(argument_name, kind) for argument_name, kind in inputs],
+                [
+                    _argument(argument_name, kind)
+                    for argument_name, kind in (*outputs, ("Error", ua.VariantType.Int32))
+                ],
             )
         await self._show_states(states.vision, states.automatic)
 
@@ -137,7 +142,7 @@ class CameraNodes:
     async def _instance(self, parent: Any, node: ua.NodeId, kind: str, space: int) -> None:
         of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         text = str(node.Identifier)
-        name = text if space == self._own else text.rpartition(".")[2]
+        name = text if space == self._own_index else text.rpartition(".")[2]
         await instantiate(
             parent,
             of,
@@ -151,10 +156,10 @@ class CameraNodes:
         """Add an optional method to an instance, as a copy of its type's node."""
         of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         pattern = await of.get_child(f"{self._vision}:{method}")
-        found: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
-        for one in await pattern.get_properties():
-            found[(await one.read_browse_name()).Name] = await one.read_value()
-        inputs, outputs = found["InputArguments"], found["OutputArguments"]
+        arguments: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
+        for property_ in await pattern.get_properties():
+            arguments[(await property_.read_browse_name()).Name] = await property_.read_value()
+        inputs, outputs = arguments["InputArguments"], arguments["OutputArguments"]
         name = ua.QualifiedName(method, self._vision)
         await self._node(path).add_method(
             self.id(f"{path}.{method}"), name, _nothing, inputs, outputs
@@ -327,8 +332,8 @@ class CameraNodes:
             "Records": len(records),
             "Value": text,
         }
-        for name, one in shown.items():
-            await self._write(f"Plain.{name}", ua.Variant(one, _PLAIN[name][0]))
+        for name, value in shown.items():
+            await self._write(f"Plain.{name}", ua.Variant(value, _PLAIN[name][0]))
         if columns and result.application is not None:
             first = records[0] if records and not result.error else {}
             await self._show_columns(f"App{result.application}", columns[:MAX_FIELDS], first)
@@ -350,16 +355,16 @@ class CameraNodes:
                 await self._write(path, value)
 
     async def _make_columns(self, folder: str, columns: Sequence[Column]) -> None:
-        """Make a variable for each value, in place of those of an earlier layout."""
+        """Make a variable for each value, in place of the variables of an earlier layout."""
         node = self._node(f"Plain.{folder}")
         if folder in self._columns:
             await self._server.delete_nodes([node], recursive=True)
         parent = self._node("Plain")
-        node = await parent.add_object(self.id(f"Plain.{folder}"), f"{self._own}:{folder}")
+        node = await parent.add_object(self.id(f"Plain.{folder}"), f"{self._own_index}:{folder}")
         for name, kind, unit in columns:
             made = await node.add_variable(
                 self.id(f"Plain.{folder}.{name}"),
-                ua.QualifiedName(name, self._own),
+                ua.QualifiedName(name, self._own_index),
                 plain(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
                 varianttype=type_of(kind),
                 datatype=ua.NodeId(type_of(kind).value),

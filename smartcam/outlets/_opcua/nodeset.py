@@ -55,7 +55,7 @@ def nodeset_text() -> str:
 @functools.cache
 def _nodes() -> Mapping[str, ET.Element]:
     root = ET.fromstring(nodeset_text())  # noqa: S314 - a file of this package
-    return {one.attrib["NodeId"]: one for one in root if "NodeId" in one.attrib}
+    return {element.attrib["NodeId"]: element for element in root if "NodeId" in element.attrib}
 
 
 def _name(node: ET.Element) -> str:
@@ -67,34 +67,34 @@ def node_ids() -> Mapping[str, int]:
     """Return the numeric ids of all types of the nodeset, by their names."""
     kinds = ("UAObjectType", "UAVariableType", "UADataType")
     wanted = {_NODE + kind for kind in kinds}
-    return {_name(one): _number(key) for key, one in _nodes().items() if one.tag in wanted}
+    return {_name(node): _number(key) for key, node in _nodes().items() if node.tag in wanted}
 
 
 @functools.cache
 def state_ids() -> Mapping[tuple[str, str], int]:
     """Return the numeric ids of states, by the names of their machine's type and their own."""
-    found: dict[tuple[str, str], int] = {}
-    for one in transitions():
-        for name, key in _ends(_nodes()[f"ns=1;i={one.node}"]):
-            found[_machine(_nodes()[key]), name] = _number(key)
-    return found
+    ids: dict[tuple[str, str], int] = {}
+    for transition in transitions():
+        for name, key in _ends(_nodes()[f"ns=1;i={transition.node}"]):
+            ids[_machine(_nodes()[key]), name] = _number(key)
+    return ids
 
 
 @functools.cache
 def transitions() -> tuple[Transition, ...]:
     """Return the transitions of both machines, from the XML."""
-    found: list[Transition] = []
+    transitions_found: list[Transition] = []
     for key, node in _nodes().items():
         ends = [name for name, _ in _ends(node)]
         machine = _machine(node)
         if len(ends) == 2 and machine in (VISION, AUTOMATIC):
-            causes = [_name(_nodes()[one]) for one in _refers(node, "HasCause")]
-            effects = tuple(_name(_nodes()[one]) for one in _refers(node, "HasEffect"))
+            causes = [_name(_nodes()[reference]) for reference in _refers(node, "HasCause")]
+            effects = tuple(_name(_nodes()[reference]) for reference in _refers(node, "HasEffect"))
             source, target = ends
             cause = causes[0] if causes else ""
             made = Transition(machine, _name(node), _number(key), source, target, cause, effects)
-            found.append(made)
-    return tuple(found)
+            transitions_found.append(made)
+    return tuple(transitions_found)
 
 
 def _ends(node: ET.Element) -> list[tuple[str, str]]:
@@ -104,11 +104,11 @@ def _ends(node: ET.Element) -> list[tuple[str, str]]:
 
 
 def _refers(node: ET.Element, kind: str) -> list[str]:
-    found = node.iterfind(f"{_NODE}References/{_NODE}Reference")
+    references = node.iterfind(f"{_NODE}References/{_NODE}Reference")
     return [
-        one.text or ""
-        for one in found
-        if one.get("ReferenceType") == kind and one.get("IsForward") != "false"
+        reference.text or ""
+        for reference in references
+        if reference.get("ReferenceType") == kind and reference.get("IsForward") != "false"
     ]
 
 

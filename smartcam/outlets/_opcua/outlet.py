@@ -61,7 +61,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         await self._in_server_thread(server.start())
         self._open = True
         for camera, state in self._states.items():
-            self._tell(server, camera, state)
+            self._show_state(server, camera, state)
 
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries in the server's thread."""
@@ -74,7 +74,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         if camera in self._states or len(self._states) < MAX_STATES:
             self._states[camera] = state
             if self._open and self._server is not None:
-                self._tell(self._server, camera, state)
+                self._show_state(self._server, camera, state)
 
     async def watch(self) -> None:
         """Wait until the server fails."""
@@ -90,7 +90,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         finally:
             await asyncio.to_thread(self._thread.stop)
 
-    def _tell(self, server: VisionServer, camera: str, state: Mapping[str, Any]) -> None:
+    def _show_state(self, server: VisionServer, camera: str, state: Mapping[str, Any]) -> None:
         self._thread.post(lambda: server.state_changed(camera, state))
 
     async def _in_server_thread(self, work: Coroutine[Any, Any, None]) -> None:

@@ -84,7 +84,7 @@ class Users:
 
     def __init__(self, settings: OpcUaSettings, folder: Path) -> None:
         self._anonymous = settings.anonymous
-        self._passwords = {name: one.read(folder) for name, one in settings.users.items()}
+        self._passwords = {name: user.read(folder) for name, user in settings.users.items()}
         for name, password in self._passwords.items():
             if not password:
                 raise ConfigurationError(f"users.{name}: the password is empty")
@@ -142,7 +142,11 @@ class FailedLogins:
             ServiceError: too many logins from this address have failed.
         """
         now = self._clock()
-        failed = [one for one in self._failed.get(address, ()) if now - one < LOGIN_SECONDS]
+        failed = [
+            attempt_at
+            for attempt_at in self._failed.get(address, ())
+            if now - attempt_at < LOGIN_SECONDS
+        ]
         if len(failed) >= MAX_FAILED_LOGINS:
             raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
         try:

@@ -92,11 +92,11 @@ class VisionServer:
         await secure(server, self.name, self.settings, self.folder)
         await server.import_xml(xmlstring=nodeset_text())
         vision = await server.get_namespace_index(URI)
-        own = await server.register_namespace(OWN_URI)
-        self.spaces = vision, own
-        self.values = VisionValues(server, vision, own)
+        own_index = await server.register_namespace(OWN_URI)
+        self.spaces = vision, own_index
+        self.values = VisionValues(server, vision, own_index)
         self.events = Events(server, vision)
-        self.files = TransferFiles(server, own)
+        self.files = TransferFiles(server, own_index)
         await self._link_types()
         self.outbox.start()
         chosen = filter(self.settings.chooses, self.context.cameras())
@@ -225,7 +225,7 @@ class CameraFace:
         types: list[int] = []
         with contextlib.suppress(ua.UaStatusCodeError):  # a method without arguments
             inputs = await (await node.get_child("0:InputArguments")).read_value()
-            types = [kind_of(one.DataType, one.ValueRank) for one in inputs]
+            types = [kind_of(argument.DataType, argument.ValueRank) for argument in inputs]
 
         async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
             return await self._methods.call(method, types, arguments)

@@ -1,4 +1,4 @@
-"""A camera as a vision system, whose states follow methods, results and the camera's state."""
+"""A camera as OPC UA's vision system: its states change by methods, results and the camera."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_REMEMBERED_JOBS = 1000
-"""Largest number of ended jobs that are remembered for results that come late from the spool."""
+"""Largest number of ended jobs that are remembered for late results from the spool."""
 
 MAX_PENDING = 1000
 """Largest number of results that wait until it is known whether they belong to the running job."""
@@ -43,26 +43,26 @@ RESULT_WAIT = 5.0
 """Seconds to wait after a trigger for its result from the spool."""
 
 COMMAND_GRACE = 30.0
-"""Seconds that a command may have beyond its own timeout, to reach the camera."""
+"""Additional seconds, beyond a command's own timeout, for its way to the camera."""
 
 PREPARE_WAIT = 0.3
 """Seconds that PrepareRecipe waits before it returns that it is not completed yet."""
 
 CONTINUOUS_GRACE = 5.0
-"""Seconds after continuous execution in which its last results may come from the spool."""
+"""Seconds after continuous execution in which its last results may arrive from the spool."""
 
-OWED_SECONDS = 60.0
-"""Seconds in which a job that was given up may still have a result."""
+LATE_RESULT_SECONDS = 60.0
+"""Seconds in which a result of an aborted job may still arrive."""
 
 
 class Face(Protocol):
-    """The side of a vision system that clients see; each call returns at once."""
+    """The nodes and events that clients see of a vision system; each call returns at once."""
 
     def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
 
     def acquired(self, job: VisionJob) -> None:
-        """Raise the event that a job's part may move: its picture is taken."""
+        """Raise the event for a taken picture, after which the part may move."""
 
     def result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
@@ -71,7 +71,7 @@ class Face(Protocol):
         """Raise an event with a text."""
 
     def trouble(self, why: str) -> None:
-        """Show why the camera cannot be used; "" when it can."""
+        """Show the reason why the camera is unusable; "" if it can be used."""
 
 
 class VisionSystem:
@@ -81,7 +81,7 @@ class VisionSystem:
         name: name of the camera.
         settings: settings of the server.
         command: function that carries out a command, by the camera's name, a verb and its fields.
-        face: the side that clients see.
+        face: nodes and events that clients see.
         picture: function that returns the file of a result's picture.
         new_job: function that returns an id for a job.
         names: function that returns the names of the camera's own applications, with their numbers.
@@ -107,21 +107,23 @@ class VisionSystem:
         self._command, self._picture, self._new_job = command, picture, new_job
         self._names = names
         self._simulated = simulated
-        # whether the camera is connected; None if it is not known yet
+        # whether the camera is connected; None: unknown
         self._connected: bool | None = None
-        self._by_client = False  # clients prepare recipes: no other becomes ready by itself
+        # whether clients prepare recipes: then none becomes ready by itself
+        self._by_client = False
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None
         self._preparing = False
-        self._stopped = False  # this server stopped the camera: start it before the next trigger
-        self._owed_until = -1.0  # until then a result may belong to a job that was given up
+        # whether this server stopped the camera: start it before the next trigger
+        self._stopped = False
+        self._late_until = -1.0  # loop time until which a result may belong to an aborted job
         self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
         self._last_continuous: VisionJob | None = None
         self._pending: collections.deque[OutletEntry] = collections.deque()
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
-        """End the job under way, and its tasks."""
+        """End the running job and its tasks."""
         self._end_job(ABORTED, "the server ends")
         for task in self._tasks:
             task.cancel()
@@ -131,12 +133,12 @@ class VisionSystem:
     # ------------------------------------------------------------------ the camera's state
 
     def camera_changed(self, state: Mapping[str, Any]) -> None:
-        """Follow the camera's connection and active application."""
+        """Update the states after a change of the camera's connection or active application."""
         connected, before = bool(state.get("connected")), self._connected
         self._connected, self.application = connected, state.get("application")
         if connected:
             if not before:
-                self._owed_until = -1.0
+                self._late_until = -1.0
                 self.face.trouble("")
             self._follow()
         elif before is not False:
@@ -147,7 +149,7 @@ class VisionSystem:
                 self._move("Error", why=why)
 
     def _follow(self) -> None:
-        """Make the transitions that need no method."""
+        """Make the transitions that the camera's state causes."""
         states = self.states
         if not self._connected:
             if self._connected is False and states.vision == "Preoperational":
@@ -184,7 +186,7 @@ class VisionSystem:
         return self._ready_application if ready else None
 
     def change(self, method: str, target: str, why: str = "") -> None:
-        """Carry out a method that only changes the state of the whole system.
+        """Carry out a method that only changes the state of the vision system.
 
         Args:
             method: ``Halt``, ``Reset`` or ``SelectModeAutomatic``.
@@ -206,10 +208,12 @@ class VisionSystem:
 
     @property
     def recipes(self) -> Mapping[str, int]:
-        """Names of applications: those of the settings, which win, and the camera's own."""
+        """Applications by name; names in the settings have priority over the camera's own."""
         named = self.settings.recipes
-        own = {name: number for name, number in self._names().items() if name not in named}
-        return {**named, **own}
+        recipes_unnamed = {
+            name: number for name, number in self._names().items() if name not in named
+        }
+        return {**named, **recipes_unnamed}
 
     def application_of(self, external: str, internal: str = "") -> int:
         """Return the application of a recipe.
@@ -221,19 +225,19 @@ class VisionSystem:
         Raises:
             UnknownRecipeError: there is no such recipe, or the two ids name different ones.
         """
-        found: set[int] = set()
+        applications: set[int] = set()
         recipes = self.recipes
         for text, names in ((external, recipes), (internal, dict[str, int]())):
             if text in names:
-                found.add(names[text])
+                applications.add(names[text])
             elif text.isascii() and text.isdecimal() and int(text[:11]) <= 0xFFFFFFFF:
-                found.add(int(text))
+                applications.add(int(text))
             elif text:
                 known = ", ".join(recipes) or "no names"
                 raise UnknownRecipeError(f"there is no recipe {text!r:.80}; known: {known}")
-        if len(found) != 1:
+        if len(applications) != 1:
             raise UnknownRecipeError(f"expected one recipe, got {external!r:.80}, {internal!r:.80}")
-        return found.pop()
+        return applications.pop()
 
     def recipe_name(self, application: int | None) -> str:
         """Return the first name of an application, else its number."""
@@ -241,9 +245,9 @@ class VisionSystem:
         return next(names, "" if application is None else str(application))
 
     async def prepare(self, application: int) -> bool:
-        """Begin to prepare an application, wait a moment, and return True if it is ready.
+        """Begin to prepare an application; return True if it is ready after a moment.
 
-        A camera may take seconds, and a client's other requests wait during this one.
+        A camera may take seconds, and the client's other requests wait for the return.
 
         Raises:
             WrongStateError: the method is not allowed in this state, or the state changed
@@ -269,7 +273,7 @@ class VisionSystem:
         return True
 
     def _prepared_later(self, application: int, done: asyncio.Future[None]) -> None:
-        """Report the failure of a recipe whose caller got no error any more."""
+        """Report the failure of a preparation after the method's return."""
         error = None if done.cancelled() else done.exception()
         if error is not None:
             text = f"recipe {application} is not prepared: {str(error) or type(error).__name__}"
@@ -291,7 +295,7 @@ class VisionSystem:
             self._become_ready("PrepareRecipe")
         except (SmartCamError, TimeoutError) as exc:
             prepared.set_exception(exc)
-            prepared.exception()  # the caller may no longer wait
+            prepared.exception()  # mark the error as retrieved, if the caller no longer waits
         else:
             prepared.set_result(None)
         finally:
@@ -314,12 +318,12 @@ class VisionSystem:
 
         Args:
             ids: ids of measurement, part and product.
-            recipe: name or number of the recipe; "" for the one that is ready.
+            recipe: name or number of the recipe; "" for the ready one.
             single: True for one trigger, False for continuous execution.
 
         Raises:
-            WrongStateError: no recipe is ready, or a job is under way.
-            UnknownRecipeError: another recipe than this one is ready.
+            WrongStateError: no recipe is ready, or a job is running.
+            UnknownRecipeError: another recipe is ready.
         """
         method = "StartSingleJob" if single else "StartContinuous"
         self._check(method)
@@ -331,14 +335,14 @@ class VisionSystem:
         return job
 
     def end_job(self, method: str, why: str = "") -> None:
-        """End the job under way.
+        """End the running job.
 
         Args:
             method: ``Stop`` or ``Abort``.
             why: text that the client gave.
 
         Raises:
-            WrongStateError: there is no job under way.
+            WrongStateError: no job is running.
         """
         self._check(method)
         job = self._end_job(ABORTED, f"{method} {why}".rstrip())
@@ -421,7 +425,7 @@ class VisionSystem:
     def _end_job(
         self, state: int, why: str, *, kind: str = "Aborted", owed: bool = True
     ) -> VisionJob | None:
-        """End the job under way, if there is one, and publish its end."""
+        """End the running job, if there is one, and publish its end."""
         job, self.job = self.job, None
         if job is None:
             return None
@@ -430,9 +434,9 @@ class VisionSystem:
         if job.task is not None and job.task is not asyncio.current_task():
             job.task.cancel()
         if job.single and job.trigger is None and owed:
-            self._owed_until = loop.time() + OWED_SECONDS
+            self._late_until = loop.time() + LATE_RESULT_SECONDS
         if job.trigger is not None:
-            self._by_trigger.pop(job.trigger, None)  # its end counts as its one result
+            self._by_trigger.pop(job.trigger, None)  # the end of the job counts as its only result
         if not job.single:
             self._last_continuous = job
             self._stopped = True
@@ -459,7 +463,7 @@ class VisionSystem:
     # ------------------------------------------------------------------ results
 
     def take(self, entry: OutletEntry) -> None:
-        """Publish an entry, or keep it until it is known whether the job under way made it."""
+        """Publish an entry, or keep it until it is known whether it belongs to the running job."""
         job = self.job
         if self._pending or (job is not None and job.single and job.trigger is None):
             fields = json.loads(entry.body) if entry.body else {}
@@ -504,15 +508,15 @@ class VisionSystem:
         """Return the job of a result; None if it is uncertain."""
         trigger = _time(fields.get("triggered_at"))
         if trigger is not None:
-            found = self._by_trigger.pop(trigger, None)
-            if found is not None:
-                return found
+            job_of_trigger = self._by_trigger.pop(trigger, None)
+            if job_of_trigger is not None:
+                return job_of_trigger
         clock = asyncio.get_running_loop().time()
         job = self.job or self._last_continuous
         if job is None or job.single or at < job.started or (trigger and trigger < job.started):
             return None
-        if clock < self._owed_until:
-            self._owed_until = -1.0  # it may be the result of a job that was given up
+        if clock < self._late_until:
+            self._late_until = -1.0  # the result may be one of a job that was given up
             return None
         if job.ended_clock is not None and clock > job.ended_clock + CONTINUOUS_GRACE:
             return None

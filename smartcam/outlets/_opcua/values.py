@@ -99,7 +99,9 @@ class Structure(NamedTuple):
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):
             return None
         kind = ua.VariantType.ExtensionObject
-        return [ua.Variant(ua.ExtensionObject(self.encoding, one), kind) for one in packed]
+        return [
+            ua.Variant(ua.ExtensionObject(self.encoding, structure), kind) for structure in packed
+        ]
 
     def _pack(self, record: Mapping[str, Any]) -> bytes:
         parts: list[bytes] = []
@@ -118,11 +120,11 @@ class VisionValues:
     Args:
         server: server of asyncua, with the nodeset.
         machine_vision: index of the nodeset's namespace.
-        own: index of the namespace of cameras.
+        own_index: index of the namespace of cameras.
     """
 
-    def __init__(self, server: Any, machine_vision: int, own: int) -> None:
-        self._server, self._vision, self._own = server, machine_vision, own
+    def __init__(self, server: Any, machine_vision: int, own_index: int) -> None:
+        self._server, self._vision, self._own_index = server, machine_vision, own_index
         self._structures: dict[tuple[str, int, tuple[Column, ...]], Structure] = {}
         base: Any = getattr(ua, "BinaryIdBaseDataType")  # noqa: B009 - made from the nodeset
         self._classes: dict[str, Any] = {
@@ -209,17 +211,17 @@ class VisionValues:
 
         So a client never decodes a new structure by an earlier one.
         """
-        versions = sum(one[:2] == (camera, application) for one in self._structures)
+        versions = sum(structure[:2] == (camera, application) for structure in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
         digest = hashlib.sha256(repr(columns).encode()).hexdigest()[:16]
         key = f"types.{camera}.App{application}.{digest}"
         node = await create_data_type(
             self._server.nodes.base_structure_type,
-            ua.NodeId(key, self._own),
-            ua.QualifiedName(name, self._own),
+            ua.NodeId(key, self._own_index),
+            ua.QualifiedName(name, self._own_index),
         )
         encoding = await create_encoding(
-            node, ua.NodeId(f"{key}.Binary", self._own), ua.QualifiedName("Default Binary", 0)
+            node, ua.NodeId(f"{key}.Binary", self._own_index), ua.QualifiedName("Default Binary", 0)
         )
         definition = ua.StructureDefinition()
         definition.BaseDataType = self._server.nodes.base_structure_type.nodeid

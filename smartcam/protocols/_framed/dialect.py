@@ -81,7 +81,7 @@ NO_STATUS = Status(0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusBits:
-    """The meaning of the bits in a dialect's status word; by default, those of Status.
+    """The meaning of the bits in a dialect's status word; by default, the meaning of Status.
 
     Attributes:
         named: bit on the wire to the status bit that means the same.
@@ -99,14 +99,14 @@ class StatusBits:
         """Return the status for a word on the wire."""
         if not self.others:
             return as_status(word)
-        status, rest = int(self.always), word
+        status, payload = int(self.always), word
         for bit, meaning in self.named.items():
             status |= meaning if word & bit else 0
-            rest &= ~bit
+            payload &= ~bit
         for bit, meaning in self.without.items():
             status |= 0 if word & bit else meaning
-            rest &= ~bit
-        return Status(status | rest << self.others)
+            payload &= ~bit
+        return Status(status | payload << self.others)
 
     def write(self, status: Status) -> int:
         """Return the word on the wire; bits without a place there are left out."""
@@ -144,7 +144,7 @@ class Codec:
 
     __slots__ = (
         *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
-        *("_known", "_meaning", "_omitted", "_status"),
+        *("_messages", "_meaning", "_omitted", "_status"),
         *("has_data", "message_id", "names", "size", "type"),
     )
 
@@ -169,13 +169,13 @@ class Codec:
         coded = answers and dialect.coded and "code" in self._fields
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
-        self._known: dict[bytes, Message] = {}  # received bodies; messages are immutable
+        self._messages: dict[bytes, Message] = {}  # received bodies; messages are immutable
         # fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [_filler(row.type, name) for name in self.names]
         self._omitted = [
-            (_filler(row.type, one.name), one.default)
-            for one in dataclasses.fields(row.type)
-            if one.name not in self.names
+            (_filler(row.type, attribute.name), attribute.default)
+            for attribute in dataclasses.fields(row.type)
+            if attribute.name not in self.names
         ]
 
     @property
@@ -229,14 +229,14 @@ class Codec:
             data = bytes(buffer[behind:end])
             return self._make((*self._body.unpack_from(buffer, begin), data))
         body = bytes(buffer[begin:behind])
-        message = self._known.get(body)
+        message = self._messages.get(body)
         if message is None:
             values = self._body.unpack(body)
             if self._status is not None:
                 values = (self._status.read(values[0]), *values[1:])
             message = self._make(values)
-            if len(self._known) < MAX_KNOWN:
-                self._known[body] = message
+            if len(self._messages) < MAX_KNOWN:
+                self._messages[body] = message
         return message
 
     def spell(self, body: bytes) -> dict[str, Any]:
@@ -251,7 +251,9 @@ class Codec:
     def like(self, message: Message) -> Callable[[bytes], Message]:
         """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
-        names = [one.name for one in dataclasses.fields(kind) if one.name != data_name]
+        names = [
+            attribute.name for attribute in dataclasses.fields(kind) if attribute.name != data_name
+        ]
         others = [(_filler(kind, name), getattr(message, name)) for name in names]
         fill_data = _filler(kind, data_name)
 
@@ -266,7 +268,7 @@ class Codec:
             return make
         (fill_1, value_1), (fill_2, value_2), (fill_3, value_3), (fill_4, value_4) = others
 
-        def make_result(data: bytes) -> Message:  # as make() does, without a loop
+        def make_result(data: bytes) -> Message:  # same result as make(), without a loop
             made = new(kind)
             fill_1(made, value_1)
             fill_2(made, value_2)
@@ -288,7 +290,7 @@ class Codec:
 
 def _filler(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
     """Return the setter of a field's slot, from the class that declares the slot."""
-    owner = next(one for one in message_type.__mro__ if name in vars(one))
+    owner = next(base for base in message_type.__mro__ if name in vars(base))
     fill: Callable[[Message, Any], None] = vars(owner)[name].__set__
     return fill
 
@@ -514,7 +516,7 @@ class FramedDialect(Dialect):
         if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
             fields = codec.spell(frame.payload)
         else:
-            with contextlib.suppress(RemoteProtocolError):  # its error follows in the trace
+            with contextlib.suppress(RemoteProtocolError):  # the frame's error follows in the trace
                 message = self.decode(sender, frame)
                 names = self.fields(type(message))
                 fields = {name: jsonable(getattr(message, name)) for name in names}

@@ -1,32 +1,32 @@
 """Bound the time that a frame may take to be received.
 
-A wrong length swallows the bytes that follow, and no other message is received meanwhile. A peer
-that breaks off sends nothing more, which the liveness check finds. So it is enough to check the age
-whenever bytes come.
+With a wrong length a frame swallows the bytes that follow, so that no other message is received. A
+peer that stops sending is found by the liveness check. So it is enough to check the age when bytes
+arrive.
 """
 
 from __future__ import annotations
 
 FRAME_TIME = 5.0
-"""Seconds that a frame of a stream may take, plus the time for its length. A camera writes it at
-once; TCP replaces lost segments within one or two seconds."""
+"""Seconds that a frame on TCP may take, plus the transfer time of its length. A camera writes a
+frame at once; TCP replaces lost segments within one or two seconds."""
 
 FRAME_RATE = 1 << 16
-"""Bytes a second of the slowest line: half a megabit. The 64 kB that a camera sends at most may
-take 6 s, the 1 MiB that is accepted by default 21 s."""
+"""Rate of the slowest line, bytes per second: half a megabit. The 64 kB that a camera sends at most
+may take 6 s; the 1 MiB that is accepted by default, 21 s."""
 
 HINT_TIME = 1.0
 """Seconds after which another header inside an unfinished frame shows that the frame's length is
-wrong. A frame that comes without delay may hold any bytes."""
+wrong. Before, a frame may contain any bytes."""
 
 
 class Unfinished:
     """The age of the frame that is being received.
 
-    The longest pause in it does not count, since perhaps this side did not read.
+    The longest pause is not counted, since this side may not have read.
 
     Attributes:
-        searched: number of its bytes that were searched for another header.
+        searched: number of the frame's bytes that were searched for another header.
     """
 
     __slots__ = ("_frame", "_pause", "_received_at", "searched")
@@ -37,9 +37,9 @@ class Unfinished:
         self.searched: int = 0
 
     def age(self, frame: int, since: float, now: float) -> float:
-        """Return the seconds since a frame's first bytes came; call it whenever bytes come.
+        """Return the seconds since a frame's first bytes arrived; call it whenever bytes arrive.
 
-        ``frame``: number of the frame. Its first bytes came at ``since``, the last at ``now``.
+        ``frame``: number of the frame. ``since``, ``now``: arrival of its first and last bytes.
         """
         if frame != self._frame:
             self._frame, self._received_at, self._pause, self.searched = frame, since, 0.0, 0

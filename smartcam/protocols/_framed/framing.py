@@ -182,8 +182,8 @@ class Framer:
         large = self._large
         if large is None:
             buffer, start = self.buffer, self.start
-            rest = bytes(buffer[start:]) if start < len(buffer) else b""
-            self.buffer, self.start = rest + data if rest else bytes(data), 0
+            unread = bytes(buffer[start:]) if start < len(buffer) else b""
+            self.buffer, self.start = unread + data if unread else bytes(data), 0
             return
         filled, missing = self._filled, len(large) - self._filled
         if len(data) <= missing:
@@ -367,14 +367,14 @@ class Framer:
             self.buffer, self.start, self._large = self.pending, 0, None
         self._keep(self.start)  # a view would be copied at each place
         begin = self.start
-        found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
-        if found < 0:
+        begin_of_next = bytes(self.buffer).find(magic, begin + 1) if magic else -1
+        if begin_of_next < 0:
             keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
             while keep and not magic.startswith(bytes(self.buffer[-keep:])):
                 keep -= 1
-            found = len(self.buffer) - keep
-        self.start = found
-        return found - begin
+            begin_of_next = len(self.buffer) - keep
+        self.start = begin_of_next
+        return begin_of_next - begin
 
     def clear(self) -> None:
         """Drop everything kept."""
@@ -436,11 +436,11 @@ class Framer:
             )
 
 
-def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[bytes]) -> int:
+def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, pieces: list[bytes]) -> int:
     """Cut frames of ``length`` bytes that begin with ``head``, which includes that length.
 
     Sixteen are cut at a time, or none of them: the first that differs may have another length, so
-    bytes after it would be no frame. The bytes after the heads are added to ``found``.
+    bytes after it would be no frame. The bytes after the heads are added to ``pieces``.
 
     Returns:
         The place of the next frame.
@@ -451,12 +451,12 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[
         parts = cut(buffer, start)
         if parts[::2].count(head) < MAX_ALIKE_FRAMES:
             break
-        found += parts[1::2]
+        pieces += parts[1::2]
         start += MAX_ALIKE_FRAMES * length
     return start
 
 
 @functools.lru_cache(maxsize=64)
-def _cutter(count: int, head: int, rest: int) -> Read:
+def _cutter(count: int, head: int, tail: int) -> Read:
     """Return a function that unpacks ``count`` frames into alternating headers and bodies."""
-    return struct.Struct(f"{head}s{rest}s" * count).unpack_from
+    return struct.Struct(f"{head}s{tail}s" * count).unpack_from

@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from smartcam.protocols._framed.dialect import Codec, FramedDialect
     from smartcam.protocols.messages import Message
 
-MANY_EVENTS = 64
+MAX_EVENTS_PER_READ = 64
 """Number of events of one read above which the next read takes fewer bytes: cutting frames, and
 making messages of them, must not delay other cameras."""
 
-MANY_FRAMES = 512
+MAX_FRAMES_PER_READ = 512
 """Number of frames of one read with the same effect, even if all are one burst of results: more
 than the receive task handles in a turn, so that reading would have to pause after each read."""
 
@@ -294,7 +294,7 @@ class Machine:
         # of a client: deliveries by their sizes; how many more are stored
         self._deliveries: dict[int, _Delivery] = {}
         self._unknown_deliveries = MAX_KNOWN_DELIVERIES
-        self._volley: _Volley | None = None  # of a client: the last messages sent together
+        self._volley: _Volley | None = None  # last messages that a client sent together
         # of a camera, by chunks seen before in this state: their messages and frames
         self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
         # of a camera, by the id of a message object sent before: the message and its frame
@@ -310,11 +310,11 @@ class Machine:
         Raises:
             LocalProtocolError: the dialect is not in :attr:`kin`.
         """
-        found = [one for one in self.kin if one is dialect]
-        if not found:
+        candidates = [dialect_ for dialect_ in self.kin if dialect_ is dialect]
+        if not candidates:
             raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
-        self.kin = found
-        self._take_up(found[0])
+        self.kin = candidates
+        self._take_up(candidates[0])
 
     def _take_up(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
@@ -402,9 +402,9 @@ class Machine:
         self._receive(data)
         if state is not self._state or self._framer.buffered:
             return
-        messages = [one for one in self._events[before:] if isinstance(one, m.Message)]
+        messages = [event for event in self._events[before:] if isinstance(event, m.Message)]
         if len(self._chunks) < MAX_KNOWN_CHUNKS and messages:
-            frames = [self.dialect.to_frame(one) for one in messages]
+            frames = [self.dialect.to_frame(message) for message in messages]
             if b"".join(map(self.dialect.encode_frame, frames)) == data:
                 self._chunks[data] = messages, frames
 
@@ -429,8 +429,8 @@ class Machine:
         if cut:
             before = self.counters.frames_received
             left = self._receive_frames()
-            came = self.counters.frames_received - before
-            if came > MANY_FRAMES or len(self._events) > MANY_EVENTS:
+            received = self.counters.frames_received - before
+            if received > MAX_FRAMES_PER_READ or len(self._events) > MAX_EVENTS_PER_READ:
                 self._framer.read_less()
         if left and self._bounded:
             number = self.counters.frames_received
@@ -558,19 +558,19 @@ class Machine:
         self._receive_familiar()
         while framer.start < len(framer.buffer):
             try:
-                found = framer.cut()
+                frame = framer.cut()
             except RemoteProtocolError as error:
                 if self._reject(error):
                     return False
                 framer.resync()
                 continue
-            if found is None:
+            if frame is None:
                 return True
-            message = self._receive_frame(*found)
+            message = self._receive_frame(*frame)
             if framer.start == len(framer.buffer):
                 break
             if self._takes_bursts and isinstance(message, m.ResultContainer):
-                self._receive_burst(message, found[1])
+                self._receive_burst(message, frame[1])
             self._receive_familiar()
         return False
 
@@ -594,12 +594,12 @@ class Machine:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
-                found = self._find_result(buffer, start)
-                if found is None and self._open:
-                    found = self._find_answer(buffer, start)
-                if found is None:
+                result = self._find_result(buffer, start)
+                if result is None and self._open:
+                    result = self._find_answer(buffer, start)
+                if result is None:
                     break
-                message, end = found
+                message, end = result
             elif status_id in self._open:
                 self._close(status_id)
             events.append(message)
@@ -611,8 +611,11 @@ class Machine:
 
     def _note_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
         """Store a delivery that consisted of familiar frames only, each of them an event."""
-        framer, events = self._framer, [one for one in self._events if isinstance(one, m.Message)]
-        results = [at for at, one in enumerate(events) if isinstance(one, m.ResultContainer)]
+        framer, events = (
+            self._framer,
+            [event for event in self._events if isinstance(event, m.Message)],
+        )
+        results = [at for at, event in enumerate(events) if isinstance(event, m.ResultContainer)]
         self._unknown_deliveries -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
             return
@@ -713,12 +716,12 @@ class Machine:
         header = self.dialect.header
         message_id, size = framer.unfinished() or (None, header.size)
         which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
-        there = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
+        shortage = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
         other = framer.header_within(begun.searched)
         if other is not None:
-            text = f"{which} holds another header at byte {other}; {there}"
+            text = f"{which} holds another header at byte {other}; {shortage}"
         elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
-            text = f"{which} does not become whole: {there}"
+            text = f"{which} does not become whole: {shortage}"
         else:
             begun.searched = max(framer.buffered - header.size + 1, 0)
             return False
@@ -735,8 +738,8 @@ class Machine:
                 framer.clear()
                 return
         try:
-            found = framer.cut()
-            if found is None or framer.buffered:
+            frame = framer.cut()
+            if frame is None or framer.buffered:
                 raise MessageError(
                     f"a datagram is not one whole frame: {hex_excerpt(framer.pending)}",
                     data=framer.pending,
@@ -744,7 +747,7 @@ class Machine:
         except RemoteProtocolError as error:
             self._reject(error)
         else:
-            self._receive_frame(*found)
+            self._receive_frame(*frame)
         framer.clear()
 
     def _receive_frame(self, message_id: int, begin: int, end: int) -> Message | None:

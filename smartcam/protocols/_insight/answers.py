@@ -202,10 +202,10 @@ def _bitmap_size(data: bytearray) -> int:
     return size
 
 
-def _number(line: str, what: str) -> int:
+def _number(line: str, label: str) -> int:
     text = line.strip()
     if not text.removeprefix("-").isdecimal() or not text.isascii() or len(text) > 12:
-        raise unexpected(line, what)
+        raise unexpected(line, label)
     return int(text)
 
 

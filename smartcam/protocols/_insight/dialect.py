@@ -73,7 +73,10 @@ _MNEMONICS: Mapping[type[m.Message], str] = {
 
 _REQUESTS = frozenset({m.Connect, m.Disconnect, Command, *_MNEMONICS})
 _REPORTS = frozenset(
-    {m.ResultContainer, *(one.answer for one in _REQUESTS if issubclass(one, m.Request))}
+    {
+        m.ResultContainer,
+        *(request.answer for request in _REQUESTS if issubclass(request, m.Request)),
+    }
 ) - {None}
 
 
@@ -82,7 +85,7 @@ class InSightDialect(Dialect):
     """In-Sight native mode.
 
     Args:
-        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
+        name, about, source, quirks: as for :class:`~smartcam.protocols.Dialect`.
         user: name of the user to log in.
         password: password of that user.
         cells: cells that are read after each trigger, in order, as commands name them.
@@ -174,8 +177,8 @@ class InSightDialect(Dialect):
             return Spelled(None, "password", {"text": "***"}, b"")
         if frame.message_id == Piece.TEXT:
             return Spelled(None, "text", {"text": text}, frame.payload)
-        what = "command" if sender is m.Sender.CLIENT else "line"
-        return Spelled(None, what, {"text": text}, frame.payload + LINE_END)
+        label = "command" if sender is m.Sender.CLIENT else "line"
+        return Spelled(None, label, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
         """Return a command of the user, such as ``GVA001``; the payload follows it.
@@ -216,7 +219,7 @@ def _cell_names(text: str) -> list[str]:
     Raises ConfigurationError: one is neither a cell, a range, nor a name; or there are too many.
     """
     names: list[str] = []
-    for part in filter(None, (one.strip() for one in text.split(","))):
+    for part in filter(None, (name.strip() for name in text.split(","))):
         if ":" in part or part[1:2].isdecimal():
             names += [cell.wire for cell in parse_cells(part)]
         else:

@@ -94,7 +94,7 @@ class AnswerForm(enum.Enum):
     CODE = "code"
     """The code, nothing else."""
     BARE = "bare"
-    """One line with the value; no code comes before it."""
+    """Form of an answer: one line with the value, without a code before it."""
     LINE = "line"
     """The code, then one line."""
     INFO = "info"
@@ -411,8 +411,8 @@ def hex_lines(data: bytes) -> tuple[int, bytes]:
     digits = binascii.hexlify(data).upper()
     # negative: the short line is the last one
     lines = binascii.hexlify(data, b"\n", -HEX_WIDTH // 2).upper().replace(b"\n", LINE_END)
-    found = checksum(digits).encode("ascii") + LINE_END
-    return len(digits), lines + LINE_END * bool(lines) + found
+    tail = checksum(digits).encode("ascii") + LINE_END
+    return len(digits), lines + LINE_END * bool(lines) + tail
 
 
 # ---------------------------------------------------------------------- lines

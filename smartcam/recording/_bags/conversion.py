@@ -46,8 +46,8 @@ def write_bag(
     """Convert a recording to a rosbag2, in its order and with its times.
 
     Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
-    each result's bytes are interpreted again; those that do not fit are written with the error, and
-    counted.
+    each result's bytes are interpreted again; results that do not fit are written with the error,
+    and counted.
 
     Args:
         recording: recording to read.
@@ -86,7 +86,7 @@ def write_bag(
 
 @dataclass(eq=False)
 class BagConversion:
-    """Converts a recording to a bag in steps of one item; the fields are those of `write_bag`."""
+    """Converts a recording to a bag item by item; the fields are arguments of `write_bag`."""
 
     recording: Recording
     folder: Path
@@ -103,11 +103,11 @@ class BagConversion:
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
         again = self.interpret_as is not None or self.calibration is not None
-        self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
+        self._readers = {name.name: self._reader(name) for name in chosen} if again else {}
         self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
-        for one in chosen:
-            facts = {"interpret_as": self._spec(one)} if again else one.facts
-            self._items.describe({**facts, "camera": one.name})
+        for camera in chosen:
+            facts = {"interpret_as": self._spec(camera)} if again else camera.facts
+            self._items.describe({**facts, "camera": camera.name})
 
     @property
     def counts(self) -> BagCounts:
@@ -176,7 +176,7 @@ class BagConversion:
         """Return a result as it is written to the bag."""
         if self._readers:
             return self._readers[result.camera].read(result)
-        if result.value == result.raw.hex():  # as bytes stand in a recording
+        if result.value == result.raw.hex():  # text form of bytes in a recording
             return ReadResult(result._replace(value=result.raw))
         parts = parts_from_json(result.value)
         return ReadResult(result if parts is None else result._replace(value=parts))

@@ -70,7 +70,7 @@ class BagCounts(NamedTuple):
 
     Attributes:
         messages: all messages.
-        results: results, each on the topic ``results``, also those that could not be interpreted.
+        results: results, each on the topic ``results``, also results that could not be interpreted.
         unread: results that could not be interpreted; their messages have the error.
         localizations: results that are localizations, which are on two more topics.
         errors: other errors, on ``/diagnostics``.
@@ -165,10 +165,10 @@ class BagItems:
 
     def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
         at, made = nanoseconds(result.received_at), camera.make
-        if result.application < 0:  # its application is unknown
+        if result.application < 0:  # the result's application is unknown
             result = result._replace(application=0)
         parts = None if error else camera.specs.parts(result)
-        frames = {one.pose.header.frame_id for one in parts or ()}
+        frames = {part.pose.header.frame_id for part in parts or ()}
         self._count(results=1, unread=bool(error), localizations=parts is not None)
         if error:
             message = made.result(result._replace(value=result.raw), None)
@@ -191,8 +191,8 @@ class BagItems:
             return
         application, raw, at = camera.unread() or (0, b"", item.at)
         result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
-        found = self._read(result) if raw else ReadResult(result)
-        yield from self._result(camera, found.result, found.error if found.again else text)
+        reading = self._read(result) if raw else ReadResult(result)
+        yield from self._result(camera, reading.result, reading.error if reading.again else text)
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.counts, name) + more[name] for name in more}
@@ -238,7 +238,7 @@ class _BagCamera:
     def state(self, at: datetime) -> Iterator[BagMessage]:
         """Yield the messages of the state for its topic and, if they changed, the diagnostics."""
         known = self.known
-        how = health(known, heard=bool(known.why))
+        how = health(known, session_alive=bool(known.why))
         fields = {"header": header_fields(at, self.name), **status_fields(known)}
         yield BagMessage(self._status, nanoseconds(at), fields)
         health_now = (how.level, "" if how.level == OK else how.text, known.application)
@@ -306,7 +306,7 @@ def parts_from_json(value: object) -> list[Localization] | None:
         return None
     items: list[Any] = value
     try:
-        return [_part(one) for one in items]
+        return [_part(item) for item in items]
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
@@ -329,7 +329,7 @@ def _part(fields: Mapping[str, Any]) -> Localization:
     if "sigma" in pose:
         sigma = {name: pose["sigma"][name] for name in PoseSigma._fields}
         errors: dict[str, Any] = {
-            name: None if one is None else _number(one) for name, one in sigma.items()
+            name: None if value is None else _number(value) for name, value in sigma.items()
         }
         place = place.with_sigma(PoseSigma(**errors))
     return Localization(feature, _number(fields["quality"]), photo, place)

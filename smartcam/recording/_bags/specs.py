@@ -29,7 +29,7 @@ class Specs:
             except (ValueError, SyntaxError, MemoryError, RecursionError):
                 spec = ""
         specs: Any = spec if hasattr(spec, "items") else {None: spec}
-        self._known = {key: _resolved(one) for key, one in specs.items()}
+        self._by_application = {key: _resolved(spec) for key, spec in specs.items()}
         self._pixels = pixels
         self._with_parts: set[int] = set()  # applications that had localizations
 
@@ -39,7 +39,7 @@ class Specs:
         An empty list counts as localizations if its application had some.
         """
         parts, application = localizations_of(result.value), result.application
-        reader = self._known.get(application, self._known.get(None))
+        reader = self._by_application.get(application, self._by_application.get(None))
         pixels = self._pixels or in_pixels(reader)
         if parts:
             self._with_parts.add(application)

@@ -1,6 +1,6 @@
 """A rosbag2: a folder with an MCAP file of ROS 2 messages and a ``metadata.yaml`` about it.
 
-The contents of both are those of rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
+The contents of both are as in rosbag2: ``mcap_storage.cpp`` of rosbag2_storage_mcap
 (profile ``ros2``, schemas ``ros2msg``, ``offered_qos_profiles`` and ``topic_type_hash`` with each
 channel, a metadata record ``rosbag2``), ``yaml.hpp`` and ``qos.cpp`` of rosbag2_storage (the rest).
 The format is version 8, with the policies as numbers in a text: version 9 has their names in a
@@ -74,9 +74,9 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
         ConfigurationError: the folder exists already, contains something else than a bag, another
             recorder writes it, or it cannot be created.
     """
-    what = f"bag {folder}"
+    label = f"bag {folder}"
     try:
-        made = _made(folder, what, overwrite=overwrite)
+        made = _made(folder, label, overwrite=overwrite)
         try:
             stream = opened(mcap_of(folder), overwrite=overwrite)
             for old in folder.iterdir():
@@ -90,26 +90,26 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
         if isinstance(exc, ConfigurationError):
             raise
         reason = exc.strerror if isinstance(exc, OSError) else exc
-        raise ConfigurationError(f"{what}: {reason}") from exc
+        raise ConfigurationError(f"{label}: {reason}") from exc
     return stream
 
 
-def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
+def _made(folder: Path, label: str, *, overwrite: bool) -> bool:
     """Create the folder if it does not exist; return whether it was created."""
     try:
         folder.mkdir()
     except FileExistsError as exc:
         if not overwrite:
             raise ConfigurationError(
-                f"{what}: it exists already; overwrite (--force) replaces a bag"
+                f"{label}: it exists already; overwrite (--force) replaces a bag"
             ) from exc
         if not folder.is_dir():
-            raise ConfigurationError(f"{what}: this is no folder") from exc
-        other = [one.name for one in folder.iterdir() if not _is_of_bag(folder, one)]
+            raise ConfigurationError(f"{label}: this is no folder") from exc
+        other = [path.name for path in folder.iterdir() if not _is_of_bag(folder, path)]
         if other:
             raise ConfigurationError(
-                f"{what}: the folder holds {other[0]!r:.80}, which is no part of a bag: it is left "
-                "as it is"
+                f"{label}: the folder holds {other[0]!r:.80}, which is no part of a bag: it is "
+                "left as it is"
             ) from exc
         return False
     return True
@@ -122,8 +122,8 @@ def mcap_of(folder: Path) -> Path:
 
 def _is_of_bag(folder: Path, path: Path) -> bool:
     """Return True if a file may be the bag's own; other recordings are not."""
-    own = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
-    return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
+    match = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
+    return (match is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
 
 
 def remove_folder(folder: Path) -> None:

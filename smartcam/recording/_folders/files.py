@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
-LOOK_INTERVAL = 10.0
+LISTING_INTERVAL = 10.0
 """Seconds after which the folder is listed again when a file is begun."""
 
-ITEMS_PER_LOOK = 64
+ITEMS_PER_CHECK = 64
 """Number of items after which a file's size is checked."""
 
 
@@ -78,12 +78,12 @@ class FolderFiles:
         """
         done = written = 0
         try:
-            for place, one in enumerate(given):
-                if track.file is None or (not place % ITEMS_PER_LOOK and self._is_over(track)):
+            for place, item in enumerate(given):
+                if track.file is None or (not place % ITEMS_PER_CHECK and self._is_over(track)):
                     self._flush(track, written)
                     done, written = place, 0
-                    self._begin(track, one)
-                written += self._add(track, one)
+                    self._begin(track, item)
+                written += self._add(track, item)
             self._flush(track, written)
             done = len(given)
         except BaseException:
@@ -96,7 +96,7 @@ class FolderFiles:
         aged = self._clock() - track.begun >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
-    def _add(self, track: CameraTrack, one: Any) -> int:
+    def _add(self, track: CameraTrack, thing: Any) -> int:
         """Add an object's records to the file; return their number."""
         file = track.file
         if file is None:  # cannot happen: the file was begun
@@ -104,18 +104,18 @@ class FolderFiles:
         if track.gap is not None and not track.gap_written:
             self._add_gap(track, file, track.gap)
             track.gap_written = True
-        if isinstance(one, Gap):
-            track.follow_all(one)
-            self._add_gap(track, file, one)
+        if isinstance(thing, Gap):
+            track.follow_all(thing)
+            self._add_gap(track, file, thing)
             return 0
-        if isinstance(one, Description):
-            track.facts |= one.facts
+        if isinstance(thing, Description):
+            track.facts |= thing.facts
             file.add(Description(track.facts))
             return 0
-        track.follow(one)
+        track.follow(thing)
         written = 0
         try:
-            items = [*track.read(one)]
+            items = [*track.read(thing)]
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything
@@ -147,7 +147,7 @@ class FolderFiles:
             OSError: the file cannot be created.
         """
         now = self._clock()
-        if now - self._looked > LOOK_INTERVAL:
+        if now - self._looked > LISTING_INTERVAL:
             self._folder.look()
             self._looked = now
         at = _time_of(first)
@@ -213,10 +213,10 @@ class FolderFiles:
         """Delete the oldest files until the rest is within the bound."""
         folder = self._folder
         while folder.bytes > self._limits.keep:
-            found = [one for one in folder.files.values() if one.name not in self._stuck]
-            if not found:
+            old_files = [file for file in folder.files.values() if file.name not in self._stuck]
+            if not old_files:
                 return
-            oldest = min(found)
+            oldest = min(old_files)
             for track in tracks:
                 if track.file is not None and track.file.path.name == oldest.name:
                     self.finish(track)  # the camera's next record begins a new one

@@ -45,7 +45,7 @@ class FleetPictures:
     Args:
         server: agent of the cameras.
         writer: writer of the recordings.
-        all_of_them: whether every picture is recorded, or only those of results.
+        all_of_them: whether every picture is recorded, or only pictures of results.
     """
 
     def __init__(self, server: FleetServer, writer: FolderWriter, *, all_of_them: bool) -> None:
@@ -105,7 +105,7 @@ class FleetPictures:
                 why = repr(exc)
             if why != logged and not host.frames.closed:
                 logged = why
-                self._tell(track, why)
+                self._report(track, why)
             await asyncio.sleep(next(delays))
 
     async def _take_all(self, track: CameraTrack, source: FrameSource) -> bool:
@@ -146,7 +146,7 @@ class FleetPictures:
             track, picture, size if fits and size <= MAX_PICTURE_SIZE_BYTES else -1
         )
 
-    def _tell(self, track: CameraTrack, why: str) -> None:
+    def _report(self, track: CameraTrack, why: str) -> None:
         """Report in the log and in the recording that a camera's pictures do not come."""
         logger.warning("%s ! its pictures are not recorded: %s", track.camera, why)
         text = f"its pictures are not recorded: {why}"

@@ -118,15 +118,15 @@ class FleetRecorder(Server):
             RecordingFolder(self.path),
             Limits(section.size, section.age, section.keep),
             load_compress(),
-            self._tell,
+            self._report,
             self._clock,
         )
         self._loop, self._writer = asyncio.get_running_loop(), writer
         try:
-            await _whole(writer.start)
+            await _run_to_end(writer.start)
         except BaseException:
             self._writer = None
-            await _whole(writer.stop)
+            await _run_to_end(writer.stop)
             raise
         kind = _Frames if section.frames else _Hooks
         self._pictures = self._made_pictures(writer)
@@ -155,7 +155,7 @@ class FleetRecorder(Server):
                 await pictures.stop()
         finally:
             if writer is not None:
-                await _whole(writer.stop)
+                await _run_to_end(writer.stop)
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
@@ -167,13 +167,13 @@ class FleetRecorder(Server):
         """Error because of which nothing is written now; None without one."""
         return None if self._writer is None else self._writer.trouble
 
-    def _tell(self, trouble: RecordingError | None) -> None:
+    def _report(self, trouble: RecordingError | None) -> None:
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._on_trouble, trouble)
 
 
-async def _whole(work: Callable[[], None]) -> None:
+async def _run_to_end(work: Callable[[], None]) -> None:
     """Run work in a thread, to its end even if the caller is cancelled."""
     running = asyncio.ensure_future(asyncio.to_thread(work))
     try:
@@ -232,8 +232,8 @@ class _Hooks(Observer):
         if track is not None:
             text = str(error)
             kind = type(error).__name__
-            came = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
-            self._writer.put(track, came, len(text))
+            recorded = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
+            self._writer.put(track, recorded, len(text))
 
     def _endian(self, camera: str) -> int | None:
         host = self._server.hosts.get(camera)

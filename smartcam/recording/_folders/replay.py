@@ -65,7 +65,7 @@ class FleetReplay(Server):
         check_recording(recording, "replay")
         if cameras is not None:
             given = check_all(cameras, "cameras", "names of cameras", "replay")
-            cameras = [check_text(one, "cameras", "replay") for one in given]
+            cameras = [check_text(camera, "cameras", "replay") for camera in given]
         speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
         self._recording, self._listen = recording, check_text(listen, "listen", "replay", least=1)
         self._server: FleetServer | None = None
@@ -87,7 +87,7 @@ class FleetReplay(Server):
                     raise
                 self.skipped[name] = str(exc)
         # cameras that are already over
-        self._silent = {name for name, one in self._played.items() if not one.remaining}
+        self._silent = {name for name, played in self._played.items() if not played.remaining}
         if not self._played:
             why = "; ".join(self.skipped.values()) or "no camera is in it"
             raise ConfigurationError(f"recording {recording.path}: nothing can be played: {why}")
@@ -150,14 +150,14 @@ class FleetReplay(Server):
 
 def _camera_options(camera: RecordedCamera) -> dict[str, Any]:
     """Return a camera's settings for the agent, without the address."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     spec = camera.interpret_as
     if spec is not None:
-        found["interpret_as"] = spec
+        options["interpret_as"] = spec
         if spec.startswith("{"):
             with contextlib.suppress(ValueError, SyntaxError, MemoryError, RecursionError):
-                found["interpret_as"] = ast.literal_eval(spec)
+                options["interpret_as"] = ast.literal_eval(spec)
     for name in ("y_down", "lenient"):
         if camera.facts.get(name) == "True":
-            found[name] = True
-    return found
+            options[name] = True
+    return options

@@ -98,14 +98,14 @@ class CameraTrack:
 
     def lose(self, given: list[Any], reason: str) -> None:
         """Count objects that are not written; keep the camera's state that they report."""
-        for one in given:
-            if isinstance(one, Description):
-                self.facts |= one.facts
-            elif isinstance(one, Gap):
-                self._widen(one)  # a gap is already counted
-                self.follow_all(one)
+        for item in given:
+            if isinstance(item, Description):
+                self.facts |= item.facts
+            elif isinstance(item, Gap):
+                self._widen(item)  # a gap is already counted
+                self.follow_all(item)
             else:
-                self.follow(one)
+                self.follow(item)
                 self.lose_one(reason)
 
     def lose_one(self, reason: str) -> None:

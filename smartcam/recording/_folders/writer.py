@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from smartcam._forks import tell_of_forks
+from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
 from smartcam.recording._folders.files import FolderFiles, Limits
@@ -46,7 +46,7 @@ MIN_FREE_BYTES = 4 * CHUNK
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that failed is tried again; the last delay is repeated."""
 
-EVENT_ROOM = 2
+EVENT_ROOM_FACTOR = 2
 """Factor by which more may wait before events are left out, since these have the camera's state."""
 
 
@@ -76,8 +76,8 @@ class FolderWriter:
         folder: folder that holds the files.
         limits: bounds on the files.
         compress: function that compresses a chunk.
-        tell: function that is called in the thread with the error when nothing can be written, and
-            with None when it can again.
+        report: function that is called in the thread with the error when nothing can be written,
+            and with None when it can again.
         clock: function that returns the time in seconds, for the files' age and delays.
 
     Attributes:
@@ -89,10 +89,10 @@ class FolderWriter:
         folder: RecordingFolder,
         limits: Limits,
         compress: Callable[[bytes], bytes],
-        tell: Callable[[RecordingError | None], None],
+        report: Callable[[RecordingError | None], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._tell, self._clock = folder, tell, clock
+        self._folder, self._report, self._clock = folder, report, clock
         self._files = FolderFiles(folder, limits, compress, clock)
         self._more = threading.Condition()
         self._waiting = _DiskQueue()
@@ -100,7 +100,7 @@ class FolderWriter:
         self._tracks: dict[str, CameraTrack] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
-        tell_of_forks(self)
+        notify_of_forks(self)
 
     def forked(self) -> None:
         """Write nothing in a fork of the process that has the folder; leave out all records."""
@@ -150,7 +150,7 @@ class FolderWriter:
         with self._more:
             waiting = self._waiting
             track.offered += 1
-            room = MAX_WAITING_BYTES * EVENT_ROOM if event else MAX_WAITING_BYTES
+            room = MAX_WAITING_BYTES * EVENT_ROOM_FACTOR if event else MAX_WAITING_BYTES
             if self._closing or waiting.bytes > room or size < 0:
                 self._leave_out(track, given)
                 return False
@@ -226,21 +226,21 @@ class FolderWriter:
             for track in self._tracks.values():
                 track.overflow = None
             over = self._closing
-        found: dict[CameraTrack, list[Any]] = {}
+        items_of_track: dict[CameraTrack, list[Any]] = {}
         for track, item in taken.items:
-            found.setdefault(track, []).append(item)
-        return found, over
+            items_of_track.setdefault(track, []).append(item)
+        return items_of_track, over
 
-    def _write(self, found: dict[CameraTrack, list[Any]]) -> None:
+    def _write(self, items_of_track: dict[CameraTrack, list[Any]]) -> None:
         """Write records, or count them as lost; never raises."""
         try:
-            if self._ready(found):
-                for track, given in found.items():
+            if self._ready(items_of_track):
+                for track, given in items_of_track.items():
                     self._files.write(track, given)
                 tracks = self._all_tracks()
                 self._files.end_old(tracks)
                 self._files.delete_old(tracks)
-                if found:
+                if items_of_track:
                     self._heal()
         except (OSError, ConfigurationError) as exc:
             self._fail(exc)
@@ -249,10 +249,10 @@ class FolderWriter:
             self._fail(exc)
         trouble = self._trouble
         if trouble is not None:
-            for track, given in found.items():
+            for track, given in items_of_track.items():
                 track.lose(given, trouble.reason)
 
-    def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
+    def _ready(self, items_of_track: dict[CameraTrack, list[Any]]) -> bool:
         """Return True if the disk should be tried; after a failure, check its free room first.
 
         Raises:
@@ -262,7 +262,7 @@ class FolderWriter:
         trouble, now = self._trouble, self._clock()
         if trouble is None:
             return True
-        if now < trouble.again or not found:
+        if now < trouble.again or not items_of_track:
             return False
         self._files.enter()
         if trouble.full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:
@@ -287,11 +287,11 @@ class FolderWriter:
         self._trouble = _Trouble(failure, reason, full, again, tries)
         if before is None:
             logger.warning("%s; nothing is recorded until it is better", failure)
-            self._tell(failure)
+            self._report(failure)
 
     def _heal(self) -> None:
         """Note that the disk works again."""
         if self._trouble is not None:
             self._trouble = None
             logger.warning("recordings %s: recorded again", self._folder.path)
-            self._tell(None)
+            self._report(None)

@@ -25,7 +25,7 @@ class LastBodies(Generic[Key, Value]):
 
     def __init__(self) -> None:
         self._order: deque[tuple[Key, Value, int]] = deque()
-        self._known: dict[Key, Value] = {}
+        self._values: dict[Key, Value] = {}
         self._characters = 0
 
     def add(self, key: Key, value: Value, characters: int) -> None:
@@ -34,16 +34,16 @@ class LastBodies(Generic[Key, Value]):
         ``characters``: number of hex characters of the frame's data.
         """
         self._order.append((key, value, characters))
-        self._known[key] = value
+        self._values[key] = value
         self._characters += characters
         while self._characters > MAX_CHARACTERS or len(self._order) > MAX_FRAMES:
             if len(self._order) == 1:
                 break
             key, value, characters = self._order.popleft()
             self._characters -= characters
-            if self._known.get(key) is value:  # otherwise a later frame has the same key
-                del self._known[key]
+            if self._values.get(key) is value:  # otherwise a later frame has the same key
+                del self._values[key]
 
     def get(self, key: Key) -> Value | None:
         """Return the value of a key; None if it is not kept."""
-        return self._known.get(key)
+        return self._values.get(key)

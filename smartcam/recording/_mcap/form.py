@@ -92,7 +92,7 @@ class RecordedError(NamedTuple):
         text: text of the error.
         triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended with it.
         since: time of the first record that was not written, UTC, if ``error`` is
-            ``RecordingGap``; ``at`` is that of the last one. None for other errors.
+            ``RecordingGap``; ``at`` is the time of the last record. None for other errors.
         records: number of records in a gap that were not written. None for other errors.
     """
 
@@ -246,7 +246,7 @@ def topic_of(camera: str, kind: str) -> str:
 
 
 def _object(value: object) -> dict[str, Any]:
-    """Return an item's fields as JSON, without those that are None."""
+    """Return an item's fields as JSON, without fields that are None."""
     fields: dict[str, Any] = jsonable(value)
     return {name: field for name, field in fields.items() if field is not None}
 

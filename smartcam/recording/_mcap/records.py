@@ -217,9 +217,9 @@ class RecordReader:
     # ------------------------------------------------------------------ the file
 
     def _check_magic(self) -> None:
-        came = self._read(len(MAGIC))
-        if came != MAGIC:
-            raise ValueError(f"{came.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
+        magic = self._read(len(MAGIC))
+        if magic != MAGIC:
+            raise ValueError(f"{magic.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
 
     def _read(self, size: int) -> bytes:
         """Return the next bytes; allocate memory only as they come, not by the length."""
@@ -297,11 +297,11 @@ def _message(data: memoryview) -> McapMessage:
 def _metadata(fields: _Body) -> Metadata:
     name = fields.text()
     facts = _Body(fields.take(fields.number(4)))
-    found: dict[str, str] = {}
+    metadata: dict[str, str] = {}
     while facts.left:
         key = facts.text()
-        found[key] = facts.text()
-    return Metadata(name, found)
+        metadata[key] = facts.text()
+    return Metadata(name, metadata)
 
 
 _PARSERS: dict[int, Callable[[memoryview], Record]] = {

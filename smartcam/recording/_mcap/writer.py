@@ -178,11 +178,11 @@ class McapWriter:
         place = start + length
         indexes: list[bytes] = []
         places: list[bytes] = []
-        for channel, found in self._places.items():
-            indexes.append(_index_record(channel, found))
+        for channel, places_of_channel in self._places.items():
+            indexes.append(_index_record(channel, places_of_channel))
             places.append(_COUNT.pack(channel, place))
             place += len(indexes[-1])
-            self._counts[channel] = self._counts.get(channel, 0) + len(found) // 2
+            self._counts[channel] = self._counts.get(channel, 0) + len(places_of_channel) // 2
         self._stream.write(_HEAD.pack(_CHUNK, length - _HEAD.size) + b"".join(chunk))
         self._stream.write(packed)
         self._stream.write(b"".join(indexes))

@@ -88,7 +88,7 @@ _TYPE_OF: Final = {kind: number for number, kind in _KINDS.items()}
 
 @cache
 def schema_data(name: str) -> bytes:
-    """Return the schema of the message as MCAP has it: a FileDescriptorSet."""
+    """Return the message's schema in MCAP's form: a FileDescriptorSet."""
     return file_set(name, _MESSAGES, {"PointsAnnotation": {"Type": _TYPES}})
 
 
@@ -100,19 +100,19 @@ def annotations_message(frame: Frame) -> bytes:
     thick = stroke_width(frame.width, frame.height)
     stamp = timestamp(frame.utc)
     parts: dict[str, list[bytes]] = {"points": [], "texts": []}
-    for place, one in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
-        points = one.points[:MAX_POINTS]
+    for place, drawing in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
+        points = drawing.points[:MAX_POINTS]
         if not points or not all(math.isfinite(x) and math.isfinite(y) for x, y in points):
             continue
-        marked = {"timestamp": stamp, "place": place, "role": one.role}
-        text = one.text[:MAX_TEXT_CHARACTERS]
-        if one.kind != "text":
+        marked = {"timestamp": stamp, "place": place, "role": drawing.role}
+        text = drawing.text[:MAX_TEXT_CHARACTERS]
+        if drawing.kind != "text":
             values = {
                 **marked,
-                "type": _TYPE_OF[one.kind],
+                "type": _TYPE_OF[drawing.kind],
                 "points": [_point(*point) for point in points],
-                "outline_color": _colour(one.role),
-                "thickness": thick * (3.0 if one.kind == "points" else 1.0),
+                "outline_color": _colour(drawing.role),
+                "thickness": thick * (3.0 if drawing.kind == "points" else 1.0),
                 "word": text,
             }
             parts["points"].append(message(_MESSAGES["PointsAnnotation"], values))
@@ -123,7 +123,7 @@ def annotations_message(frame: Frame) -> bytes:
                 "position": _point(*points[0]),
                 "text": text,
                 "font_size": 14.0 * thick,
-                "text_color": _colour(one.role),
+                "text_color": _colour(drawing.role),
                 "background_color": _colour(None),
             }
             parts["texts"].append(message(_MESSAGES["TextAnnotation"], values))
@@ -137,20 +137,22 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         ValueError: the message is not valid.
     """
     lists = values_of(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
-    found: dict[int, Drawing] = {}
-    for one in lists.get("points", ()):
-        values = values_of(_MESSAGES["PointsAnnotation"], one, MAX_POINTS + 100)
+    drawings: dict[int, Drawing] = {}
+    for annotation in lists.get("points", ()):
+        values = values_of(_MESSAGES["PointsAnnotation"], annotation, MAX_POINTS + 100)
         kind = _KINDS.get(values.get("type", 0))
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
         points = tuple(map(_coordinates, values.get("points", ())))
-        found[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
-    for one in lists.get("texts", ()):
-        values = values_of(_MESSAGES["TextAnnotation"], one, 100)
+        drawings[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+    for annotation in lists.get("texts", ()):
+        values = values_of(_MESSAGES["TextAnnotation"], annotation, 100)
         if "place" in values:  # others are the words of points
             point = _coordinates(values.get("position", memoryview(b"")))
-            found[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
-    return tuple(one for _, one in sorted(found.items()))
+            drawings[_number(values)] = Drawing(
+                "text", (point,), _role(values), _text(values, "text")
+            )
+    return tuple(drawing for _, drawing in sorted(drawings.items()))
 
 
 def _point(x: float, y: float) -> bytes:
@@ -178,10 +180,12 @@ def _number(values: dict[str, Any]) -> int:
 
 
 def _role(values: dict[str, Any]) -> Role:
-    came = _text(values, "role")
-    role: Role | None = next((one for one in get_args(Role) if one == came), None)
+    role_text = _text(values, "role")
+    role: Role | None = next(
+        (argument for argument in get_args(Role) if argument == role_text), None
+    )
     if role is None:
-        raise ValueError(f"role: {came!r:.60} came, expected {', '.join(get_args(Role))}")
+        raise ValueError(f"role: {role_text!r:.60} came, expected {', '.join(get_args(Role))}")
     return role
 
 

@@ -66,9 +66,9 @@ class RecordedDriver(TaskDriver):
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         path, fragment = address.path, address.fragment
-        found = re.fullmatch(r"(.*?)#(\w+=[^#]*)", path, re.DOTALL)
-        if found is not None and "://" not in address.url:
-            path, fragment = found[1], found[2]
+        match = re.fullmatch(r"(.*?)#(\w+=[^#]*)", path, re.DOTALL)
+        if match is not None and "://" not in address.url:
+            path, fragment = match[1], match[2]
         self._path = Path(path)
         parameters = address.parameters(_KNOWN, fragment)
         self._camera = parameters.get("camera")
@@ -91,7 +91,7 @@ class RecordedDriver(TaskDriver):
         """Find the first picture.
 
         Raises:
-            FrameFormatError: the recording has no pictures, or those of several cameras.
+            FrameFormatError: the recording has no pictures, or pictures of several cameras.
             FrameSourceError: the path does not exist, or is no recording of smartcam.
         """
         first = await asyncio.to_thread(self._first)
@@ -117,10 +117,10 @@ class RecordedDriver(TaskDriver):
         if self._camera is None and len(cameras) > 1:
             raise self._several(cameras)
         if first is None:
-            there = f"; those of {', '.join(cameras)} are" if cameras else ""
+            cameras_text = f"; those of {', '.join(cameras)} are" if cameras else ""
             whose = f" of camera {self._camera!r}" if self._camera is not None else ""
             raise FrameFormatError(
-                f"{self._path}: no picture{whose} is in it{there}", source=self.name
+                f"{self._path}: no picture{whose} is in it{cameras_text}", source=self.name
             )
         return first
 
@@ -142,7 +142,7 @@ class RecordedDriver(TaskDriver):
     # ------------------------------------------------------------------ playing
 
     def _pictures(self) -> Iterator[RecordedPicture]:
-        """Yield the camera's pictures; those of a gap count as left out."""
+        """Yield the camera's pictures; pictures of a gap count as left out."""
         gap = 0
         for item in each_item(self._path, lambda text: _log.warning("%s", text)):
             if item.camera != self._camera:

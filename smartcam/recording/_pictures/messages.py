@@ -63,7 +63,7 @@ _COMPRESSIONS: Final = {"MJPEG": "jpeg", "PNG": "png", "JPEGXL": "jxl", "H264": 
 
 _STAMP = WireField(1, "message", TIMESTAMP)
 
-_OURS: Final = {
+_SMARTCAM_FIELDS: Final = {
     "pixel_format": WireField(101, "string"),
     "picture_width": WireField(102, "fixed32"),
     "picture_height": WireField(103, "fixed32"),
@@ -95,21 +95,21 @@ SCHEMAS: Final[dict[str, Fields]] = {
         "encoding": WireField(4, "string"),
         "step": WireField(5, "fixed32"),
         "data": WireField(6, "bytes"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
     COMPRESSED: {
         "timestamp": _STAMP,
         "frame_id": WireField(4, "string"),
         "data": WireField(2, "bytes"),
         "format": WireField(3, "string"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
     VIDEO: {
         "timestamp": _STAMP,
         "frame_id": WireField(2, "string"),
         "data": WireField(3, "bytes"),
         "format": WireField(4, "string"),
-        **_OURS,
+        **_SMARTCAM_FIELDS,
     },
 }
 """Messages of pictures by their names, and their fields."""
@@ -120,10 +120,10 @@ SCHEMAS: Final[dict[str, Fields]] = {
 
 def schema_of(picture: RecordedPicture) -> str:
     """Return the name of the schema of a picture's message."""
-    found = picture.frame.format
-    if not found.compressed:
+    pixel_format = picture.frame.format
+    if not pixel_format.compressed:
         return RAW
-    return VIDEO if found.name == "H264" else COMPRESSED
+    return VIDEO if pixel_format.name == "H264" else COMPRESSED
 
 
 def check_readable(frame: Frame) -> None:
@@ -236,20 +236,20 @@ def picture_of(
     values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
     fields = _Values(values)
     try:
-        found = find_format(fields.text("pixel_format", 100))
-        marks = drawings if number and fields.whole("annotations_from") == number else ()
-        frame = _frame(fields, found, marks)
-        found.check(frame.data, frame.width, frame.height, frame.stride)
+        pixel_format = find_format(fields.text("pixel_format", 100))
+        marks = drawings if number and fields.integer("annotations_from") == number else ()
+        frame = _frame(fields, pixel_format, marks)
+        pixel_format.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
         received = fields.result_received_at()
     except (FrameFormatError, OverflowError, OSError) as exc:
         raise ValueError(f"a picture: {exc!s:.300}") from exc
     camera = fields.text("frame_id", MAX_NAME_CHARACTERS)
     made = fields.number_of_result(), received
-    return RecordedPicture(camera, at, frame, fields.whole("left_out"), *made)
+    return RecordedPicture(camera, at, frame, fields.integer("left_out"), *made)
 
 
-def _frame(fields: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
+def _frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
     moment = fields.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")
@@ -259,17 +259,17 @@ def _frame(fields: _Values, found: PixelFormat, drawings: tuple[Drawing, ...]) -
     width, height = fields.side("picture_width"), fields.side("picture_height")
     return Frame(
         data=fields.data(),
-        format=found,
+        format=pixel_format,
         width=width,
         height=height,
-        stride=fields.whole("stride"),
+        stride=fields.integer("stride"),
         captured=fields.real("captured"),
         utc=fields.real("utc"),
         moment=Moment[moment],
         duration=duration,
         device_time=fields.real("device_time") if fields.has("device_time") else None,
-        sequence=fields.whole("sequence"),
-        lost=fields.whole("lost"),
+        sequence=fields.integer("sequence"),
+        lost=fields.integer("lost"),
         source=fields.text("source", MAX_NAME_CHARACTERS),
         remark=fields.text("remark", MAX_NAME_CHARACTERS),
         drawings=drawings,
@@ -286,33 +286,33 @@ class _Values:
         return name in self._values
 
     def data(self) -> memoryview:
-        found: memoryview = self._values.get("data", memoryview(b""))
-        return found
+        data: memoryview = self._values.get("data", memoryview(b""))
+        return data
 
     def text(self, name: str, most: int) -> str:
-        found = self._values.get(name, memoryview(b""))
-        if len(found) > 4 * most:
-            raise ValueError(f"{name}: {len(found)} bytes, expected {4 * most} at most")
-        return str(found, "utf-8")
+        text = self._values.get(name, memoryview(b""))
+        if len(text) > 4 * most:
+            raise ValueError(f"{name}: {len(text)} bytes, expected {4 * most} at most")
+        return str(text, "utf-8")
 
-    def whole(self, name: str) -> int:
-        found: int = self._values.get(name, 0)
-        return found
+    def integer(self, name: str) -> int:
+        number: int = self._values.get(name, 0)
+        return number
 
     def side(self, name: str) -> int:
-        found = self.whole(name)
-        if not 1 <= found <= MAX_SIDE_PX:
-            raise ValueError(f"{name}: {found} came, expected 1 to {MAX_SIDE_PX} pixels")
-        return found
+        side = self.integer(name)
+        if not 1 <= side <= MAX_SIDE_PX:
+            raise ValueError(f"{name}: {side} came, expected 1 to {MAX_SIDE_PX} pixels")
+        return side
 
     def real(self, name: str, *, endless: bool = False) -> float:
-        found: float = self._values.get(name, 0.0)
-        if math.isnan(found) or (math.isinf(found) and not endless):
-            raise ValueError(f"{name}: {found} came, expected seconds")
-        return found
+        number: float = self._values.get(name, 0.0)
+        if math.isnan(number) or (math.isinf(number) and not endless):
+            raise ValueError(f"{name}: {number} came, expected seconds")
+        return number
 
     def number_of_result(self) -> int | None:
-        return self.whole("result_number") or None
+        return self.integer("result_number") or None
 
     def result_received_at(self) -> datetime | None:
         seconds = self.real("result_received")

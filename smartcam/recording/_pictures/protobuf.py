@@ -61,7 +61,7 @@ def message(fields: Fields, values: Mapping[str, Any]) -> bytes:
 def encoded(field: WireField, value: Any) -> bytes:
     """Return a field with its value; of a repeated field with each of the values in a list."""
     if field.repeated and isinstance(value, list):
-        return b"".join(encoded(field, one) for one in value)
+        return b"".join(encoded(field, item) for item in value)
     if field.type == "double":
         return tag(field.number, FIXED64) + struct.pack("<d", value)
     if field.type == "fixed32":
@@ -112,8 +112,8 @@ def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
     Raises:
         ValueError: the message is not valid, has too many fields, or a field of another type.
     """
-    known = {one.number: (name, one) for name, one in fields.items()}
-    found: dict[str, Any] = {}
+    known = {field.number: (name, field) for name, field in fields.items()}
+    values: dict[str, Any] = {}
     for count, (number, wire_type, value) in enumerate(_pieces(data)):
         if count >= most:
             raise ValueError(f"a message of more than {most} fields")
@@ -124,10 +124,10 @@ def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
         if wire_type != expected:
             raise ValueError(f"{name}: wire type {wire_type} came, expected {expected}")
         if field.repeated:
-            found.setdefault(name, []).append(read(value))
+            values.setdefault(name, []).append(read(value))
         else:
-            found[name] = read(value)
-    return found
+            values[name] = read(value)
+    return values
 
 
 def _same(value: Any) -> Any:
@@ -187,11 +187,11 @@ def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
 def file_set(
     name: str, messages: dict[str, Fields], enums: dict[str, dict[str, tuple[str, ...]]]
 ) -> bytes:
-    """Return the schema of a message as MCAP has it: a FileDescriptorSet.
+    """Return a message's schema in MCAP's form: a FileDescriptorSet.
 
     Args:
         name: full name of the message, without a dot in front.
-        messages: the message, and all that it needs of its package, by their short names.
+        messages: the message, and all messages of its package that it needs, by their short names.
         enums: enumerations that a message has within itself, and their names from 0 on.
     """
     package, _, short = name.partition(".")
@@ -201,9 +201,13 @@ def file_set(
     bodies = []
     for called, fields in messages.items():
         body = sized(1, called.encode())
-        for field, one in fields.items():
+        for field, message_field in fields.items():
             descriptor = _descriptor(
-                field, one.number, TYPES[one.type], one.of, repeated=one.repeated
+                field,
+                message_field.number,
+                TYPES[message_field.type],
+                message_field.of,
+                repeated=message_field.repeated,
             )
             body += sized(2, descriptor)
         for enum, names in enums.get(called, {}).items():
@@ -230,4 +234,9 @@ def _file(path: str, package: str, messages: list[bytes], needs: str = "") -> by
     """Return a FileDescriptorProto."""
     head = sized(1, path.encode()) + sized(2, package.encode())
     needed = sized(3, needs.encode()) if needs else b""
-    return head + needed + b"".join(sized(4, one) for one in messages) + sized(12, b"proto3")
+    return (
+        head
+        + needed
+        + b"".join(sized(4, message_bytes) for message_bytes in messages)
+        + sized(12, b"proto3")
+    )

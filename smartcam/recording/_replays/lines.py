@@ -71,9 +71,9 @@ class LineAnswers:
         """Return the next answer; after the last one the last again, or with ``loop`` the first."""
         if loop and self.next >= len(self.given):
             self.next = 0
-        found = self.given[min(self.next, len(self.given) - 1)]
+        answer = self.given[min(self.next, len(self.given) - 1)]
         self.next += 1
-        return found
+        return answer
 
     def take_at(self, moment: int) -> list[TimedLine]:
         """Return the next answer of a moment; after its last one the last again.
@@ -84,12 +84,13 @@ class LineAnswers:
         if moment != self.asked_at:
             self.asked, self.asked_at = 0, moment
         nearest = min(
-            self.moments, key=lambda one: ((one - moment) % 2, one > moment, abs(one - moment))
+            self.moments,
+            key=lambda place: ((place - moment) % 2, place > moment, abs(place - moment)),
         )
-        of_moment = [at for at, one in enumerate(self.moments) if one == nearest]
-        found = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
+        of_moment = [at for at, moment in enumerate(self.moments) if moment == nearest]
+        answer = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
         self.asked += 1
-        return found
+        return answer
 
 
 @dataclass(slots=True)
@@ -177,21 +178,23 @@ def _forget_silence(lines: list[_AskedLine]) -> None:
 
 def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
     """Add the answer of each line to a plan."""
-    triggers = [one for one in lines if isinstance(one.line, bytes) and is_trigger(codec, one.line)]
+    triggers = [
+        line for line in lines if isinstance(line.line, bytes) and is_trigger(codec, line.line)
+    ]
     plan.triggers = len(triggers)
-    for one in lines:
+    for line in lines:
         answers = (
-            plan.answers.setdefault(one.line, LineAnswers())
-            if isinstance(one.line, bytes)
-            else plan.secrets.setdefault(one.line, LineAnswers())
+            plan.answers.setdefault(line.line, LineAnswers())
+            if isinstance(line.line, bytes)
+            else plan.secrets.setdefault(line.line, LineAnswers())
         )
-        answers.given.append(one.pieces)
-        answers.moments.append(_moment(one.begin, triggers))
+        answers.given.append(line.pieces)
+        answers.moments.append(_moment(line.begin, triggers))
 
 
 def _moment(place: int, triggers: list[_AskedLine]) -> int:
     """Return the moment of a place in a recording, see :class:`LineAnswers`."""
-    before = bisect_left(triggers, place, key=lambda one: one.begin)
+    before = bisect_left(triggers, place, key=lambda answers: answers.begin)
     end = triggers[before - 1].end if before else None
     return 2 * before - (before > 0 and (end is None or end > place))
 
@@ -280,7 +283,7 @@ class ReplayedLines(LineCamera):
                 of_result[item.number] = triggers
             elif isinstance(item, TraceEntry) and item.direction == ">":
                 triggers += is_trigger(self.lines, bare(self.lines, bytes.fromhex(item.hex)))
-        found: dict[int, bytes] = {}
+        images: dict[int, bytes] = {}
         size = 0
         for result, picture, _ in recording.judged(camera):
             if picture is None:
@@ -288,13 +291,13 @@ class ReplayedLines(LineCamera):
             answer = self._kind.image_answer(eight_bits(picture))
             if answer is None:
                 return {}
-            found[of_result[result.number]] = answer
+            images[of_result[result.number]] = answer
             size += len(answer)
             if size > MAX_REPLAY_BYTES:
                 raise RecordingError(
                     f"recording: {size} bytes of pictures, expected {MAX_REPLAY_BYTES} at most"
                 )
-        return found
+        return images
 
     def _image_for(self, line: str) -> bytes | None:
         """Return the picture of the last trigger; None for another line, or without a picture."""
@@ -307,7 +310,9 @@ class ReplayedLines(LineCamera):
     def remaining(self) -> int:
         """Number of triggers that are left, in this round."""
         return sum(
-            one.left for line, one in self.plan.answers.items() if is_trigger(self.lines, line)
+            answer.left
+            for line, answer in self.plan.answers.items()
+            if is_trigger(self.lines, line)
         )
 
     def begins_session(self, message: HeardLine) -> bool:
@@ -328,35 +333,35 @@ class ReplayedLines(LineCamera):
         if self._at_once:
             client = client.answer_later()
         data = line.encode(self.lines.encoding, "replace")
-        found = self.plan.secrets.get(place) or self.plan.answers.get(data)
-        if found is None and (image := self._image_for(line)) is not None:
+        answer = self.plan.secrets.get(place) or self.plan.answers.get(data)
+        if answer is None and (image := self._image_for(line)) is not None:
             self._play(client, [TimedLine(0.0, image)], client.end_line)
             return
-        if found is None:
+        if answer is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
         triggers = is_trigger(self.lines, data)
         self._triggered += triggers
-        if triggers and not found.left and not self._loop:
+        if triggers and not answer.left and not self._loop:
             client.answer(None)
             return
         if place + 1 in self.plan.secrets:
             client.hide_next_line()
-        pieces = self._take(data, found)
+        pieces = self._take(data, answer)
         self._play(client, pieces, self._ended(client, trigger=triggers and bool(pieces)))
         if triggers and self._on_over is not None and not self.remaining:
-            tell, self._on_over = self._on_over, None
-            tell()
+            on_over, self._on_over = self._on_over, None
+            on_over()
 
-    def _take(self, line: bytes, found: LineAnswers) -> list[TimedLine]:
+    def _take(self, line: bytes, answers: LineAnswers) -> list[TimedLine]:
         """Return the recorded pieces that answer a line now."""
         if (
             is_trigger(self.lines, line)
             or not self.plan.triggers
-            or found is not self.plan.answers.get(line)
+            or answers is not self.plan.answers.get(line)
         ):
-            return found.take(loop=self._loop)
-        return found.take_at(self._moment())
+            return answers.take(loop=self._loop)
+        return answers.take_at(self._moment())
 
     def _moment(self) -> int:
         """Return the moment of the recording that is played, see :class:`LineAnswers`."""

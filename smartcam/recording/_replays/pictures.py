@@ -61,10 +61,16 @@ class ReplayedPictures:
         self.shown: Frame | None = None
         self.sinks: set[FrameSink] = set()
         self._speed, self._began = speed, 0.0
-        self._given: collections.Counter[tuple[int, bytes]] = collections.Counter()
+        self._times_given: collections.Counter[tuple[int, bytes]] = collections.Counter()
         self._pictures = _by_application(recording, camera, applications)
         self.first: Frame | None = next(
-            (one.frame for some in self._pictures.values() for one in some if one is not None), None
+            (
+                picture.frame
+                for pictures_of_key in self._pictures.values()
+                for picture in pictures_of_key
+                if picture is not None
+            ),
+            None,
         )
 
     def source(self) -> FrameSource:
@@ -79,14 +85,14 @@ class ReplayedPictures:
         """Show the picture of the result that is being sent."""
         key = application, data
         pictures = self._pictures.get(key)
-        found = None
+        chosen = None
         if pictures:
-            found = pictures[self._given[key] % len(pictures)]
-            self._given[key] += 1
-        if found is None:
+            chosen = pictures[self._times_given[key] % len(pictures)]
+            self._times_given[key] += 1
+        if chosen is None:
             self.shown = None
             return
-        frame, seconds = found
+        frame, seconds = chosen
         now = time.monotonic()
         captured = min(now, max(self._began, now - seconds / self._speed))
         duration = min(frame.duration / self._speed, captured - self._began)
@@ -99,21 +105,27 @@ def _by_application(
     recording: Recording, camera: str, applications: Mapping[int, ApplicationRuns]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
     """Return the pictures of results with the same bytes, if their order is certain."""
-    found: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
+    pictures_by_key: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
     size = 0
     for result, picture, _ in recording.judged(camera):
-        some = found.setdefault((result.application, result.raw), [])
+        pictures_of_key = pictures_by_key.setdefault((result.application, result.raw), [])
         size += 0 if picture is None else memoryview(picture.data).nbytes
         if picture is None or size > MAX_REPLAY_BYTES:
-            some.append(None)
+            pictures_of_key.append(None)
         else:
-            some.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
+            pictures_of_key.append(
+                _ShownPicture(picture, result.received_at.timestamp() - picture.utc)
+            )
     if size > MAX_REPLAY_BYTES:
         _log.warning(
             "%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
         )
     counts = _in_one_order(applications)
-    return {key: some for key, some in found.items() if counts.get(key) == len(some)}
+    return {
+        key: pictures_of_key
+        for key, pictures_of_key in pictures_by_key.items()
+        if counts.get(key) == len(pictures_of_key)
+    }
 
 
 def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int, bytes], int]:
@@ -124,8 +136,11 @@ def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int
     triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     untriggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     for number, takes in applications.items():
-        for count, some in ((triggered, takes.triggered), (untriggered, takes.untriggered)):
-            count.update((number, data) for take in some for data in take.containers)
+        for count, numbers_and_data in (
+            (triggered, takes.triggered),
+            (untriggered, takes.untriggered),
+        ):
+            count.update((number, data) for take in numbers_and_data for data in take.containers)
     both = triggered.keys() & untriggered.keys()
     return {
         key: n for count in (triggered, untriggered) for key, n in count.items() if key not in both
@@ -159,7 +174,7 @@ class _ResultPictures(FrameDriver):
         return StreamFormat(first.format, first.width, first.height)
 
     async def start(self, sink: FrameSink) -> None:
-        """Deliver the picture of the last result, and those of the next ones."""
+        """Deliver the picture of the last result, and the pictures of the next results."""
         self._sink = sink
         self._pictures.sinks.add(sink)
         if self._pictures.shown is not None:

@@ -2,16 +2,16 @@
 
 The device is the emulator's own. Its applications send the recorded containers, byte for byte:
 
-- The n-th trigger of an application gets the n-th recorded container of a trigger, after the same
-  time; if the recorded trigger had no result it gets none, and if it was dropped it is dropped.
-- Containers without a trigger come by themselves: the first at its time after the start of the
-  run, each other at its time after the one before. They wait while the camera is stopped or has
-  another application; none is left out.
-- Overheat and System Error come and go at their times after the start of the first session.
+- The n-th trigger of an application gets the container of the n-th recorded trigger, after the same
+  time. If the recorded trigger had no result or was dropped, so has or is the n-th trigger.
+- Containers without a trigger are sent by themselves: the first at its time after the start of the
+  run, each other at its time after the container before. They wait while the camera is stopped or
+  has another application; none is left out.
+- Overheat and System Error rise and fall at their times after the start of the first session.
 
-Only sequence numbers are not as recorded, if the client sets them, as a client does whose layout
-has an ``@sequence`` field. Such a client gets its own numbers in that field, whose place is known
-from the ``interpret_as`` in the recording.
+Sequence numbers differ from the recorded ones if the client sets them, as it does if its layout has
+an ``@sequence`` field. Then containers have the client's numbers in that field; the
+``interpret_as`` in the recording gives its place.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ class _PendingRuns:
 
     @property
     def head(self) -> RecordedRun | None:
-        """The next take; None if none is left."""
+        """The next take; None after the last one."""
         return self._runs[self._next] if self._next < len(self._runs) else None
 
     @property
     def left(self) -> int:
-        """Number of runs that are left, in this round."""
+        """Number of remaining runs of this round."""
         return len(self._runs) - self._next
 
     def pop(self) -> RecordedRun | None:
@@ -111,9 +111,9 @@ class _Track:
     waits: bool  # whether the camera waits for triggers
     triggered: _PendingRuns  # takes for triggers
     untriggered: _PendingRuns  # runs without a trigger
-    current: RecordedRun | None = None  # the take of the inspection under way
+    current: RecordedRun | None = None  # the take of the running inspection
     # further containers to be sent
-    rest: list[bytes] = field(default_factory=list[bytes])
+    pending: list[bytes] = field(default_factory=list[bytes])
     # place of the client's numbers in containers; None: containers keep their own numbers
     numbers: _Numbers | None = None
     # function that is called with each recorded container when it is sent
@@ -129,12 +129,12 @@ class _Track:
             self.on_picture(data)
         if self.numbers is not None:
             containers = [self.numbers.put(data, number, byte_order) for data in containers]
-        first, *self.rest = containers
+        first, *self.pending = containers
         return first
 
 
 class _PlayedApplication(Application):
-    """An application whose containers come from a track."""
+    """An application that sends the containers of a track."""
 
     _track: _Track | None = PrivateAttr(default=None)
 
@@ -160,15 +160,15 @@ class _PlayedApplication(Application):
 class ReplayedCamera(EmulatedCamera):
     """An emulated camera that replays a recording.
 
-    Its application is that of the first container, and runs if there are containers. At the end of
-    the recording, triggers get no result and no containers come any more, unless ``loop``. All
-    containers are kept in memory.
+    It begins with the application of the first container, and runs if there are containers. After
+    the end of the recording, triggers get no result and no containers are sent, unless ``loop``.
+    All containers are kept in memory.
 
     Args:
         recording: recording to replay.
         camera: name of the camera in it; default the only one.
         speed: factor by which to replay faster than recorded, 0.001 to 1000.
-        loop: begin again at the end: each application's takes on their own.
+        loop: whether to begin again at the end, separately for each application's takes.
         host: address to listen on.
         port: port to listen on, 0 for a free one.
         transport: default the recorded one.
@@ -213,11 +213,11 @@ class ReplayedCamera(EmulatedCamera):
         self._on_over = None if loop else on_over
         self._tracks = {
             number: _Track(
-                found.waits,
-                _PendingRuns(found.triggered, loop),
-                _PendingRuns(found.untriggered, loop),
+                runs.waits,
+                _PendingRuns(runs.triggered, loop),
+                _PendingRuns(runs.untriggered, loop),
             )
-            for number, found in self.plan.applications.items()
+            for number, runs in self.plan.applications.items()
         }
         recorded: dict[str, Any] = {}
         if quirks is None:
@@ -229,8 +229,8 @@ class ReplayedCamera(EmulatedCamera):
             recorded = dict.fromkeys(self.plan.quirks, True)
         super().__init__(
             [
-                _application(found, speed).play(self._tracks[number])
-                for number, found in self.plan.applications.items()
+                _application(runs, speed).play(self._tracks[number])
+                for number, runs in self.plan.applications.items()
             ],
             builtins=False,
             host=host,
@@ -246,7 +246,7 @@ class ReplayedCamera(EmulatedCamera):
         self._numbers = _numbers(recording.camera(camera).interpret_as)
         self.device.set_endian(self.plan.endian)
         self._set_conditions(self.plan.conditions)
-        self._armed: RecordedRun | None = None  # the take before which triggers are to be dropped
+        self._armed: RecordedRun | None = None  # the take before which triggers will be dropped
         self._ready: int | None = None  # the application that may send without a trigger now
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._alarm: TimerHandle | None = None
@@ -313,14 +313,14 @@ class ReplayedCamera(EmulatedCamera):
             track.current = None
         elif track.waits and track.current is None:
             self._begin(track, track.triggered.pop())
-        if track.rest:
-            rest, track.rest = track.rest, []
-            self._send(rest)
+        if track.pending:
+            pending, track.pending = track.pending, []
+            self._send(pending)
         self._arm_drops(track)
         self._play_unasked(track)
         if self._on_over is not None and not self.remaining and not self.device.processing:
-            tell, self._on_over = self._on_over, None
-            tell()
+            on_over, self._on_over = self._on_over, None
+            on_over()
 
     def _begin(self, track: _Track, take: RecordedRun | None) -> None:
         """Begin an inspection with the recorded duration."""
@@ -426,18 +426,18 @@ def _numbers(interpret_as: str | None) -> _Numbers | None:
     if layout is None:
         return None
     offset = 0
-    for one in (*layout.head, *layout.fields):
-        if one.sequence:
-            return _Numbers(one, offset)
-        offset += one.size
+    for part in (*layout.head, *layout.fields):
+        if part.sequence:
+            return _Numbers(part, offset)
+        offset += part.size
     return None
 
 
-def _application(found: ApplicationRuns, speed: float) -> _PlayedApplication:
-    fields: dict[str, Any] = {"id": found.application, "name": "recorded"}
-    if found.load_time is not None:
-        fields["load_time"] = min(found.load_time / speed, MAX_LOAD_TIME)
-    if found.waits:
+def _application(runs: ApplicationRuns, speed: float) -> _PlayedApplication:
+    fields: dict[str, Any] = {"id": runs.application, "name": "recorded"}
+    if runs.load_time is not None:
+        fields["load_time"] = min(runs.load_time / speed, MAX_LOAD_TIME)
+    if runs.waits:
         fields["processing_time"] = MIN_INSPECTION_TIME
     else:
         fields["rate"] = FREE_RUN_RATE

@@ -1,7 +1,8 @@
 """Plan a replay from a recording's frames, or from its results without frames; no I/O.
 
-A container belongs to the oldest trigger without one. Other containers came without a trigger of
-the client: by the digital input, if the application waits for triggers, or from a free run.
+A container belongs to the oldest trigger without a container. Other containers have no trigger of
+the client: they come from the digital input, if the application waits for triggers, or from a free
+run.
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ class RecordedRun:
 
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
-    seconds: float  # seconds from its beginning to its first container, or to its end without one
-    # seconds from the end of the take before, or from the start of the run, to its beginning; only
+    seconds: float  # seconds from the run's beginning to its first container, else to its end
+    # seconds from the end of the earlier take, or from the start of the run, to this one; only
     # for a take without a trigger
     gap: float = 0.0
-    drops: int = 0  # triggers that the camera dropped before it
+    drops: int = 0  # triggers that the camera dropped before this run
 
 
 @dataclass(slots=True)
@@ -77,7 +78,7 @@ class ApplicationRuns:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A condition that is set or cleared, seconds after the start of the first session."""
+    """A change of conditions at a time in seconds after the start of the first session."""
 
     at: float
     condition: Status
@@ -147,10 +148,10 @@ def _fitting(
 ) -> dict[int, ApplicationRuns]:
     """Return the applications that can be emulated; others must have no containers."""
     fitting: dict[int, ApplicationRuns] = {}
-    for number, found in lists.items():
+    for number, runs in lists.items():
         if number in dialect.application_ids and number >= 1:
-            fitting[number] = found
-        elif found.triggered or found.untriggered:
+            fitting[number] = runs
+        elif runs.triggered or runs.untriggered:
             raise ConfigurationError(
                 f"recording {recording.path}: application id {number} cannot be emulated in "
                 f"dialect {dialect.name}"
@@ -167,14 +168,14 @@ def _dialect_of(
             f"recording {recording.path}: there was no session with camera {camera.name!r}"
         )
     if is_fleet(camera.url):
-        found = BVS.dialects.get(camera.dialect or HANDBOOK.name)
-        if found is None:
+        spoken = BVS.dialects.get(camera.dialect or HANDBOOK.name)
+        if spoken is None:
             raise ConfigurationError(
                 f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
                 f"{camera.dialect}, expected one of bvs; no frames of it are recorded, which would "
                 "be played line by line"
             )
-        return found, "tcp"
+        return spoken, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
@@ -240,28 +241,28 @@ class _GapSteps:
     """
 
     def __init__(self) -> None:
-        self._whole = False  # whether all earlier items are known
+        self._is_complete = False  # whether all earlier items are known
 
     def steps(self, item: Item | RecordedState, at: float) -> list[_ReplayStep]:
         """Return the steps of an item, at a time that does not decrease."""
         if isinstance(item, RecordedError) and item.error == GAP:
-            self._whole = False
+            self._is_complete = False
             return [_ReplayStep(at, _StepKind.LOST)]
         if not isinstance(item, RecordedState):
-            self._whole = True
+            self._is_complete = True
             return []
         if not item.connected:
-            self._whole = False
+            self._is_complete = False
             return [_ReplayStep(at, _StepKind.LOST)]
-        if self._whole:
+        if self._is_complete:
             return []
-        self._whole = True
-        found = [_ReplayStep(at, _StepKind.CONNECTED)]
+        self._is_complete = True
+        steps = [_ReplayStep(at, _StepKind.CONNECTED)]
         if item.application is not None:
-            found.append(_ReplayStep(at, _StepKind.NAMED, item.application))
+            steps.append(_ReplayStep(at, _StepKind.NAMED, item.application))
         if item.status is not None:
-            found.append(_ReplayStep(at, _StepKind.STATUS, item.endian, item.status))
-        return found
+            steps.append(_ReplayStep(at, _StepKind.STATUS, item.endian, item.status))
+        return steps
 
 
 def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Iterator[_ReplayStep]:
@@ -357,7 +358,7 @@ _BY_AGENT = {_StepKind.TRIGGER, _StepKind.ABORT, _StepKind.CONTAINER}
 def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
     """Return steps with times that fit their order.
 
-    The times of results are on the agent's clock, those of other events on the program's.
+    The times of results are on the agent's clock, the times of other events on the program's.
     """
     least, most = -math.inf, math.inf  # bounds of the difference between the clocks
     by_program, by_agent = -math.inf, -math.inf  # the last times
@@ -370,14 +371,14 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
             most = min(most, by_program - by_agent)
     # a status follows most results at once
     offset = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
-    found: list[_ReplayStep] = []
+    replay_steps: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
         at = step.at + offset if step.kind in _BY_AGENT else step.at
         if step.kind is not _StepKind.TRIGGER:
             at = last = max(at, last)
-        found.append(step._replace(at=at, recorded_at=step.at))
-    return found
+        replay_steps.append(step._replace(at=at, recorded_at=step.at))
+    return replay_steps
 
 
 def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
@@ -451,7 +452,7 @@ class _ScheduleMaker:
         self.began: float | None = None
         self.now: float = 0.0  # time of the last step, seconds
         self.first: int | None = None  # application of the first container; None before
-        self.ran_at_first: bool = False  # the first status said Running
+        self.ran_at_first: bool = False  # whether Running was set in the first status
         self.endian: int = 0  # byte order of the last status before the first container
         self.conditions: Status = Status(0)  # conditions of the first status
         self.changes: list[Change] = []  # changes of conditions so far
@@ -463,7 +464,7 @@ class _ScheduleMaker:
         self._drops = 0  # number of triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # times at which Waiting for Trigger rose, fell
         self._open: RecordedRun | None = None  # take whose inspection may send more containers
-        self._opened = 0.0  # time of its first container
+        self._opened = 0.0  # time of the first container of that take
         self._began_untriggered: float | None = None  # start of an inspection without a trigger
         self._reference = 0.0  # time from which the next untriggered take is counted
         self._switching: tuple[float, int] | None = None
@@ -485,7 +486,7 @@ class _ScheduleMaker:
         self._takers[step.kind](step)
 
     def finish(self) -> None:
-        """End the plan, without the result of a trigger under way, which is unknown."""
+        """End the plan, without a trigger whose result was not recorded."""
         self._triggers.clear()
 
     # ------------------------------------------------------------------ steps
@@ -561,22 +562,22 @@ class _ScheduleMaker:
         if self.first is None:
             self.first = step.number
         self._name(step.number)
-        found = self._list(step.number)
-        if not found.waits:
+        runs = self._list(step.number)
+        if not runs.waits:
             self._triggers.clear()  # a free-running application ignores them
-            found.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
+            runs.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
         elif self._triggers:
             began = self._triggers.pop(0)
             self._open = RecordedRun([step.data], self.now - began, drops=self._drops)
             self._drops = 0
-            found.triggered.append(self._open)
+            runs.triggered.append(self._open)
         elif self._open is not None and not self._is_over():
             self._open.containers.append(step.data)
         else:
             seen = self._began_untriggered is not None or not self._waits
             began = self.now if self._began_untriggered is None else self._began_untriggered
             take = RecordedRun([step.data], self.now - began, gap=self._gap(began))
-            found.untriggered.append(take)
+            runs.untriggered.append(take)
             self._open = take if seen else None
         if self._open is not None and len(self._open.containers) == 1:
             self._opened = self.now
@@ -584,11 +585,11 @@ class _ScheduleMaker:
 
     @property
     def _waits(self) -> bool:
-        """True if the last status says that the camera waits for a trigger."""
+        """True if the camera waits for a trigger, by its last status."""
         return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
 
     def _is_over(self) -> bool:
-        """Return True if the camera waits, and was silent too long for more results."""
+        """Return True if the camera waits, and more results can no longer arrive."""
         return self._waits and self.now - self._opened > MAX_TIME_BEHIND_FIRST
 
     # ------------------------------------------------------------------ inside
@@ -599,7 +600,7 @@ class _ScheduleMaker:
         return gap
 
     def _give_up(self) -> None:
-        """End the inspection under way, whose trigger has no result."""
+        """End the running inspection, whose trigger has no result."""
         if self._active is not None and self._list(self._active).waits:
             for began in self._triggers:
                 ended = self._waits_from if self._waits_from > began else self.now

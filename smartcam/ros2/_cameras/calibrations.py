@@ -102,13 +102,13 @@ class RosCalibrationFace:
             SmartCamError: the service failed.
         """
         service = CALIBRATION[name]
-        names = [one for one in service.request.model_fields if hasattr(message, one)]
-        fields = {one: _plain(getattr(message, one)) for one in names}
+        names = [field for field in service.request.model_fields if hasattr(message, field)]
+        fields = {name: _plain(getattr(message, name)) for name in names}
         request = validated(service.request, fields, f"{self.name}: {name}")
-        found = await service.do(CalibrationCall(self, request, service.timeout))
-        if "pose" in found:
-            found["pose"] = _stamped(found["pose"])
-        return found
+        answer = await service.do(CalibrationCall(self, request, service.timeout))
+        if "pose" in answer:
+            answer["pose"] = _stamped(answer["pose"])
+        return answer
 
 
 def _plain(value: Any) -> Any:

@@ -20,7 +20,7 @@ _FLOAT32: Final = 7
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of numpy by the numbers of ``sensor_msgs/PointField``."""
 
-STEP: Final = 16
+POINT_BYTES: Final = 16
 """Number of bytes of a point: x, y, z and rgb."""
 
 NO_DISPARITY: Final = -1.0
@@ -86,16 +86,16 @@ def compressed_depth_fields(
         encoding: as for :func:`depth_fields`.
     """
     a = b = 0.0
-    there = depth > 0
+    valid = depth > 0
     if encoding == "16UC1":
         values = _millimetres(depth)
-    elif there.any():
-        near, far = float(depth[there].min()), float(depth[there].max())
-        far = max(far, near * MIN_DEPTH_RANGE)
-        a = MAX_DEPTH_STEPS / (1 / near - 1 / far)
-        b = 1 - a / far
-        inverse = a / np.where(there, depth, np.float32(far)).astype(np.float64) + b
-        values = np.where(there, np.rint(inverse), 0).astype(np.uint16)
+    elif valid.any():
+        nearest, farthest = float(depth[valid].min()), float(depth[valid].max())
+        farthest = max(farthest, nearest * MIN_DEPTH_RANGE)
+        a = MAX_DEPTH_STEPS / (1 / nearest - 1 / farthest)
+        b = 1 - a / farthest
+        inverse = a / np.where(valid, depth, np.float32(farthest)).astype(np.float64) + b
+        values = np.where(valid, np.rint(inverse), 0).astype(np.uint16)
     else:
         values = np.zeros(depth.shape, np.uint16)
     done, png = load("cv2").imencode(".png", values, PNG_OPTIONS)
@@ -107,9 +107,9 @@ def compressed_depth_fields(
 
 def _millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Return depths in millimetres, 0 for no depth and for depths too large for 16 bits."""
-    whole = np.rint(depth * np.float32(1000))
-    fits = (whole > 0) & (whole <= np.iinfo(np.uint16).max)
-    return np.where(fits, whole, 0).astype(np.uint16)
+    rounded = np.rint(depth * np.float32(1000))
+    fits = (rounded > 0) & (rounded <= np.iinfo(np.uint16).max)
+    return np.where(fits, rounded, 0).astype(np.uint16)
 
 
 def disparity_fields(
@@ -165,7 +165,7 @@ def cloud_fields(
     rows = points if points.ndim == 3 else points[None]
     height, width = rows.shape[:2]
     names = ["x", "y", "z"]
-    step = STEP if colours is not None else STEP - 4
+    step = POINT_BYTES if colours is not None else POINT_BYTES - 4
     data = np.zeros((height, width, step // 4), "<f4")
     data[..., :3] = rows
     if colours is not None:
@@ -206,16 +206,16 @@ def cloud_from(message: Any) -> CloudPoints:
         )
     xyz = [_column(message, fields[name], "f") for name in "xyz"]
     points = np.stack(xyz, axis=-1).reshape(-1, 3).astype(np.float32)
-    there = np.isfinite(points).all(axis=1)
+    valid = np.isfinite(points).all(axis=1)
     packed = fields.get("rgb") or fields.get("rgba")
     if packed is None:
-        return CloudPoints(points[there], None)
+        return CloudPoints(points[valid], None)
     values = np.ascontiguousarray(_column(message, packed, "fui")).reshape(-1)
     if values.dtype.itemsize != 4:
         raise RosMessageError(f"point cloud: expected {packed.name} of 4 bytes, got {values.dtype}")
-    bits = values.view(np.uint32)[there]
+    bits = values.view(np.uint32)[valid]
     colours = np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=-1).astype(np.uint8)
-    return CloudPoints(points[there], colours)
+    return CloudPoints(points[valid], colours)
 
 
 def _column(message: Any, field: Any, kinds: str) -> NDArray[Any]:

@@ -55,7 +55,7 @@ class CameraControls:
 
     async def close(self) -> None:
         """Undeclare the parameters. Idempotent."""
-        tasks = [one for one in (self._task, self._refreshing) if one is not None]
+        tasks = [task for task in (self._task, self._refreshing) if task is not None]
         self._task = self._refreshing = None
         for task in tasks:
             task.cancel()

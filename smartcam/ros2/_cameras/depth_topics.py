@@ -121,8 +121,8 @@ class DepthTopics:
             if stream is not None:
                 await stream.close()
         finally:
-            for one in self._publishers.values():
-                one.close()
+            for publisher in self._publishers.values():
+                publisher.close()
             self._publishers.clear()
             await self._transforms.close()
             thread, self._thread = self._thread, None
@@ -146,15 +146,19 @@ class DepthTopics:
             turn = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
             seen = place @ turn
             parent = self._parent or place.target
-            found = Transform(parent, self.frame_id, seen.rotation, seen.translation)
-            self._transforms.replace([found])
+            transform = Transform(parent, self.frame_id, seen.rotation, seen.translation)
+            self._transforms.replace([transform])
 
     async def _publish(self, frame: DepthFrame) -> None:
-        heard = {name: one for name, one in self._publishers.items() if getattr(one, "heard", True)}
-        if self._thread is None or not heard:
+        publishers = {
+            name: publisher
+            for name, publisher in self._publishers.items()
+            if getattr(publisher, "has_subscribers", True)
+        }
+        if self._thread is None or not publishers:
             return
         loop = asyncio.get_running_loop()
-        for name, publisher in heard.items():
+        for name, publisher in publishers.items():
             fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
             await publish_newest(publisher, fields)
 
@@ -182,6 +186,6 @@ class DepthTopics:
     def _cloud(self, frame: DepthFrame, header: dict[str, Any]) -> dict[str, Any]:
         points, colours = points_of(frame.depth, frame.camera_info), frame.left
         if not self._organized:
-            there = frame.depth > 0
-            points, colours = points[there], colours[there]
+            valid = frame.depth > 0
+            points, colours = points[valid], colours[valid]
         return cloud_fields(points, colours, header)

@@ -1,6 +1,6 @@
 """Convert a camera's health to ROS: its status, and its diagnostics.
 
-A node publishes the health of its camera, a bag that of a recorded camera.
+A node publishes the health of its camera, a bag the health of a recorded camera.
 """
 
 from __future__ import annotations
@@ -78,21 +78,21 @@ class Health(NamedTuple):
     errors: tuple[str, ...] = ()
 
 
-def health(known: KnownState, *, heard: bool = True) -> Health:
+def health(known: KnownState, *, session_alive: bool = True) -> Health:
     """Return the health of a camera.
 
     Args:
         known: known state of the camera.
-        heard: whether the program that has the session with the camera is alive.
+        session_alive: whether the program that has the session with the camera is alive.
     """
     if not known.connected:
         text = known.why[:MAX_ERROR_CHARACTERS] or "there was no session yet"
-        return Health(ERROR if heard else STALE, text)
+        return Health(ERROR if session_alive else STALE, text)
     status = known.bits
-    found = [bit for bit in TROUBLES if bit in status]
-    if found:
-        level, text = TROUBLES[found[0]]
-        return Health(level, text, tuple(bit.name or "" for bit in found))
+    bits = [bit for bit in TROUBLES if bit in status]
+    if bits:
+        level, text = TROUBLES[bits[0]]
+        return Health(level, text, tuple(bit.name or "" for bit in bits))
     if known.status is None:
         return Health(OK, "connected")
     if status.loading:

@@ -1,6 +1,6 @@
 """Convert pictures to ROS' messages and back, without a node.
 
-The names of encodings are those of ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
+The names of encodings are from ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
 in millimetres, 0 for no depth, or 32FC1 in metres, NaN for no depth.
 """
 
@@ -37,10 +37,10 @@ ENCODINGS: Final[dict[str, str]] = {
     "RGBa8": "rgba8",
     "BGRa8": "bgra8",
     "RGBa16": "rgba16",
-    **{f"Bayer{ours}8": f"bayer_{theirs}8" for ours, theirs in _BAYER.items()},
+    **{f"Bayer{ours}8": f"bayer_{ros_name}8" for ours, ros_name in _BAYER.items()},
     **{
-        f"Bayer{ours}{bits}": f"bayer_{theirs}16"
-        for ours, theirs in _BAYER.items()
+        f"Bayer{ours}{bits}": f"bayer_{ros_name}16"
+        for ours, ros_name in _BAYER.items()
         for bits in (10, 12, 16)
     },
     "Coord3D_C16": "16UC1",
@@ -58,8 +58,8 @@ converted to ``rgb8`` or unpacked first: see :func:`prepared`.
 
 _FORMATS: Final[dict[str, str]] = {
     **{
-        theirs: ours
-        for ours, theirs in reversed(ENCODINGS.items())
+        ros_name: ours
+        for ours, ros_name in reversed(ENCODINGS.items())
         if ours not in {"Mono10", "Mono12", "Mono14"} and not ours.endswith(("10", "12"))
     },
     "8UC1": "Mono8",
@@ -79,9 +79,9 @@ _DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
 
 def stamp_fields(utc: float) -> dict[str, int]:
     """Return a time in seconds since 1970 as the fields of ``builtin_interfaces/Time``."""
-    whole = int(max(utc, 0.0))
-    more = round(max(utc - whole, 0.0) * BILLION)  # separate, since a sum would lose digits
-    return {"sec": whole + more // BILLION, "nanosec": more % BILLION}
+    seconds = int(max(utc, 0.0))
+    more = round(max(utc - seconds, 0.0) * BILLION)  # separate, since a sum would lose digits
+    return {"sec": seconds + more // BILLION, "nanosec": more % BILLION}
 
 
 def header_fields(utc: float, frame_id: str) -> dict[str, Any]:
@@ -149,16 +149,16 @@ def _whole_rows(frame: Frame) -> memoryview:
 
 def array_fields(pixels: NDArray[Any], encoding: str, header: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of ``sensor_msgs/Image`` of an array (H, W) or (H, W, C)."""
-    kept = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
-    height, width = kept.shape[:2]
+    contiguous = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    height, width = contiguous.shape[:2]
     return {
         "header": header,
         "height": height,
         "width": width,
         "encoding": encoding,
         "is_bigendian": 0,
-        "step": kept.nbytes // max(height, 1),
-        "data": kept.reshape(-1).view(np.uint8),
+        "step": contiguous.nbytes // max(height, 1),
+        "data": contiguous.reshape(-1).view(np.uint8),
     }
 
 
@@ -335,9 +335,13 @@ def pixels_from(message: Any) -> NDArray[Any]:
 
 def _samples(encoding: str) -> tuple[str, int]:
     """Return the type of an encoding's numbers, and their count for a pixel."""
-    bits, _, rest = encoding.partition("C")
-    if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and rest in {*"1234", ""}:
-        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(rest or 1)
+    bits, _, channels_text = encoding.partition("C")
+    if (
+        bits[:-1] in {"8", "16", "32", "64"}
+        and bits[-1:] in _DTYPES
+        and channels_text in {*"1234", ""}
+    ):
+        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(channels_text or 1)
     for name, channels in (("mono", 1), ("bayer_", 1), ("rgba", 4), ("bgra", 4), ("rgb", 3)):
         if encoding.startswith(name) and encoding.endswith(("8", "16")):
             return ("u2" if encoding.endswith("16") else "u1"), channels

@@ -84,6 +84,6 @@ def lens_from(message: Any) -> CameraInfo | None:
         turn = np.eye(3)
     if not np.any(projection):
         projection = np.column_stack([lens.matrix, np.zeros(3)])
-    if not all(math.isfinite(one) for one in (*turn.ravel(), *projection.ravel())):
+    if not all(math.isfinite(number) for number in (*turn.ravel(), *projection.ravel())):
         raise RosMessageError("camera_info: expected finite numbers in R and P")
     return CameraInfo(lens, message.header.frame_id, turn, projection)

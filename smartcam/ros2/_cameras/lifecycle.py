@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-PATIENCE_TIMEOUT = 60.0
+CAMERA_WAIT = 60.0
 """Largest number of seconds of one wait for a camera, before the next wait begins."""
 
 RETRY = Backoff(initial=0.5, maximum=10.0)
@@ -58,7 +58,7 @@ class CameraLifecycle(Lifecycle):
     Args:
         camera: camera of the node.
         node: node of ROS 2, or of ROS 1, which has no services of a life cycle.
-        application: id of the application to load and run; None: that of the settings.
+        application: id of the application to load and run; None: the settings' application.
         autostart: whether the node goes to Active by itself.
     """
 
@@ -72,7 +72,7 @@ class CameraLifecycle(Lifecycle):
         self._starting: asyncio.Task[None] | None = None
         self._ends: list[Any] = []
         limit = settings.connect_timeout + 2 * settings.switch_timeout + settings.request_timeout
-        super().__init__(node.full_name, {"configure": self._have_camera}, limit)
+        super().__init__(node.full_name, {"configure": self._ensure_camera}, limit)
 
     async def start(self) -> None:
         """Serve, and go to Active with ``autostart``."""
@@ -100,7 +100,7 @@ class CameraLifecycle(Lifecycle):
 
             return answer
 
-        states = {"available_states": [one._asdict() for one in STATES]}
+        states = {"available_states": [state._asdict() for state in STATES]}
         ways = "GetAvailableTransitions"
         return {
             "change_state": ("ChangeState", self._on_change_state),
@@ -130,7 +130,7 @@ class CameraLifecycle(Lifecycle):
 
     # ------------------------------------------------------------------ work
 
-    async def _have_camera(self) -> None:
+    async def _ensure_camera(self) -> None:
         camera, application = self._camera, self._application
         await camera.wait_connected(camera.settings.connect_timeout)
         if application is None:
@@ -144,7 +144,7 @@ class CameraLifecycle(Lifecycle):
         logged, delays = "", RETRY.delays()
         while True:
             try:
-                await self._camera.wait_connected(PATIENCE_TIMEOUT)
+                await self._camera.wait_connected(CAMERA_WAIT)
                 await self.configure()
                 await self.activate()
             except (LinkError, ResponseTimeoutError) as exc:
@@ -195,4 +195,4 @@ def is_managed(node: Any) -> bool:
 
 
 def _described(transitions: Any) -> dict[str, Any]:
-    return {"available_transitions": [one.fields for one in transitions]}
+    return {"available_transitions": [transition.fields for transition in transitions]}

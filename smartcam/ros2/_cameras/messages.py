@@ -50,7 +50,7 @@ class ResultMessages:
 
     Args:
         types: types of the messages, from the node that publishes them.
-        camera: name of the camera, which is also its frame: that of poses without a calibration.
+        camera: name of the camera, which is also the frame of poses without a calibration.
         frame_id: name of the camera's frame in ROS.
         calibration: calibration of the camera's settings, which names the robot's frame.
         robot_frame: name of the robot's frame in ROS; empty: the calibration's own.
@@ -69,8 +69,12 @@ class ResultMessages:
     ) -> None:
         self.frame_id: str = frame_id
         self._camera, self._calibration = camera, calibration
-        own = {frame_of_robot(one) for one in calibrations_of(calibration).values()}
-        self._in_ros: dict[str, str] = dict.fromkeys(own, robot_frame) if robot_frame else {}
+        robot_frames = {
+            frame_of_robot(calibration_) for calibration_ in calibrations_of(calibration).values()
+        }
+        self._in_ros: dict[str, str] = (
+            dict.fromkeys(robot_frames, robot_frame) if robot_frame else {}
+        )
         self._in_ros[camera] = frame_id
         cls = {
             name: types.message(name).cls
@@ -94,7 +98,7 @@ class ResultMessages:
             )
         }
         self._cls: Any = type(
-            "Classes", (), {name.rpartition("/")[2]: one for name, one in cls.items()}
+            "Classes", (), {name.rpartition("/")[2]: class_ for name, class_ in cls.items()}
         )
         self._no_covariance = np.zeros(36)
         self._no_covariance.flags.writeable = False
@@ -105,8 +109,8 @@ class ResultMessages:
         Raises:
             RosMessageError: the poses are in several frames.
         """
-        found = localizations_of(result.value)
-        frames = {one.pose.header.frame_id for one in found or ()}
+        localizations = localizations_of(result.value)
+        frames = {localization.pose.header.frame_id for localization in localizations or ()}
         if len(frames) > 1:
             raise RosMessageError(
                 f"{self._camera}: expected the poses of a result in one frame, got "
@@ -128,8 +132,8 @@ class ResultMessages:
         time = cls.Time(since.days * 86_400 + since.seconds, since.microseconds * 1000)
         return cls.Header(time, frame_id)
 
-    def _pose(self, one: Localization) -> Any:
-        _, position, orientation = one.pose
+    def _pose(self, localization: Localization) -> Any:
+        _, position, orientation = localization.pose
         cls = self._cls
         return cls.Pose(cls.Point(*position), cls.Quaternion(*orientation))
 
@@ -140,7 +144,7 @@ class ResultMessages:
             RosMessageError: the poses are in several frames.
         """
         header = self.header(result.received_at, self.frame_of(result))
-        return self._cls.PoseArray(header, [self._pose(one) for one in parts])
+        return self._cls.PoseArray(header, [self._pose(part) for part in parts])
 
     def detections(self, result: Result, parts: Sequence[Localization]) -> Any:
         """Return the ``Detection3DArray`` of a result: one hypothesis for each part.
@@ -154,26 +158,26 @@ class ResultMessages:
         cls = self._cls
         header = self.header(result.received_at, self.frame_of(result))
         no_size = cls.Vector3(0.0, 0.0, 0.0)
-        found = list[Any]()
-        for one in parts:
-            pose = self._pose(one)
+        detections = list[Any]()
+        for part in parts:
+            pose = self._pose(part)
             hypothesis = cls.ObjectHypothesisWithPose(
-                cls.ObjectHypothesis(one.feature_id, one.quality),
+                cls.ObjectHypothesis(part.feature_id, part.quality),
                 cls.PoseWithCovariance(pose, self._no_covariance),
             )
-            found.append(
+            detections.append(
                 cls.Detection3D(header, [hypothesis], cls.BoundingBox3D(pose, no_size), "")
             )
-        return cls.Detection3DArray(header, found)
+        return cls.Detection3DArray(header, detections)
 
     def localizations(self, parts: Sequence[Localization]) -> list[Any]:
         """Return the thesis' ``Localization`` of each part."""
         cls, made = self._cls, list[Any]()
-        for one in parts:
-            stamped = one.pose.header
+        for part in parts:
+            stamped = part.pose.header
             header = self.header(stamped.stamp, self._frame(stamped.frame_id))
-            pose = cls.PoseStamped(header, self._pose(one))
-            made.append(cls.Localization(one.feature_id, one.quality, one.photo_index, pose))
+            pose = cls.PoseStamped(header, self._pose(part))
+            made.append(cls.Localization(part.feature_id, part.quality, part.photo_index, pose))
         return made
 
     def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:

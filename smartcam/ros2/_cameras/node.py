@@ -45,23 +45,23 @@ class CameraPart(Protocol):
 
 
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
-    lambda one: CameraParameters.of(one.camera, one.node, one.options, one.status),
-    lambda one: one.status,
-    lambda one: one.results,
-    lambda one: CameraGraph(
-        one.node, one.calibrations, owned=one.calibrations is not one.options.calibrations
+    lambda node: CameraParameters.of(node.camera, node.node, node.options, node.status),
+    lambda node: node.status,
+    lambda node: node.results,
+    lambda node: CameraGraph(
+        node.node, node.calibrations, owned=node.calibrations is not node.options.calibrations
     ),
-    lambda one: one.services,
-    lambda one: one.rosout(),
-    lambda one: CameraPictures(
-        one.camera,
-        one.node,
-        frame_id=one.frames.optical,
-        camera_info_url=str(one.options.frames.get("camera_info_url", "")),
+    lambda node: node.services,
+    lambda node: node.rosout(),
+    lambda node: CameraPictures(
+        node.camera,
+        node.node,
+        frame_id=node.frames.optical,
+        camera_info_url=str(node.options.frames.get("camera_info_url", "")),
     ),
-    lambda one: one.controls(),
-    lambda one: StaticTransforms(one.node, one.frames.transforms()),
-    lambda one: one.lifecycle,
+    lambda node: node.controls(),
+    lambda node: StaticTransforms(node.node, node.frames.transforms()),
+    lambda node: node.lifecycle,
 )
 """Parts of a node, in the order of their start. The life cycle is the last, so that the others get
 its events."""

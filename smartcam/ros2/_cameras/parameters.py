@@ -27,27 +27,33 @@ DIAGNOSTICS_PERIODS = (0.1, 3600.0)
 """Smallest and largest number of seconds between two diagnostics messages."""
 
 SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
-    "url": ("URL of the camera, without a password", lambda one: masked(one.address.url)),
+    "url": ("URL of the camera, without a password", lambda camera: masked(camera.address.url)),
     "interpret_as": (
         "interpretation of result containers; empty: none",
-        lambda one: as_text(one.interpret_as),
+        lambda camera: as_text(camera.interpret_as),
     ),
-    "y_down": ("the camera's y axis points down", lambda one: one.y_down),
-    "lenient": ("any non-zero byte is a true bool", lambda one: one.lenient),
+    "y_down": ("the camera's y axis points down", lambda camera: camera.y_down),
+    "lenient": ("any non-zero byte is a true bool", lambda camera: camera.lenient),
     "restore": (
         "application and run state are restored after a reconnect",
-        lambda one: one.restore,
+        lambda camera: camera.restore,
     ),
-    "reconnect": ("the client reconnects after a loss", lambda one: one.reconnect is not None),
-    "connect_timeout": ("seconds to establish a session", lambda one: one.connect_timeout),
+    "reconnect": (
+        "the client reconnects after a loss",
+        lambda camera: camera.reconnect is not None,
+    ),
+    "connect_timeout": ("seconds to establish a session", lambda camera: camera.connect_timeout),
     "switch_timeout": (
         "seconds for a switch until the camera is ready",
-        lambda one: one.switch_timeout,
+        lambda camera: camera.switch_timeout,
     ),
-    "request_timeout": ("seconds for the answer to a request", lambda one: one.request_timeout),
+    "request_timeout": (
+        "seconds for the answer to a request",
+        lambda camera: camera.request_timeout,
+    ),
     "liveness_timeout": (
         "seconds until a camera that does not answer counts as lost; 0: never",
-        lambda one: one.liveness_timeout or 0.0,
+        lambda camera: camera.liveness_timeout or 0.0,
     ),
 }
 """Read-only parameters: the description, and a function that returns the value."""
@@ -66,7 +72,7 @@ def as_text(spec: object) -> str:
     if spec is None:
         return ""
     if isinstance(spec, Mapping):
-        return json.dumps({str(key): as_text(one) for key, one in spec.items()})
+        return json.dumps({str(key): as_text(value) for key, value in spec.items()})
     return spec if isinstance(spec, str) else type(spec).__name__
 
 

@@ -53,17 +53,17 @@ def frame_of_file(data: bytes, source: str) -> Frame:
     """
     if data[:2] == b"\xff\xd8":
         width, height, _ = jpeg_header(data, source)
-        name, kept, stride = "MJPEG", memoryview(data), 0
+        name, encoded, stride = "MJPEG", memoryview(data), 0
     else:
         try:
             pixels = np.ascontiguousarray(read_bitmap(data))
         except FrameFormatError as exc:
             raise FrameFormatError(f"{source}: {exc}", source=source) from exc
         height, width = pixels.shape[:2]
-        name, kept = "Mono8" if pixels.ndim == 2 else "RGB8", pixels.data.cast("B")
+        name, encoded = "Mono8" if pixels.ndim == 2 else "RGB8", pixels.data.cast("B")
         stride = pixels.nbytes // height
     return Frame(
-        data=kept,
+        data=encoded,
         format=find_format(name),
         width=width,
         height=height,
@@ -101,10 +101,12 @@ class PictureRequests:
             logger.warning("%s ! a request for a picture failed: %s", self._node.full_name, exc)
             return {"error": error_text(exc)}
 
-    async def _serve(self, asked: float) -> dict[str, Any]:
-        if not 0 <= asked <= MAX_TIMEOUT:
-            raise RosMessageError(f"timeout: expected 0 to {MAX_TIMEOUT:g} seconds, got {asked:g}")
-        timeout = asked or MAX_TIMEOUT
+    async def _serve(self, requested_at: float) -> dict[str, Any]:
+        if not 0 <= requested_at <= MAX_TIMEOUT:
+            raise RosMessageError(
+                f"timeout: expected 0 to {MAX_TIMEOUT:g} seconds, got {requested_at:g}"
+            )
+        timeout = requested_at or MAX_TIMEOUT
         try:
             async with asyncio.timeout(timeout):
                 await self._one_at_a_time.acquire()

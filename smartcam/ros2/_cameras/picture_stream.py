@@ -18,7 +18,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 Item = TypeVar("Item")
 
-LOOK_INTERVAL: Final = 0.1
+CHECK_INTERVAL: Final = 0.1
 """Seconds between two checks for a subscriber."""
 
 IDLE_CHECK_INTERVAL: Final = 1.0
@@ -59,7 +59,7 @@ class SubscribedPictures(Generic[Item]):
     def start(self) -> None:
         """Start to check for subscribers."""
         if self._task is None:
-            watches = [getattr(one, "watch", None) for one in self._publishers]
+            watches = [getattr(publisher, "watch", None) for publisher in self._publishers]
             if None not in watches:
                 self._watches = [watch(self._woken.set) for watch in watches if watch]
             self._task = asyncio.get_running_loop().create_task(
@@ -87,7 +87,7 @@ class SubscribedPictures(Generic[Item]):
     @property
     def has_subscriber(self) -> bool:
         """True if one of the topics has a subscriber, as far as is known."""
-        return any(getattr(one, "heard", True) for one in self._publishers)
+        return any(getattr(publisher, "has_subscribers", True) for publisher in self._publishers)
 
     async def _run(self) -> None:
         while True:
@@ -106,7 +106,7 @@ class SubscribedPictures(Generic[Item]):
         check_often_until = 0.0
         while not self.has_subscriber:
             pause = (
-                LOOK_INTERVAL
+                CHECK_INTERVAL
                 if not self._watches or loop.time() < check_often_until
                 else IDLE_CHECK_INTERVAL
             )
@@ -122,12 +122,12 @@ class SubscribedPictures(Generic[Item]):
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.has_subscriber and loop.time() < end:  # noqa: ASYNC110 - there is no event for it
-            await asyncio.sleep(LOOK_INTERVAL)
+            await asyncio.sleep(CHECK_INTERVAL)
 
     async def _stream(self) -> None:
         """Publish until there is no subscriber, or the source ends."""
         try:
-            async with self._read(LOOK_INTERVAL) as reader:
+            async with self._read(CHECK_INTERVAL) as reader:
                 while self.has_subscriber:
                     with contextlib.suppress(FrameTimeoutError):
                         await self._publish_one(await anext(reader))

@@ -53,7 +53,7 @@ class CameraPictures:
         frame_id: the optical frame, z ahead and y down (REP-103); "": the node's name with
             ``_optical``.
         camera_info_url: the file of the lens, ``file:///PATH`` or a path, which need not exist
-            yet; "": no file, and the lens is that of the frames.
+            yet; "": no file, and the frames' lens is used.
         quality: quality of JPEGs, 1 to 100.
 
     Raises:
@@ -77,7 +77,7 @@ class CameraPictures:
         self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
         self.frame_id: str = frame_id or f"{node.name}_optical"
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
-        self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
+        self._requests = PictureRequests(node, self.frame_id, self._lens, self._publish_one)
         self._ends: list[Any] = []
         self._streams: list[SubscribedPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
@@ -127,8 +127,8 @@ class CameraPictures:
         )
         kind = "smartcam_msgs/srv/RequestImage"
         self._ends.append(node.serve("~/request_image", kind, self._requests.serve))
-        for one in self._streams:
-            one.start()
+        for stream in self._streams:
+            stream.start()
 
     async def close(self) -> None:
         """Withdraw topics and services; a source of the caller's stays open. Idempotent.
@@ -136,11 +136,11 @@ class CameraPictures:
         Cancellation: everything is still closed.
         """
         streams, self._streams = self._streams, []
-        for one in streams:
-            one.end()
+        for stream in streams:
+            stream.end()
         try:
-            for one in streams:
-                await one.close()
+            for stream in streams:
+                await stream.close()
         finally:
             for end in self._ends:
                 end.close()
@@ -162,7 +162,7 @@ class CameraPictures:
         quality = None if encoding == "raw" else self._quality
         return self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
 
-    async def _one(self, timeout: float) -> Frame:
+    async def _publish_one(self, timeout: float) -> Frame:
         frame = await one_frame(self._frames, self._camera, timeout)
         self._size = (frame.width, frame.height)
         return frame
@@ -171,14 +171,14 @@ class CameraPictures:
         if self._frames is not None:
             return self._frames.format.width, self._frames.format.height
         if self._size is None:
-            await self._one(SIZE_TIMEOUT)
+            await self._publish_one(SIZE_TIMEOUT)
         return self._size or (0, 0)
 
     # ------------------------------------------------------------------ messages
 
     async def _publish_raw(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        if _heard(self._image):
+        if _has_subscribers(self._image):
             ready = frame
             if frame.format.name not in ENCODINGS:
                 ready = await self._in_thread(lambda: prepared(frame))
@@ -187,15 +187,17 @@ class CameraPictures:
 
     async def _publish_small(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        way = compression(frame)
+        compressed_form = compression(frame)
         small = frame
-        if way.first:
-            small = await self._codecs.converted(small, way.first)
-        if way.how == "png":
+        if compressed_form.first:
+            small = await self._codecs.converted(small, compressed_form.first)
+        if compressed_form.how == "png":
             small = await self._codecs.png(small)
-        elif way.how == "jpeg":
+        elif compressed_form.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        await publish_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
+        await publish_newest(
+            self._small, compressed_fields(small, compressed_form.text(), self.frame_id)
+        )
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:
@@ -203,7 +205,7 @@ class CameraPictures:
         if frame.utc in self._stamps:
             return
         self._stamps.append(frame.utc)
-        if _heard(self._info):
+        if _has_subscribers(self._info):
             await self._lens.load()
             self._info.publish(self._lens.fields(frame))
 
@@ -214,5 +216,5 @@ class CameraPictures:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
 
-def _heard(publisher: Any) -> bool:
-    return bool(getattr(publisher, "heard", True))
+def _has_subscribers(publisher: Any) -> bool:
+    return bool(getattr(publisher, "has_subscribers", True))

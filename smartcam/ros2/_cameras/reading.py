@@ -27,14 +27,14 @@ def place_of(camera: Camera[Any]) -> Address:
 def calibrations_of(given: Any) -> dict[int | None, Any]:
     """Return the calibrations of a camera's settings by application; None: of all of them."""
     if hasattr(given, "items") and not hasattr(given, "to_robot"):
-        return {number: one for number, one in given.items() if one is not None}
+        return {number: value for number, value in given.items() if value is not None}
     return {} if given is None else {None: given}
 
 
 def calibration_of(given: Any, application: int) -> Any:
     """Return the calibration of an application in a camera's settings; None without one."""
-    found = calibrations_of(given)
-    return found.get(application, found.get(None))
+    calibrations = calibrations_of(given)
+    return calibrations.get(application, calibrations.get(None))
 
 
 def frame_of_robot(calibration: Any) -> str:

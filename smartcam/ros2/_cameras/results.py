@@ -55,7 +55,7 @@ class CameraResults:
 
     Attributes:
         active: whether results are published; otherwise they are discarded as they come.
-        taken: number of results that came, including those that could not be interpreted.
+        taken: number of results that came, including results that could not be interpreted.
         failed: number of results that could not be interpreted.
         refused: number of messages that could not be made from a result.
     """
@@ -89,10 +89,12 @@ class CameraResults:
         return waiting + (0 if self._outlet is None else self._outlet.dropped)
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if one of the topics has a subscriber."""
         outlet = () if self._outlet is None else (self._outlet,)
-        return any(_heard(one) for one in (*self._publishers.values(), *outlet))
+        return any(
+            _has_subscribers(publisher) for publisher in (*self._publishers.values(), *outlet)
+        )
 
     def start(self) -> None:
         """Declare the topics, and publish results from now on. Idempotent.
@@ -119,7 +121,8 @@ class CameraResults:
         except ConfigurationError as exc:
             if kind != DETECTIONS:
                 raise
-            logger.info("%s: without %s: %s", self._node.full_name, name, exc)  # as in ROS 1
+            # ROS 1 does the same
+            logger.info("%s: without %s: %s", self._node.full_name, name, exc)
 
     async def close(self) -> None:
         """Stop publishing, and withdraw the topics. Idempotent."""
@@ -177,11 +180,11 @@ class CameraResults:
 
     def _other_topic(self, topic: str, depth: int) -> Any:
         publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
-        own = self._publishers.get("results")
-        if own is not None and _name(publisher) == _name(own):
+        general = self._publishers.get("results")
+        if general is not None and _name(publisher) == _name(general):
             publisher.close()
             raise ConfigurationError(
-                f"{self._camera.name}: {_name(own)} has its results already: expected another "
+                f"{self._camera.name}: {_name(general)} has its results already: expected another "
                 "topic, or none"
             )
         return publisher
@@ -236,7 +239,7 @@ class CameraResults:
             self._put(publisher, make)
 
     def _put(self, publisher: Any, make: Any) -> None:
-        if not _heard(publisher):
+        if not _has_subscribers(publisher):
             return
         try:
             publisher.publish(make())
@@ -251,9 +254,9 @@ class CameraResults:
             logger.exception("%s ! a result was not published", self._node.full_name)
 
 
-def _heard(publisher: Any) -> bool:
+def _has_subscribers(publisher: Any) -> bool:
     """Return False if it is known that a topic has no subscriber, otherwise True."""
-    return bool(getattr(publisher, "heard", True))
+    return bool(getattr(publisher, "has_subscribers", True))
 
 
 def _name(publisher: Any) -> str:
@@ -284,13 +287,13 @@ class _SubscriberOutlet:
         self._timer: asyncio.TimerHandle | None = None
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a subscriber."""
-        return _heard(self._publisher)
+        return _has_subscribers(self._publisher)
 
     def offer(self, made: _Made, put: Any) -> None:
         """Publish a message when the delay is over."""
-        if not self.heard:
+        if not self.has_subscribers:
             return
         self._queue.append(made)
         self._bytes += made.size

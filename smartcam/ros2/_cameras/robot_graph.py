@@ -89,17 +89,17 @@ class CameraGraph:
         """
         full = self._full(topic)
         kind = self._kind(full)
-        came: list[float] = []
-        heard = self._node.subscribe(full, kind, qos=QoS(reliable=False, depth=1))
+        ages: list[float] = []
+        subscription = self._node.subscribe(full, kind, qos=QoS(reliable=False, depth=1))
         try:
             async with asyncio.timeout(PICTURE_WAIT):
-                message, utc = await _fresh(heard, came)
+                message, utc = await _fresh(subscription, ages)
         except TimeoutError as exc:
-            raise self._missing(full, kind, came) from exc
+            raise self._missing(full, kind, ages) from exc
         except StopAsyncIteration as exc:
             raise RosError(f"{full}: the node of the camera was closed meanwhile") from exc
         finally:
-            heard.close()
+            subscription.close()
         frame = frame_from(message, source=topic)
         return await asyncio.to_thread(frame.grey), utc
 
@@ -113,15 +113,15 @@ class CameraGraph:
                 unknown.
         """
         beside = f"{self._full(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        heard = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))
+        subscription = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))
         try:
             async with asyncio.timeout(LENS_WAIT):
-                found = lens_from(await anext(heard))
+                lens = lens_from(await anext(subscription))
         except (TimeoutError, StopAsyncIteration):
             return None
         finally:
-            heard.close()
-        return None if found is None else found.camera
+            subscription.close()
+        return None if lens is None else lens.camera
 
     def _full(self, topic: str) -> str:
         return resolve(topic, self._node.namespace, self._node.name)
@@ -135,25 +135,25 @@ class CameraGraph:
                 return kind
         return COMPRESSED if topic.endswith("/compressed") else IMAGE
 
-    def _missing(self, topic: str, kind: str, came: list[float]) -> Exception:
-        old = f"; {len(came)} came that were taken before" if came else ""
+    def _missing(self, topic: str, kind: str, ages: list[float]) -> Exception:
+        old = f"; {len(ages)} came that were taken before" if ages else ""
         return Code.NO_PICTURE.refusal(
             f"{topic}: no picture came within {PICTURE_WAIT:g} s{old}; expected {kind} with the "
             "time of its exposure, from a camera that is running",
             kind,
-            len(came),
+            len(ages),
         )
 
 
-async def _fresh(heard: Any, came: list[float]) -> tuple[Any, float | None]:
+async def _fresh(subscription: Any, ages: list[float]) -> tuple[Any, float | None]:
     """Return the first picture that was taken after the call, and its time."""
     begun = time.time()
     while True:
-        message = await anext(heard)
+        message = await anext(subscription)
         utc = utc_of(message.header)
         if abs(utc - time.time()) <= MAX_CLOCK_DIFFERENCE:
             if utc >= begun:
                 return message, utc
-        elif came:
+        elif ages:
             return message, None
-        came.append(utc)
+        ages.append(utc)

@@ -1,4 +1,4 @@
-"""The services of a camera's node: the thesis' eleven, those of std_srvs, and a typed trigger.
+"""The services of a camera's node: the thesis' eleven, services of std_srvs, and a typed trigger.
 
 If the reply has a field for an error, a call with an error gets a reply.
 """
@@ -41,10 +41,10 @@ CLOSE_TIMEOUT: Final = 5.0
 
 
 class CameraServices:
-    """Serves a camera to other nodes, whose calls are like those of any program.
+    """Serves a camera to other nodes, whose calls are handled like any program's.
 
-    Simultaneous calls are like those of two programs: one trigger after the other, each within its
-    own timeout. A call ends when its caller is lost, and the camera stays usable.
+    Simultaneous calls are handled like calls of two programs: one trigger after the other, each
+    within its own timeout. A call ends when its caller is lost, and the camera stays usable.
 
     Args:
         camera: the camera.
@@ -92,8 +92,8 @@ class CameraServices:
             for name, answer in answers.items():
                 do = functools.partial(answer, name)
                 self._serve(name, f"smartcam_msgs/srv/{name}", self._in_fields(do))
-            for name, (kind, tell) in self._std.items():
-                self._serve(name, f"std_srvs/srv/{kind}", self._in_words(tell))
+            for name, (kind, answer_in_words) in self._std.items():
+                self._serve(name, f"std_srvs/srv/{kind}", self._in_words(answer_in_words))
             typed = self._in_fields(self._trigger_results)
             self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed)
         except BaseException:
@@ -106,16 +106,16 @@ class CameraServices:
         await self._thesis.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
-                for one in served:
-                    if hasattr(one, "wait_closed"):
-                        await one.wait_closed()
+                for service in served:
+                    if hasattr(service, "wait_closed"):
+                        await service.wait_closed()
         except TimeoutError:
             logger.warning("%s ! a call does not end", self._node.full_name)
 
     def _withdraw(self) -> list[Any]:
         served, self._served = self._served, []
-        for one in served:
-            one.close()
+        for service in served:
+            service.close()
         return served
 
     # ------------------------------------------------------------------ errors as fields
@@ -198,8 +198,8 @@ class CameraServices:
             results_per_trigger=wanted,
         )
         make = self._results.messages.result
-        found = [make(one, localizations_in_metres(camera, one, spec)) for one in results]
-        return {"results": found}
+        parts = [make(result, localizations_in_metres(camera, result, spec)) for result in results]
+        return {"results": parts}
 
     def _check(self, request: Any, wanted: int, spec: str | None) -> None:
         name = self._camera.name
@@ -208,13 +208,15 @@ class CameraServices:
                 f"{name}: timeout {request.timeout}: expected seconds up to {MAX_TIMEOUT:g}, or 0 "
                 f"for {DEFAULT_TRIGGER_TIMEOUT:g}"
             )
-        for what, got, most in (
+        for quantity, actual, most in (
             ("results_per_trigger", wanted, MAX_RESULTS),
             ("bytes of input", len(request.input), MAX_INPUT_BYTES),
             ("characters of interpret_as", len(spec or ""), MAX_LAYOUT_CHARACTERS),
         ):
-            if got > most:
-                raise ConfigurationError(f"{name}: {what}: expected {most} at most, got {got}")
+            if actual > most:
+                raise ConfigurationError(
+                    f"{name}: {quantity}: expected {most} at most, got {actual}"
+                )
         if spec is not None and in_pixels(resolve(spec)):
             application = request.application_id or self._camera.active_application or 0
             if not calibrated(self._camera, application):

@@ -50,7 +50,9 @@ RISING: Mapping[str, str] = {
 }
 """Counters that are a warning if they have risen since the last diagnostics."""
 
-COUNTERS = tuple(one.name for one in dataclasses.fields(Statistics) if one.type in {"int", int})
+COUNTERS = tuple(
+    field.name for field in dataclasses.fields(Statistics) if field.type in {"int", int}
+)
 MEANS = ("round_trip", "processing")
 
 
@@ -79,7 +81,7 @@ class CameraStatus:
         self._since: datetime | None = None
         self._before: dict[str, int] = {}  # counters at the last diagnostics
         self._woken = asyncio.Event()
-        self._heard: list[Callable[[], None]] = []
+        self._listeners: list[Callable[[], None]] = []
         self._events: Any = None
         self._tasks: list[asyncio.Task[None]] = []
         self._ends: list[Any] = []
@@ -110,10 +112,10 @@ class CameraStatus:
         if tasks:
             await asyncio.wait(tasks)
 
-    def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
-        """Call ``heard`` at each change of the status; return a function that ends that."""
-        self._heard.append(heard)
-        return lambda: self._heard.remove(heard) if heard in self._heard else None
+    def listen(self, on_change: Callable[[], None]) -> Callable[[], None]:
+        """Call ``on_change`` at each change of the status; return a function that ends that."""
+        self._listeners.append(on_change)
+        return lambda: self._listeners.remove(on_change) if on_change in self._listeners else None
 
     def set_period(self, seconds: float) -> None:
         """Publish diagnostics in this period from now on."""
@@ -160,8 +162,8 @@ class CameraStatus:
         self._due = asyncio.get_running_loop().time() + self._least
         self._status.publish({"header": self._header(), **fields})
         self._published = fields
-        for heard in tuple(self._heard):
-            self._guarded(heard)
+        for on_change in tuple(self._listeners):
+            self._guarded(on_change)
 
     # ------------------------------------------------------------------ diagnostics
 
@@ -170,7 +172,7 @@ class CameraStatus:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            if getattr(self._diagnostics, "heard", True):
+            if getattr(self._diagnostics, "has_subscribers", True):
                 self._guarded(self._diagnose)
             if loop.time() >= self._due:
                 self._guarded(self._publish_if_new)  # the reason of a loss changes without an event
@@ -189,10 +191,10 @@ class CameraStatus:
         """Return the fields of ``diagnostic_msgs/msg/DiagnosticStatus``."""
         counted = self._camera.statistics()
         counts = {name: int(getattr(counted, name)) for name in COUNTERS}
-        streams = [one for one in counted.subscribers if one.name == "results"]
-        counts["dropped"] = sum(one.dropped for one in streams)
+        streams = [subscriber for subscriber in counted.subscribers if subscriber.name == "results"]
+        counts["dropped"] = sum(stream.dropped for stream in streams)
         known = KnownState.of(self._camera)
-        how = health(known, heard=self._is_heard(counted))
+        how = health(known, session_alive=self._is_session_alive(counted))
         before, self._before = self._before, counts
         rose = [name for name in RISING if counts[name] > before.get(name, counts[name])]
         if how.level == OK and rose:
@@ -207,7 +209,7 @@ class CameraStatus:
         address = options.settings.address if options.settings is not None else None
         return options.hardware_id or hardware_id(address or place_of(self._camera))
 
-    def _is_heard(self, counted: Statistics) -> bool:
+    def _is_session_alive(self, counted: Statistics) -> bool:
         """Return True if the program that has the session is alive, or was."""
         if self._options.is_agent_alive is not None:
             return self._options.is_agent_alive()

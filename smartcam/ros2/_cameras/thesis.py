@@ -190,16 +190,16 @@ class ThesisServices:
             return self._encodable(await service.answer(call))
 
     def _request(self, name: str, service: ThesisService, message: Any) -> Any:
-        known = [one for one in service.request.model_fields if hasattr(message, one)]
-        fields = {one: getattr(message, one) for one in known}
+        known = [field for field in service.request.model_fields if hasattr(message, field)]
+        fields = {field: getattr(message, field) for field in known}
         return validated(service.request, fields, f"{self._face.name}: {name}")
 
-    def _encodable(self, found: dict[str, Any]) -> dict[str, Any]:
-        if "strings" in found:
-            found["strings"] = [utf8(one) for one in found["strings"]]
-        if "localizations" in found:
-            found["localizations"] = self._messages.localizations(found["localizations"])
-        return found
+    def _encodable(self, reply: dict[str, Any]) -> dict[str, Any]:
+        if "strings" in reply:
+            reply["strings"] = [utf8(text) for text in reply["strings"]]
+        if "localizations" in reply:
+            reply["localizations"] = self._messages.localizations(reply["localizations"])
+        return reply
 
     def _check_name(self, name: str) -> None:
         """Check that a request is meant for this camera.
@@ -209,7 +209,7 @@ class ThesisServices:
         """
         camera, node = self._face.name, self._node
         known = {camera, node.full_name, node.name}
-        if name and name.strip("/") not in {one.strip("/") for one in known}:
+        if name and name.strip("/") not in {field.strip("/") for field in known}:
             raise ConfigurationError(
                 f"camera_name {name!r:.80}: this is the node of {camera!r}: expected "
                 "that, or an empty text"

@@ -72,7 +72,7 @@ class _FrameLink:
         static: message of a static transform; None if the transform changes.
         times: times of the moments, UTC, in order.
         moments: messages of the transform at these times.
-        came: time of the arrival of the newest one, by the monotonic clock.
+        arrived_at: time of the arrival of the newest one, by the monotonic clock.
     """
 
     child: str
@@ -84,7 +84,7 @@ class _FrameLink:
     moments: collections.deque[Any] = field(
         default_factory=lambda: collections.deque[Any](maxlen=MAX_MOMENTS)
     )
-    came: float = 0.0
+    arrived_at: float = 0.0
 
     def add(self, utc: float, message: Any) -> None:
         """Add the frame's transform at a time; ignore one that is older than the newest."""
@@ -94,16 +94,16 @@ class _FrameLink:
         if not self.times or utc > self.times[-1]:
             self.times.append(utc)
             self.moments.append(message)
-            self.came = time.monotonic()
+            self.arrived_at = time.monotonic()
 
     def check_new(self) -> None:
         """Raise BAD_TIME if the newest transform is old."""
-        silent, behind = time.monotonic() - self.came, time.time() - self.times[-1]
+        silent, behind = time.monotonic() - self.arrived_at, time.time() - self.times[-1]
         if silent > MAX_AGE or abs(behind) > MAX_AGE:
-            way = "behind" if behind > 0 else "ahead of"
+            direction = "behind" if behind > 0 else "ahead of"
             raise Code.BAD_TIME.refusal(
                 f"TF: {self.parent} -> {self.child}: the newest transform came {silent:.1f} s ago, "
-                f"and its stamp is {abs(behind):.1f} s {way} this computer's clock; expected "
+                f"and its stamp is {abs(behind):.1f} s {direction} this computer's clock; expected "
                 f"{MAX_AGE:g} s at most, from a robot that is running and clocks that agree",
                 MAX_AGE,
                 round(max(silent, abs(behind)), 3),
@@ -131,7 +131,7 @@ class _FrameLink:
                 utc,
             )
         before, after = (
-            _transform(self, self.moments[one], self.times[one]) for one in (place - 1, place)
+            _transform(self, self.moments[index], self.times[index]) for index in (place - 1, place)
         )
         return before.between(after, _time(utc))
 
@@ -146,7 +146,7 @@ class TransformListener:
     def __init__(self, node: Any) -> None:
         self._node = node
         self._links: dict[str, _FrameLink] = {}
-        self._heard: list[Any] = []
+        self._subscriptions: list[Any] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._news = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
@@ -159,37 +159,37 @@ class TransformListener:
             RosError: the node is not open.
         """
         loop = asyncio.get_running_loop()
-        if not self._heard:
+        if not self._subscriptions:
             for topic, qos in TOPICS.items():
-                heard = self._node.subscribe(topic, TYPE, qos=qos)
-                self._heard.append(heard)
-                task = loop.create_task(self._take(heard, static=qos.latched))
+                subscription = self._node.subscribe(topic, TYPE, qos=qos)
+                self._subscriptions.append(subscription)
+                task = loop.create_task(self._take(subscription, static=qos.latched))
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = loop.call_later(LINGER, self._rest)
+        self._timer = loop.call_later(LINGER, self._unsubscribe)
 
-    def _rest(self) -> None:
+    def _unsubscribe(self) -> None:
         """Unsubscribe, and forget all transforms."""
         if self._timer is not None:
             self._timer.cancel()
-        heard, self._heard, self._timer = self._heard, [], None
-        for one in heard:
-            one.close()
+        subscriptions, self._subscriptions, self._timer = self._subscriptions, [], None
+        for subscription in subscriptions:
+            subscription.close()
         for task in self._tasks:
             task.cancel()
         self._links.clear()
 
     async def close(self) -> None:
         """Unsubscribe. Idempotent."""
-        self._rest()
+        self._unsubscribe()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def _take(self, heard: Any, *, static: bool) -> None:
-        async for message in heard:
-            for one in message.transforms:
-                self._add(one, static=static)
+    async def _take(self, subscription: Any, *, static: bool) -> None:
+        async for message in subscription:
+            for transform in message.transforms:
+                self._add(transform, static=static)
             self._news.set()
 
     def _add(self, message: Any, *, static: bool) -> None:
@@ -235,13 +235,13 @@ class TransformListener:
             CalibrationError: ``WRONG_FRAME``: TF does not know the frame.
         """
 
-        def found() -> str:
+        def root_of_chain() -> str:
             chain = self._chain(frame.strip("/"))
             if not chain:
                 raise self._strange(frame)
             return chain[-1].parent
 
-        return await self._until(found)
+        return await self._until(root_of_chain)
 
     async def _until(self, look: Callable[[], Found]) -> Found:
         """Return the result of ``look`` as soon as it succeeds; bounded."""
@@ -262,44 +262,44 @@ class TransformListener:
 
     def _chain(self, frame: str) -> list[_FrameLink]:
         """Return the links from a frame up to its root."""
-        found: list[_FrameLink] = []
+        links: list[_FrameLink] = []
         seen = {frame}
         while (link := self._links.get(frame)) is not None:
-            found.append(link)
+            links.append(link)
             frame = link.parent
             if frame in seen:
                 raise Code.WRONG_FRAME.refusal(f"TF: {frame} is above itself; expected a tree")
             seen.add(frame)
-        return found
+        return links
 
     def _pose(self, frame: str, base: str, utc: float | None) -> Transform:
         up, down = self._chain(frame), self._chain(base)
-        above = {frame, *(one.parent for one in up)}
-        below = {base, *(one.parent for one in down)}
+        above = {frame, *(link.parent for link in up)}
+        below = {base, *(link.parent for link in down)}
         shared = above & below
         if not shared:
             raise self._strange(frame if not up else base if not down else frame, base)
         up = _until_shared(up, frame, shared)
         down = _until_shared(down, base, shared)
         at = utc
-        moving = [one for one in (*up, *down) if one.static is None]
+        moving = [link for link in (*up, *down) if link.static is None]
         if at is None and moving:
-            for one in moving:
-                one.check_new()
-            at = min(one.times[-1] for one in moving)
+            for link in moving:
+                link.check_new()
+            at = min(link.times[-1] for link in moving)
         lead = _product(up, frame, at)
         back = _product(down, base, at)
-        found = back.inverse() @ lead
+        transform = back.inverse() @ lead
         when = None if not moving or at is None else _time(at)
-        return Transform(base, frame, found.rotation, found.translation, when)
+        return Transform(base, frame, transform.rotation, transform.translation, when)
 
     def _strange(self, frame: str, base: str = "") -> CalibrationError:
-        known = sorted({*self._links, *(one.parent for one in self._links.values())})
-        some = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
-        way = f" to {base!r}" if base and base != frame else ""
+        known = sorted({*self._links, *(link.parent for link in self._links.values())})
+        frames_text = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
+        target_text = f" to {base!r}" if base and base != frame else ""
         return Code.WRONG_FRAME.refusal(
-            f"TF: no way leads from {frame!r}{way}; expected frames of one tree on /tf and "
-            f"/tf_static, which have {some}",
+            f"TF: no way leads from {frame!r}{target_text}; expected frames of one tree on /tf and "
+            f"/tf_static, which have {frames_text}",
             known[:MAX_FRAMES_IN_ERROR],
             frame,
         )
@@ -307,21 +307,21 @@ class TransformListener:
 
 def _until_shared(chain: list[_FrameLink], frame: str, shared: set[str]) -> list[_FrameLink]:
     """Return the links of a chain up to the first shared frame."""
-    found: list[_FrameLink] = []
-    for one in chain:
+    links: list[_FrameLink] = []
+    for link in chain:
         if frame in shared:
             break
-        found.append(one)
-        frame = one.parent
-    return found
+        links.append(link)
+        frame = link.parent
+    return links
 
 
 def _product(chain: list[_FrameLink], frame: str, at: float | None) -> Transform:
     """Return the pose of a frame in the last parent of its chain."""
-    found = Transform(frame, frame, np.eye(3), np.zeros(3))
-    for one in chain:
-        found = one.at(0.0 if at is None else at).undated() @ found
-    return found
+    transform = Transform(frame, frame, np.eye(3), np.zeros(3))
+    for link in chain:
+        transform = link.at(0.0 if at is None else at).undated() @ transform
+    return transform
 
 
 def _transform(link: _FrameLink, message: Any, utc: float | None) -> Transform:

@@ -32,7 +32,7 @@ class CameraFrames:
     """The names of a camera's frames, for its messages and ``/tf_static``.
 
     Args:
-        frame_id: name of the camera's frame, that of its results without a calibration.
+        frame_id: name of the camera's frame, the frame of its results without a calibration.
         calibration: calibration of the camera's settings, or one for each application; None
             without.
         place: hand-eye calibration of the camera; None without.
@@ -80,14 +80,14 @@ class CameraFrames:
 
         If there are several applications, each one's child has ``_APPLICATION`` at its end.
         """
-        found = [] if self._place is None else [self._of_pictures(self._place)]
+        transforms = [] if self._place is None else [self._of_pictures(self._place)]
         if self._calibrated_at is not None:
             seen_from = self._calibrated_at.inverse()
-            return [*found, _named(seen_from, self._flange or seen_from.target, self.robot)]
+            return [*transforms, _named(seen_from, self._flange or seen_from.target, self.robot)]
         for application, calibration in self._calibrations.items():
             end = "" if application is None else f"_{application}"
-            found += self._of_plane(calibration, end)
-        return found
+            transforms += self._of_plane(calibration, end)
+        return transforms
 
     def _of_pictures(self, place: Any) -> Transform:
         pose: Transform = place.camera_pose
@@ -114,8 +114,10 @@ def _named(transform: Transform, parent: str, child: str) -> Transform:
 
 def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
     """Return ``geometry_msgs/TransformStamped``: the source's pose in the target, its parent."""
-    x, y, z, w = (float(one) for one in transform.quaternion / np.linalg.norm(transform.quaternion))
-    across, down, ahead = (float(one) for one in transform.translation)
+    x, y, z, w = (
+        float(number) for number in transform.quaternion / np.linalg.norm(transform.quaternion)
+    )
+    across, down, ahead = (float(number) for number in transform.translation)
     return {
         "header": {"stamp": stamp_fields(utc), "frame_id": transform.target},
         "child_frame_id": transform.source,
@@ -172,22 +174,29 @@ class StaticTransforms:
 
     def _publish(self) -> None:
         now = time.time()
-        self._publisher.publish(transforms=[transform_fields(one, now) for one in self._transforms])
+        self._publisher.publish(
+            transforms=[transform_fields(transform, now) for transform in self._transforms]
+        )
 
 
 def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
-    kept: dict[str, Transform] = {}
-    for one in transforms:
-        for name in (one.target, one.source):
+    checked: dict[str, Transform] = {}
+    for transform in transforms:
+        for name in (transform.target, transform.source):
             if not name or name.startswith("/"):
                 raise ConfigurationError(
-                    f"tf: {one.label}: expected names of frames without / in front, got {name!r}"
+                    f"tf: {transform.label}: expected names of frames without / in front, "
+                    f"got {name!r}"
                 )
-        if one.target == one.source or one.source in kept:
-            other = kept[one.source].target if one.source in kept else one.target
-            raise ConfigurationError(
-                f"tf: {one.source}: expected one parent that is another frame, got {one.target} "
-                f"and {other}"
+        if transform.target == transform.source or transform.source in checked:
+            other = (
+                checked[transform.source].target
+                if transform.source in checked
+                else transform.target
             )
-        kept[one.source] = one
-    return tuple(kept.values())
+            raise ConfigurationError(
+                f"tf: {transform.source}: expected one parent that is another frame, "
+                f"got {transform.target} and {other}"
+            )
+        checked[transform.source] = transform
+    return tuple(checked.values())

@@ -24,8 +24,8 @@ class NativeGraph:
 
     def nodes(self) -> list[str]:
         """Return the full names of all nodes, as ``ros2 node list``."""
-        found = self._ask("get_node_names_and_namespaces")
-        return sorted(full_name(namespace, name) for name, namespace in found)
+        names = self._ask("get_node_names_and_namespaces")
+        return sorted(full_name(namespace, name) for name, namespace in names)
 
     def topics(self) -> dict[str, list[str]]:
         """Return the types of each topic by its name, as ``ros2 topic list -t``."""

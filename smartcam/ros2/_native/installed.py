@@ -48,15 +48,15 @@ def class_of(name: str) -> Any:
     Args:
         name: name of the type, such as ``std_msgs/msg/String``.
     """
-    package, kind, own = name.split("/")
+    package, kind, type_name = name.split("/")
     check = rclpy("type_support").check_for_type_support
     try:
-        found = getattr(importlib.import_module(f"{package}.{kind}"), own)
-        for one in (found.Request, found.Response) if kind == "srv" else (found,):
-            check(one)
+        class_ = getattr(importlib.import_module(f"{package}.{kind}"), type_name)
+        for message_class in (class_.Request, class_.Response) if kind == "srv" else (class_,):
+            check(message_class)
     except (ImportError, AttributeError, rclpy("exceptions").NoTypeSupportImportedException):
         return None
-    return found
+    return class_
 
 
 def checked_message(kind: MessageType) -> Any:
@@ -65,10 +65,10 @@ def checked_message(kind: MessageType) -> Any:
     Raises:
         ConfigurationError: its fields differ from smartcam's.
     """
-    found = class_of(kind.name)
-    if found is not None:
-        _compare(kind, found)
-    return found
+    class_ = class_of(kind.name)
+    if class_ is not None:
+        _compare(kind, class_)
+    return class_
 
 
 def checked_service(kind: ServiceType) -> Any:
@@ -77,20 +77,22 @@ def checked_service(kind: ServiceType) -> Any:
     Raises:
         ConfigurationError: its fields differ from smartcam's.
     """
-    found = class_of(kind.name)
-    if found is not None:
-        _compare(kind.request, found.Request)
-        _compare(kind.response, found.Response)
-    return found
+    class_ = class_of(kind.name)
+    if class_ is not None:
+        _compare(kind.request, class_.Request)
+        _compare(kind.response, class_.Response)
+    return class_
 
 
-def _compare(kind: MessageType, found: Any) -> None:
+def _compare(kind: MessageType, class_: Any) -> None:
     ours = [field.name for field in kind.fields]
-    theirs = [one for one in found.get_fields_and_field_types() if one != EMPTY_FIELD]
-    if ours != theirs:
+    actual_kinds = [kind for kind in class_.get_fields_and_field_types() if kind != EMPTY_FIELD]
+    if ours != actual_kinds:
         raise ConfigurationError(
-            f"{kind.name}: the ROS that is installed has the fields {', '.join(theirs)}: expected "
-            f"{', '.join(ours)}; say its distribution, or build the package of this smartcam"
+            f"{kind.name}: the ROS that is installed has the fields "
+            f"{', '.join(actual_kinds)}: "
+            f"expected {', '.join(ours)}; name its distribution, or "
+            f"build the package of this smartcam"
         )
 
 

@@ -34,7 +34,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 OPEN_TIMEOUT = 60.0
 """Seconds for rclpy to make a node; a busy machine takes long to import rclpy for the first one."""
 
-TELL_MISSING_AFTER = 1.0
+MISSING_LOG_DELAY = 1.0
 """Seconds after which missing packages are logged, all at once."""
 
 BILLION = 1_000_000_000
@@ -52,7 +52,7 @@ class NativeNode(NamedNode):
         name: name of the node, of letters, digits and ``_``.
         namespace: namespace of the node, such as ``/line1``.
         context: context shared with other nodes of this process; None for its own.
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``.
         managed: whether the node has a life cycle, which :meth:`manage` then has to follow.
 
     Attributes:
@@ -163,15 +163,15 @@ class NativeNode(NamedNode):
         spun = self._spun
         if spun is None:
             return
-        self._tell_missing()
-        services = [one for one in self._ends if isinstance(one, NativeService)]
+        self._report_missing()
+        services = [endpoint for endpoint in self._ends if isinstance(endpoint, NativeService)]
         for end in tuple(self._ends):
             end.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await self.parameters.close()
-                for one in services:
-                    await one.wait_closed()
+                for service in services:
+                    await service.wait_closed()
                 await asyncio.to_thread(self.outbox.close, CLOSE_TIMEOUT / 2)
         except TimeoutError:
             pass  # the handler's author must end it at cancellation
@@ -234,17 +234,17 @@ class NativeNode(NamedNode):
         except Exception as exc:
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
-    def unmade(self, what: str, end: Any) -> None:
+    def unmade(self, end_text: str, end: Any) -> None:
         """Destroy an endpoint of rclpy."""
         ros = self.ros
         if ros is not None:
-            getattr(ros, f"destroy_{what}")(end)
+            getattr(ros, f"destroy_{end_text}")(end)
 
     def forget(self, end: Any) -> None:
         """Note that an endpoint was closed."""
         self._ends.discard(end)
 
-    def _kept(self, end: End) -> End:
+    def _with_end(self, end: End) -> End:
         self._ends.add(end)
         return end
 
@@ -266,7 +266,7 @@ class NativeNode(NamedNode):
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         cls = checked_message(kind)
         self._note_missing(cls, type, name)
-        return self._kept(NativePublisher(self, name, kind, qos, cls))
+        return self._with_end(NativePublisher(self, name, kind, qos, cls))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -274,7 +274,7 @@ class NativeNode(NamedNode):
         Args:
             topic: name of the topic, absolute, relative to the namespace, or private (``~/it``).
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service; its depth is that of the queue.
+            qos: quality of service; its depth is the queue's length.
 
         Raises:
             ConfigurationError: the topic is not valid, or the type is not built for this ROS.
@@ -282,7 +282,7 @@ class NativeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         cls = self._built(checked_message(kind), type)
-        return self._kept(NativeSubscription(self, name, kind, qos, cls))
+        return self._with_end(NativeSubscription(self, name, kind, qos, cls))
 
     def serve(
         self,
@@ -296,7 +296,7 @@ class NativeNode(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields.
@@ -311,13 +311,13 @@ class NativeNode(NamedNode):
         kind, name = self.types.service(type), self._resolved(service, "service")
         cls = checked_service(kind)
         self._note_missing(cls, type, name)
-        return self._kept(NativeService(self, name, kind, cls, handler, timeout))
+        return self._with_end(NativeService(self, name, kind, cls, handler, timeout))
 
     def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> NativeClient:
         """Return a client that calls a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             qos: quality of service; ROS' own for services is used.
 
@@ -327,7 +327,9 @@ class NativeNode(NamedNode):
         """
         del qos
         kind, name = self.types.service(type), self._resolved(service, "service")
-        return self._kept(NativeClient(self, name, kind, self._built(checked_service(kind), type)))
+        return self._with_end(
+            NativeClient(self, name, kind, self._built(checked_service(kind), type))
+        )
 
     def manage(self, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]) -> NativeLifecycle:
         """Make ROS' own life cycle follow one of smartcam's.
@@ -358,9 +360,9 @@ class NativeNode(NamedNode):
         self._missing.setdefault(type.partition("/")[0], []).append(name)
         if self._telling is None:
             loop = asyncio.get_running_loop()
-            self._telling = loop.call_later(TELL_MISSING_AFTER, self._tell_missing)
+            self._telling = loop.call_later(MISSING_LOG_DELAY, self._report_missing)
 
-    def _tell_missing(self) -> None:
+    def _report_missing(self) -> None:
         if self._telling is not None:
             self._telling.cancel()
             self._telling = None

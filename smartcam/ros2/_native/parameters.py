@@ -47,7 +47,7 @@ class NativeParameters(RosParameters):
         self.undeclare(SIM_TIME)
         self._native = node
         self._ros: Any = None
-        self._own = threading.local()  # set while this object sets a value in rclpy
+        self._own_change = threading.local()  # set while this object sets a value in rclpy
 
     def open(self) -> None:
         """Declare the parameters in ROS."""
@@ -63,34 +63,34 @@ class NativeParameters(RosParameters):
 
     # ------------------------------------------------------------------ from here to ROS
 
-    def _tell(self, **what: Any) -> None:
+    def _change_parameters(self, **lists: Any) -> None:
         """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
-        for name in what.get("new", ()):
+        for name in lists.get("new", ()):
             self._declare_in_ros(name)
-        changed = what.get("changed", ())
+        changed = lists.get("changed", ())
         if changed and not _asked_by_ros.get():
-            self._put(lambda: self._ros.set_parameters([self._parameter(one) for one in changed]))
-        for name in what.get("deleted", ()):
+            self._put(lambda: self._ros.set_parameters([self._parameter(name) for name in changed]))
+        for name in lists.get("deleted", ()):
             if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
                 self._put(lambda name=name: self._ros.undeclare_parameter(name))
 
     def _put(self, do: Any) -> Any:
-        self._own.now = True
+        self._own_change.now = True
         try:
             return do()
         except Exception as exc:  # noqa: BLE001 - rclpy may raise any error
             logger.warning("%s ! a parameter: %s", self._native.full_name, exc)
         finally:
-            self._own.now = False
+            self._own_change.now = False
 
     def _declare_in_ros(self, name: str) -> None:
         description = self.describe(name)
         kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
         descriptor = to_ros(kind, description.encode(), class_of(kind.name))
         given = self._parameter(name)
-        self._own.now = True
+        self._own_change.now = True
         try:
             made = self._ros.declare_parameter(
                 name, given.value, descriptor, ignore_override=description.read_only
@@ -99,7 +99,7 @@ class NativeParameters(RosParameters):
             del self._declared[name]
             raise ConfigurationError(f"parameter {name!r}: {exc!s:.300}") from exc
         finally:
-            self._own.now = False
+            self._own_change.now = False
         if made.value != given.value:
             self._begin_with(name, decode_value(made.get_parameter_value()))
 
@@ -113,7 +113,7 @@ class NativeParameters(RosParameters):
             except SmartCamError as exc:
                 logger.warning("%s ! parameter %s: %s", self._native.full_name, name, exc)
                 _asked_by_ros.set(False)
-                self._tell(changed=[name])
+                self._change_parameters(changed=[name])
 
         task = asyncio.get_running_loop().create_task(begin())
         self._tasks.add(task)
@@ -123,7 +123,7 @@ class NativeParameters(RosParameters):
         value = self._of(name).value
         plain: Any = value.value
         if isinstance(plain, bytes):
-            plain = [bytes([one]) for one in plain]
+            plain = [bytes([byte]) for byte in plain]
         kinds = rclpy("parameter").Parameter
         plain = list(plain) if isinstance(plain, tuple) else plain
         return kinds(name, kinds.Type(value.number), plain)
@@ -133,10 +133,10 @@ class NativeParameters(RosParameters):
     def _on_set(self, parameters: Sequence[Any]) -> Any:
         """Accept or refuse values; called in the thread that sets them, which waits for hooks."""
         result = class_of("rcl_interfaces/msg/SetParametersResult")
-        if getattr(self._own, "now", False):
+        if getattr(self._own_change, "now", False):
             return result(successful=True)
         try:
-            self._carry_out({one.name: one for one in parameters})
+            self._carry_out({parameter.name: parameter for parameter in parameters})
         except concurrent.futures.CancelledError:
             return result(successful=False, reason=f"{self._native.full_name} is closed")
         except TimeoutError:
@@ -151,8 +151,8 @@ class NativeParameters(RosParameters):
 
     def _carry_out(self, given: Mapping[str, Any]) -> None:
         values = {
-            name: decode_value(one.get_parameter_value())
-            for name, one in given.items()
+            name: decode_value(value.get_parameter_value())
+            for name, value in given.items()
             if self.find(name) is not None  # others are rclpy's own
         }
         if not values:

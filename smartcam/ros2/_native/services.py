@@ -14,7 +14,7 @@ from smartcam.ros2._native.spinning import NoReplyError
 from smartcam.ros2._native.topics import profile_of
 from smartcam.ros2._node.qos import QoS
 from smartcam.ros2._node.refusals import refusal
-from smartcam.ros2._node.services import LOOK_AGAIN, MAX_CONCURRENT_CALLS
+from smartcam.ros2._node.services import MAX_CONCURRENT_CALLS, SERVER_POLL_INTERVAL
 from smartcam.ros2._node.topics import message_of
 
 if TYPE_CHECKING:
@@ -107,21 +107,21 @@ class ServiceCalls:
         try:
             async with asyncio.timeout(self._timeout):
                 reply = await self._handler(self._kind.request.decode(data, whole=False))
-            found: bytes | None = self._kind.response.encode(message_of(reply, {}))
+            encoded: bytes | None = self._kind.response.encode(message_of(reply, {}))
         except asyncio.CancelledError:
             self._answer(answered, self._refused("the call was cancelled"))
             raise
         except TimeoutError as exc:
             given_up = f"no answer in {self._timeout:g} s"
-            found = self._refused(str(exc) if isinstance(exc, SmartCamError) else given_up)
+            encoded = self._refused(str(exc) if isinstance(exc, SmartCamError) else given_up)
         except SmartCamError as exc:
-            found = self._refused(str(exc))
+            encoded = self._refused(str(exc))
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:
             logger.exception("%s ! its handler failed", self._name)
-            found = self._refused(f"{type(exc).__name__}: {exc}")
-        self._answer(answered, found)
+            encoded = self._refused(f"{type(exc).__name__}: {exc}")
+        self._answer(answered, encoded)
 
     def _refused(self, why: str) -> bytes | None:
         self.failed += 1
@@ -229,7 +229,7 @@ class NativeClient:
             async with asyncio.timeout(timeout):
                 while not self.served:
                     self._check_open()
-                    await asyncio.sleep(LOOK_AGAIN)
+                    await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} within {timeout:g} s",
@@ -266,10 +266,10 @@ class NativeClient:
         await self.wait_served(timeout)
         reply: asyncio.Future[Any] = loop.create_future()
         self._waiting.add(reply)
-        asked = self._ask(message, reply)
+        pending = self._ask(message, reply)
         try:
             async with asyncio.timeout_at(deadline):
-                found = await reply
+                reply_message = await reply
         except TimeoutError as exc:
             raise ServiceTimeoutError(
                 f"{self.name}: no reply within {timeout:g} s; whether the call was carried out is "
@@ -278,25 +278,25 @@ class NativeClient:
             ) from exc
         finally:
             self._waiting.discard(reply)
-            self._raw.remove_pending_request(asked)
-        data = rclpy("serialization").serialize_message(found)
+            self._raw.remove_pending_request(pending)
+        data = rclpy("serialization").serialize_message(reply_message)
         return self.type.response.decode(data, whole=False)
 
     def _ask(self, message: Any, reply: asyncio.Future[Any]) -> Any:
-        def take(found: Any) -> None:
+        def take(reply_message: Any) -> None:
             if not reply.done():
-                reply.set_result(found)
+                reply.set_result(reply_message)
 
         try:
-            asked = self._raw.call_async(message)
+            future = self._raw.call_async(message)
         except Exception as exc:
             self._waiting.discard(reply)
             text = f"{self.name}: {type(exc).__name__}: {exc!s:.300}"
             raise ServiceCallError(text, service=self.name) from exc
-        asked.add_done_callback(
+        future.add_done_callback(
             lambda done: None if done.cancelled() else self._node.in_loop(take, done.result())
         )
-        return asked
+        return future
 
     def fail(self, why: str) -> None:
         """End running calls."""

@@ -24,10 +24,10 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 EXECUTOR_THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
-LOOK_INTERVAL = 1.0
+CHECK_INTERVAL = 1.0
 """Seconds between two checks of a spinning thread whether its event loop still runs."""
 
-AFTER_ERROR = 0.05
+ERROR_PAUSE = 0.05
 """Seconds for which a spinning thread pauses after an error, so that a repeated one is cheap."""
 
 EXIT_TIMEOUT = 2.0
@@ -45,7 +45,7 @@ class NativeContext:
     """The context of rclpy that nodes share, opened by the first node.
 
     Args:
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the distribution whose messages are used; "": that of the installed
             ROS, as far as it is known.
         args: arguments for ROS, such as ``--ros-args -p use_sim_time:=true``.
@@ -200,12 +200,12 @@ class SpunNode:
         try:
             context = self._context.open()
         except BaseException as exc:  # noqa: BLE001 - passed to start()
-            self.in_loop(self._tell, exc)
+            self.in_loop(self._report_error, exc)
             _open.discard(self)
             return
         try:
             self._make(context)
-            self.in_loop(self._tell, None)
+            self.in_loop(self._report_error, None)
             why = self._spin(context)
         except BaseException as exc:  # noqa: BLE001 - passed to start(), or to on_end
             why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
@@ -213,10 +213,10 @@ class SpunNode:
             self._close()
             self._context.close()
             _open.discard(self)
-            self.in_loop(self._tell, why)
+            self.in_loop(self._report_error, why)
             self.in_loop(self._on_end, why)
 
-    def _tell(self, error: BaseException | None) -> None:
+    def _report_error(self, error: BaseException | None) -> None:
         if self._made.done():
             return
         if error is None:
@@ -242,7 +242,7 @@ class SpunNode:
             if not context.ok():
                 return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
             try:
-                self.executor.spin_once(LOOK_INTERVAL)
+                self.executor.spin_once(CHECK_INTERVAL)
             except shut_down:
                 continue
             except NoReplyError:
@@ -258,7 +258,7 @@ class SpunNode:
             self._logged.add(text)
             level = logging.DEBUG if closed else logging.WARNING
             logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)
-        time.sleep(AFTER_ERROR)
+        time.sleep(ERROR_PAUSE)
 
     def _close(self) -> None:
         with contextlib.suppress(Exception):  # the handles end with their context
@@ -294,5 +294,5 @@ _open: weakref.WeakSet[SpunNode] = weakref.WeakSet()
 
 @atexit.register
 def _abandon() -> None:
-    for one in tuple(_open):
-        one.abandon()
+    for future in tuple(_open):
+        future.abandon()

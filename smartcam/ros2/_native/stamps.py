@@ -33,7 +33,7 @@ class RosStamps:
 
     def __init__(self, shift: Callable[[], float]) -> None:
         self._shift = shift
-        self._known: collections.OrderedDict[int, int] = collections.OrderedDict()
+        self._arrival_times: collections.OrderedDict[int, int] = collections.OrderedDict()
         self._lock = threading.Lock()
 
     def moved(self, kind: MessageType, data: bytes) -> bytes:
@@ -47,12 +47,12 @@ class RosStamps:
 
     def _moved(self, stamp: int) -> int:
         with self._lock:
-            known = self._known.get(stamp)
+            known = self._arrival_times.get(stamp)
             if known is None:
                 known = max(0, stamp + round(self._shift() * BILLION))
-                self._known[stamp] = known
-                if len(self._known) > MAX_STAMPS:
-                    self._known.popitem(last=False)
+                self._arrival_times[stamp] = known
+                if len(self._arrival_times) > MAX_STAMPS:
+                    self._arrival_times.popitem(last=False)
             return known
 
 
@@ -62,8 +62,8 @@ def headers(kind: MessageType, message: Any) -> Iterator[Any]:
         if not field.nested:
             continue
         value = getattr(message, field.attribute)
-        for one in value if field.shape else (value,):
+        for header in value if field.shape else (value,):
             if field.type == HEADER:
-                yield one
+                yield header
             else:
-                yield from headers(kind.nested[field.type], one)
+                yield from headers(kind.nested[field.type], header)

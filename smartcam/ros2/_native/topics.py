@@ -28,9 +28,9 @@ def profile_of(qos: QoS) -> Any:
     more: dict[str, Any] = {}
     if math.isfinite(qos.lifespan):
         more["lifespan"] = rclpy("duration").Duration(seconds=qos.lifespan)
-    kept = qos.depth is not None
+    keeps_last = qos.depth is not None
     return kinds.QoSProfile(
-        history=kinds.HistoryPolicy.KEEP_LAST if kept else kinds.HistoryPolicy.KEEP_ALL,
+        history=kinds.HistoryPolicy.KEEP_LAST if keeps_last else kinds.HistoryPolicy.KEEP_ALL,
         depth=qos.kept,
         reliability=reliable.RELIABLE if qos.reliable else reliable.BEST_EFFORT,
         durability=durable.TRANSIENT_LOCAL if qos.latched else durable.VOLATILE,
@@ -64,7 +64,7 @@ class NativePublisher:
             self._raw = node.made(lambda ros: ros.create_publisher(cls, name, profile_of(qos)))
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed or self._raw is None:
             return False
@@ -106,18 +106,18 @@ class NativePublisher:
         self._check_open()
         if self._raw is None:
             return
-        what = message_of(message, fields)
+        encoded = message_of(message, fields)
         done = asyncio.Event()
         failed: list[Exception] = []
 
-        def say() -> None:
+        def publish() -> None:
             try:
-                self._pass_on(self.type.encode(what))
+                self._pass_on(self.type.encode(encoded))
             except Exception as exc:  # noqa: BLE001 - passed to the waiting task
                 failed.append(exc)
             self._node.in_loop(done.set)
 
-        self._node.outbox.put(say)
+        self._node.outbox.put(publish)
         await done.wait()
         if failed:
             raise failed[0]

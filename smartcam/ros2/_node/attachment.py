@@ -40,10 +40,10 @@ class Attachment(NamedTuple):
             RosMessageError: there is no attachment, or it has another form.
         """
         if data is None or len(data) != _FORM.size or data[16] != GID_BYTES:
-            got = "nothing" if data is None else f"{len(data)} bytes, {data[:48].hex()}"
+            actual = "nothing" if data is None else f"{len(data)} bytes, {data[:48].hex()}"
             raise RosMessageError(
                 f"attachment: expected {_FORM.size} bytes (number, time, {GID_BYTES}, GID), "
-                f"got {got}"
+                f"got {actual}"
             )
         number, when, _, gid = _FORM.unpack(data)
         if number < 0 or when < 0:

@@ -77,7 +77,7 @@ class RosContext:
         session: open session of Zenoh, which stays open; None for an own session.
         connect: endpoints that an own session connects to.
         listen: endpoints that an own session listens on, which makes it the router.
-        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        domain: number of the domain; None for the value of the variable ``ROS_DOMAIN_ID``, or 0.
         distribution: name of the ROS distribution whose messages and type hashes are used.
 
     Raises:
@@ -98,9 +98,9 @@ class RosContext:
         self.types: RosTypes = RosTypes(distribution)
         self._owns = session is None
         if session is None:
-            heard = _endpoints(listen)
-            link = BusLink(heard, () if heard else _endpoints(connect))
-            session = ZenohSession(link, SETTINGS, what="ROS 2")
+            listening = _endpoints(listen)
+            link = BusLink(listening, () if listening else _endpoints(connect))
+            session = ZenohSession(link, SETTINGS, bus_text="ROS 2")
         self.zenoh: ZenohSession = session
         self.graph: RosGraph = RosGraph(self.domain)
         self.zid: str = ""
@@ -113,7 +113,7 @@ class RosContext:
         self._long: collections.Counter[object] = collections.Counter()
         self._in_lane: collections.Counter[str] = collections.Counter()
         self._calm_since, self._direct_messages, self._crowded = 0.0, 0, 0.0
-        self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
+        self._slots = itertools.cycle(NewestSlot(priority) for priority in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:
@@ -183,12 +183,12 @@ class RosContext:
         Returns:
             A function that ends this.
         """
-        found = self._watchers.setdefault((name, kind), [])
-        found.append(watcher)
+        watchers = self._watchers.setdefault((name, kind), [])
+        watchers.append(watcher)
 
         def end() -> None:
-            found.remove(watcher)
-            if not found and self._watchers.get((name, kind)) is found:
+            watchers.remove(watcher)
+            if not watchers and self._watchers.get((name, kind)) is watchers:
                 del self._watchers[name, kind]
 
         return end
@@ -197,8 +197,8 @@ class RosContext:
         for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
             watcher(other, present)
         if present and other.kind in OTHER_END:
-            for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
-                self._differ(one, other)
+            for end_of_other in self._ends.get((other.name, OTHER_END[other.kind]), ()):
+                self._differ(end_of_other, other)
 
     def _differ(self, one: Entity, other: Entity) -> None:
         if (one.type, one.hash) != (other.type, other.hash):
@@ -237,7 +237,7 @@ class RosContext:
         return self._direct_messages <= MAX_DIRECT
 
     def send_later(self, owner: object, send: Callable[[], None], lane: str) -> None:
-        """Call ``say`` in the thread of a lane, where it may wait for room; in order."""
+        """Call ``send`` in the thread of a lane, where it may wait for room; in order."""
         thread = self._threads.get(lane)
         if thread is None:
             thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")

@@ -88,7 +88,7 @@ class RosGraph:
             del ends[token]
             if not ends:
                 del self._by_name[known.name, known.kind]
-            self._tell(known, False)
+            self._notify_watchers(known, False)
             return
         try:
             entity = Entity.parse(token)
@@ -103,9 +103,9 @@ class RosGraph:
         self._entities[token] = entity
         self._by_gid[entity.gid] = entity
         self._by_name.setdefault((entity.name, entity.kind), {})[token] = entity
-        self._tell(entity, True)
+        self._notify_watchers(entity, True)
 
-    def _tell(self, entity: Entity, present: bool) -> None:
+    def _notify_watchers(self, entity: Entity, present: bool) -> None:
         for listener in tuple(self._listeners):
             try:
                 listener(entity, present)
@@ -125,7 +125,7 @@ class RosGraph:
 
     def nodes(self) -> list[str]:
         """Return the full names of all nodes, as ``ros2 node list``."""
-        return sorted(one.full_node for one in self if one.kind == NODE)
+        return sorted(entity.full_node for entity in self if entity.kind == NODE)
 
     def topics(self) -> dict[str, list[str]]:
         """Return the types of each topic by its name, as ``ros2 topic list -t``."""
@@ -147,14 +147,14 @@ class RosGraph:
 
     def of_node(self, full_name: str) -> list[Entity]:
         """Return the endpoints of a node, as ``ros2 node info``."""
-        return [one for one in self if one.kind != NODE and one.full_node == full_name]
+        return [entity for entity in self if entity.kind != NODE and entity.full_node == full_name]
 
     def _types(self, kinds: set[str]) -> dict[str, list[str]]:
-        found: dict[str, set[str]] = {}
-        for one in self:
-            if one.kind in kinds:
-                found.setdefault(one.name, set()).add(one.ros_type)
-        return {name: sorted(found[name]) for name in sorted(found)}
+        types: dict[str, set[str]] = {}
+        for entity in self:
+            if entity.kind in kinds:
+                types.setdefault(entity.name, set()).add(entity.ros_type)
+        return {name: sorted(types[name]) for name in sorted(types)}
 
 
 OTHER_END = {PUBLISHER: SUBSCRIPTION, SUBSCRIPTION: PUBLISHER, SERVICE: CLIENT, CLIENT: SERVICE}

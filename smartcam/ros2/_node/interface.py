@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class PublisherEnd(Protocol):
     """A publisher of a topic.
 
-    It may also have ``heard``, True if the topic has a subscriber as far as is known;
+    It may also have ``has_subscribers``, True if the topic has a subscriber as far as is known;
     ``publish_encoded`` for an encoded message; and ``publish_newest`` for pictures, of which a slow
     subscriber gets only the newest.
     """

@@ -127,7 +127,7 @@ class Lifecycle:
         self.name: str = name
         self.state: LifecycleState = UNCONFIGURED
         self._work, self._timeout = work, timeout
-        self._heard: list[Callable[[LifecycleTransition], None]] = []
+        self._listeners: list[Callable[[LifecycleTransition], None]] = []
         self._task: asyncio.Task[None] | None = None
         self.closed: bool = False
 
@@ -139,12 +139,14 @@ class Lifecycle:
     @property
     def available(self) -> list[LifecycleTransition]:
         """The transitions that begin at the current state."""
-        return [one for one in TRANSITIONS if one.start is self.state]
+        return [transition for transition in TRANSITIONS if transition.start is self.state]
 
-    def listen(self, heard: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
-        """Call ``heard`` after each step; return a function that ends this."""
-        self._heard.append(heard)
-        return lambda: self._heard.remove(heard) if heard in self._heard else None
+    def listen(self, on_transition: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
+        """Call ``on_transition`` after each step; return a function that ends this."""
+        self._listeners.append(on_transition)
+        return lambda: (
+            self._listeners.remove(on_transition) if on_transition in self._listeners else None
+        )
 
     async def settled(self) -> None:
         """Wait for the end of a running transition.
@@ -218,17 +220,24 @@ class Lifecycle:
             task.cancel()
             await asyncio.wait((task,))
         for label in ("shutdown", SUCCESS):
-            step = next((one for one in self.available if one.label == label), None)
+            step = next(
+                (transition for transition in self.available if transition.label == label), None
+            )
             if step is not None and self.state is not FINALIZED:
                 self._enter(step)
 
     def _find(self, label: str, number: int) -> LifecycleTransition:
-        possible = [one for one in self.available if one.id < PRIVATE]
-        for one in possible:
-            if not self.closed and (one.label == label if label else one.id == number):
-                return one
+        possible = [transition for transition in self.available if transition.id < PRIVATE]
+        for transition in possible:
+            if not self.closed and (
+                transition.label == label if label else transition.id == number
+            ):
+                return transition
         wanted = repr(label[:40]) if label else f"transition {number}"
-        ways = ", ".join(f"{one.label} ({one.id})" for one in possible) or "nothing"
+        ways = (
+            ", ".join(f"{transition.label} ({transition.id})" for transition in possible)
+            or "nothing"
+        )
         state = "closed" if self.closed else self.state.label
         raise RosError(f"{self.name}: {wanted}: it is {state}, where {ways} can be asked for")
 
@@ -265,15 +274,15 @@ class Lifecycle:
             task.exception()
 
     def _follow(self, label: str) -> None:
-        self._enter(next(one for one in self.available if one.label == label))
+        self._enter(next(transition for transition in self.available if transition.label == label))
 
     def _enter(self, transition: LifecycleTransition) -> None:
         self.state = transition.goal
         if self.state.id < PRIVATE:
             logger.info("%s = %s", self.name, self.state.label)
-        for heard in tuple(self._heard):
+        for on_transition in tuple(self._listeners):
             try:
-                heard(transition)
+                on_transition(transition)
             except ENDS_PROGRAM:
                 raise
             except BaseException:

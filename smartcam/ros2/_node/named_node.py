@@ -46,17 +46,17 @@ class NamedNode(Server):
         if not self.is_open:
             raise RosError(f"{self.full_name}: the node is not open")
 
-    def _resolved(self, name: str, what: str) -> str:
+    def _resolved(self, name: str, kind_text: str) -> str:
         """Return the absolute name of a topic or a service of the open node.
 
         Args:
             name: name that is absolute, relative to the namespace, or private (``~/it``).
-            what: kind of the thing named, for error texts.
+            kind_text: kind of the thing named, for error texts.
 
         Raises:
             ConfigurationError: the name is not valid.
             RosError: the node is not open.
         """
-        full = resolve(name, self.namespace, self.name, what)
+        full = resolve(name, self.namespace, self.name, kind_text)
         self.check_open()
         return full

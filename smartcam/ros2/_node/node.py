@@ -139,15 +139,15 @@ class Node(NamedNode):
         token, self._token = self._token, None
         if token is None:
             return
-        services = [one for one in self._ends if isinstance(one, RosService)]
+        services = [endpoint for endpoint in self._ends if isinstance(endpoint, RosService)]
         for end in tuple(self._ends):
             end.close()
         token.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await self.parameters.close()
-                for one in services:
-                    await one.wait_closed()
+                for service in services:
+                    await service.wait_closed()
         except TimeoutError:
             pass  # the handler's author must end it at cancellation
         finally:
@@ -169,7 +169,7 @@ class Node(NamedNode):
         """
         kind = self.types.message(type)
         entity = self._end(PUBLISHER, topic, "topic", kind.dds, kind.hash, qos)
-        return self._kept(RosPublisher(self.context, entity, kind, self._ends.discard))
+        return self._with_end(RosPublisher(self.context, entity, kind, self._ends.discard))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -177,7 +177,7 @@ class Node(NamedNode):
         Args:
             topic: name of the topic: absolute, relative to the namespace, or private (``~/it``).
             type: type of the messages, such as ``std_msgs/msg/String``.
-            qos: quality of service; its depth is that of the queue.
+            qos: quality of service; its depth is the queue's length.
 
         Raises:
             ConfigurationError: the topic is not valid, or there is no such type.
@@ -185,7 +185,7 @@ class Node(NamedNode):
         """
         kind = self.types.message(type)
         entity = self._end(SUBSCRIPTION, topic, "topic", kind.dds, kind.hash, qos)
-        return self._kept(RosSubscription(self.context, entity, kind, self._ends.discard))
+        return self._with_end(RosSubscription(self.context, entity, kind, self._ends.discard))
 
     def serve(
         self,
@@ -199,7 +199,7 @@ class Node(NamedNode):
         """Serve a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             handler: coroutine function that takes each request and returns the response, or a
                 mapping of its fields; its error is logged, and is in the response if that has
@@ -213,7 +213,7 @@ class Node(NamedNode):
         """
         kind = self.types.service(type)
         entity = self._end(SERVICE, service, "service", kind.dds, kind.hash, qos)
-        return self._kept(
+        return self._with_end(
             RosService(self.context, entity, kind, handler, timeout, self._ends.discard)
         )
 
@@ -221,7 +221,7 @@ class Node(NamedNode):
         """Return a client that calls a service.
 
         Args:
-            service: name of the service, resolved as that of a topic.
+            service: name of the service, resolved like a topic's name.
             type: type of the service, such as ``std_srvs/srv/Trigger``.
             qos: quality of service.
 
@@ -231,7 +231,7 @@ class Node(NamedNode):
         """
         kind = self.types.service(type)
         entity = self._end(CLIENT, service, "service", kind.dds, kind.hash, qos)
-        return self._kept(RosClient(self.context, entity, kind, self._ends.discard))
+        return self._with_end(RosClient(self.context, entity, kind, self._ends.discard))
 
     def parameters_of(self, name: str, *, timeout: float = CALL_TIMEOUT) -> ParameterClient:
         """Return a client that lists, gets, describes and sets another node's parameters.
@@ -247,7 +247,7 @@ class Node(NamedNode):
             self.client, resolve(name, self.namespace, self.name, "node"), timeout
         )
 
-    def _kept(self, end: End) -> End:
+    def _with_end(self, end: End) -> End:
         self._ends.add(end)
         return end
 
@@ -255,12 +255,12 @@ class Node(NamedNode):
         self,
         kind: Kind,
         name: str,
-        what: str,
+        kind_text: str,
         dds: str,
         hashed: str,
         qos: QoS,
     ) -> Entity:
-        full = self._resolved(name, what)
+        full = self._resolved(name, kind_text)
         return self._entity(kind, self.context.next_id(), full, dds, hashed, qos)
 
     def _entity(self, kind: Kind, number: int, *more: Any) -> Entity:

@@ -63,8 +63,8 @@ class ParameterClient:
         """
         reply = await self._call("get_parameters", "GetParameters", names=names)
         self._check("get_parameters", names, reply.values)
-        found = zip(names, reply.values, strict=True)
-        return {name: decode_value(value).value for name, value in found}
+        values = zip(names, reply.values, strict=True)
+        return {name: decode_value(value).value for name, value in values}
 
     async def describe(self, *names: str) -> dict[str, ParameterDescription]:
         """Return the descriptions of parameters by their names.
@@ -74,8 +74,10 @@ class ParameterClient:
         """
         reply = await self._call("describe_parameters", "DescribeParameters", names=names)
         self._check("describe_parameters", names, reply.descriptors)
-        found = zip(names, reply.descriptors, strict=True)
-        return {name: ParameterDescription.decode(one) for name, one in found}
+        descriptions = zip(names, reply.descriptors, strict=True)
+        return {
+            name: ParameterDescription.decode(description) for name, description in descriptions
+        }
 
     async def set(self, values: Mapping[str, object] | None = None, /, **more: object) -> None:
         """Set parameters, all or none.
@@ -114,10 +116,10 @@ class ParameterClient:
             )
         return await client.call(timeout=self._timeout, **fields)
 
-    def _check(self, service: str, names: Sequence[str], got: Sequence[Any]) -> None:
-        if len(got) != len(names):
+    def _check(self, service: str, names: Sequence[str], replies: Sequence[Any]) -> None:
+        if len(replies) != len(names):
             raise ServiceCallError(
-                f"{self.name}: {len(got)} answers for {len(names)} names: not all of "
+                f"{self.name}: {len(replies)} answers for {len(names)} names: not all of "
                 f"{', '.join(names):.200} are declared there",
                 service=f"{self.name}/{service}",
             )

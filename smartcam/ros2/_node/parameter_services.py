@@ -83,9 +83,9 @@ class ParameterServices:
         """Publish that parameters are new, changed or deleted."""
         if self._events is None or not (new or changed or deleted):
             return
-        seconds, rest = divmod(time.time_ns(), 1_000_000_000)
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
         self._events.publish(
-            stamp={"sec": seconds, "nanosec": rest},
+            stamp={"sec": seconds, "nanosec": nanoseconds},
             node=self._node.full_name,
             new_parameters=self._messages(new),
             changed_parameters=self._messages(changed),
@@ -95,8 +95,12 @@ class ParameterServices:
         )
 
     def _messages(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        found = ((name, self._parameters.find(name)) for name in names)
-        return [{"name": name, "value": encode_value(one)} for name, one in found if one]
+        parameters_found = ((name, self._parameters.find(name)) for name in names)
+        return [
+            {"name": name, "value": encode_value(parameter)}
+            for name, parameter in parameters_found
+            if parameter
+        ]
 
     # ------------------------------------------------------------------ reading
 
@@ -157,8 +161,8 @@ class ParameterServices:
             refused = {"successful": False, "reason": why}
             return {"results": [refused] * len(request.parameters)}
         results = []
-        for one in request.parameters:
-            results.append(await self._result([one]))
+        for parameter in request.parameters:
+            results.append(await self._result([parameter]))
             await asyncio.sleep(0)
         return {"results": results}
 
@@ -179,7 +183,7 @@ class ParameterServices:
 
     async def _result(self, parameters: Sequence[Any]) -> dict[str, Any]:
         try:
-            values = {one.name: decode_value(one.value) for one in parameters}
+            values = {parameter.name: decode_value(parameter.value) for parameter in parameters}
             await self._parameters.carry_out(values)
         except SmartCamError as exc:
             return {"successful": False, "reason": reason(exc)}

@@ -87,7 +87,7 @@ class ParameterDescription:
 
     def encode(self) -> dict[str, Any]:
         """Return the fields of a ``rcl_interfaces/msg/ParameterDescriptor``."""
-        found: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "name": self.name,
             "type": TYPES.index(self.type),
             "description": self.description,
@@ -97,10 +97,10 @@ class ParameterDescription:
         }
         if self.minimum is not None and self.maximum is not None:
             field = "integer_range" if self.type == TYPES[INTEGER] else "floating_point_range"
-            found[field] = [
+            fields[field] = [
                 {"from_value": self.minimum, "to_value": self.maximum, "step": self.step or 0}
             ]
-        return found
+        return fields
 
     @classmethod
     def decode(cls, message: Any) -> ParameterDescription:
@@ -159,7 +159,9 @@ def range_of(
             f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
         )
     if number == INTEGER:
-        wrong = [one for one in (first, last, step) if one is not None and not _whole(one)]
+        wrong = [
+            bound for bound in (first, last, step) if bound is not None and not _is_integral(bound)
+        ]
         if wrong:
             raise ConfigurationError(
                 f"parameter {name!r}: a range of {wrong[0]}: expected whole numbers of 64 bits"
@@ -171,7 +173,7 @@ def range_of(
     return first, last, step
 
 
-def _whole(value: float) -> bool:
+def _is_integral(value: float) -> bool:
     return (
         isinstance(value, int) and not isinstance(value, bool) and _INT64[0] <= value <= _INT64[1]
     )
@@ -239,10 +241,10 @@ def _array(name: str, given: Sequence[Any], declared: int) -> Typed:
                 f"parameter {name!r}: a list without elements: expected its type, too"
             )
         return Typed(declared, b"" if declared == BYTES else ())
-    numbers = {_number_of(one) for one in set(map(type, given))}
+    numbers = {_number_of(kind) for kind in set(map(type, given))}
     number = numbers.pop()
     if numbers or not BOOL <= number <= STRING:
-        names = sorted({type(one).__name__ for one in given})
+        names = sorted({type(value).__name__ for value in given})
         raise ConfigurationError(
             f"parameter {name!r}: expected a list of bool, of int, of float or of str, got "
             f"{', '.join(names)}"
@@ -257,14 +259,14 @@ _PLAIN: Final[dict[int, Callable[[Any], Any]]] = {
 
 
 def _number_of(kind: type) -> int:
-    for number, one in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
-        if issubclass(kind, one):
+    for number, type_ in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
+        if issubclass(kind, type_):
             return number
     return BYTES if issubclass(kind, bytes | bytearray) else NOT_SET
 
 
 def _check_elements(name: str, number: int, given: Sequence[Any]) -> None:
-    if number == INTEGER and not (_whole(min(given)) and _whole(max(given))):
+    if number == INTEGER and not (_is_integral(min(given)) and _is_integral(max(given))):
         raise ConfigurationError(f"parameter {name!r}: expected integers of 64 bits")
     if number == STRING:
         text = "".join(given)

@@ -83,7 +83,7 @@ class _ParameterChange(NamedTuple):
 class RosParameters:
     """The parameters of a node; other nodes list, get, describe and set them while it is open.
 
-    The type of a parameter is that of its first value: ``bool``, ``int``, ``float``, ``str``,
+    The first value gives the type of a parameter: ``bool``, ``int``, ``float``, ``str``,
     ``bytes``, or a list of one of the first four; an ``int`` is not accepted for a ``float``.
 
     Args:
@@ -176,7 +176,7 @@ class RosParameters:
         made = _Declared(described, first, on_set)
         made.fitting(first, by_node=True)
         self._declared[name] = made
-        self._tell(new=[name])
+        self._notify(new=[name])
 
     def undeclare(self, name: str) -> None:
         """Remove a parameter.
@@ -186,7 +186,7 @@ class RosParameters:
         """
         gone = self._of(name)
         del self._declared[name]
-        self._tell(deleted={name: gone.value})
+        self._notify(deleted={name: gone.value})
 
     def names(self) -> list[str]:
         """Return the names, in the order of their declaration."""
@@ -210,17 +210,17 @@ class RosParameters:
 
     def find(self, name: str) -> Typed | None:
         """Return a value with its type; None if there is no parameter of this name."""
-        found = self._declared.get(name)
-        return None if found is None else found.value
+        parameter = self._declared.get(name)
+        return None if parameter is None else parameter.value
 
     def _of(self, name: str) -> _Declared:
-        found = self._declared.get(name)
-        if found is None:
+        parameter = self._declared.get(name)
+        if parameter is None:
             raise ConfigurationError(
                 f"parameter {name!r:.80} of {self._node.full_name} is not declared"
                 f"{did_you_mean(name[:MAX_NAME_CHARACTERS], self._declared)}"
             )
-        return found
+        return parameter
 
     # ------------------------------------------------------------------ setting
 
@@ -231,10 +231,10 @@ class RosParameters:
             ConfigurationError: there is no parameter of this name, or it cannot have the value.
         """
         declared = self._of(name)
-        kept = declared.fitting(value, by_node=True)
-        if kept != declared.value:
-            declared.value = kept
-            self._tell(changed=[name])
+        fitted = declared.fitting(value, by_node=True)
+        if fitted != declared.value:
+            declared.value = fitted
+            self._notify(changed=[name])
 
     async def set(self, name: str, value: object) -> None:
         """Set a parameter like another node.
@@ -301,7 +301,7 @@ class RosParameters:
             raise
         for change in changes:
             change.declared.value = change.new
-        self._tell(changed=[one for one in values if one in self._declared])
+        self._notify(changed=[value for value in values if value in self._declared])
 
     async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
         """Undo changes; a change that cannot be undone stays, and is published and logged."""
@@ -314,7 +314,7 @@ class RosParameters:
                 text = f"parameter {name!r} stays {change.new}: it was not taken back: {exc}"
                 logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - it is said
                 why.add_note(text)
-                self._tell(changed=[name])
+                self._notify(changed=[name])
 
     async def _call(self, declared: _Declared, value: Typed) -> None:
         """Call the hook with a value.
@@ -343,9 +343,9 @@ class RosParameters:
             logger.exception("%s ! on_set of parameter %r failed", self._node.full_name, name)
             raise RosError(f"parameter {name!r}: {type(exc).__name__}: {exc!s:.200}") from exc
 
-    def _tell(self, **what: Any) -> None:
+    def _notify(self, **lists: Any) -> None:
         if self._services is not None:
-            self._services.tell(**what)
+            self._services.tell(**lists)
 
 
 def _refuse_sim_time(value: bool) -> None:

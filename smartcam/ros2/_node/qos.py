@@ -60,8 +60,8 @@ class QoS:
         depth = "" if self.depth in {None, DEFAULT_DEPTH} else str(self.depth)
         lifespan = ","
         if math.isfinite(self.lifespan):
-            whole = int(self.lifespan)
-            lifespan = f"{whole},{round((self.lifespan - whole) * 1e9)}"
+            seconds = int(self.lifespan)
+            lifespan = f"{seconds},{round((self.lifespan - seconds) * 1e9)}"
         return ":".join(
             (
                 "" if self.reliable else str(_BEST_EFFORT),
@@ -84,7 +84,7 @@ class QoS:
         if [len(part) for part in parts] != [1, 1, 2, 2, 2, 3]:
             raise ValueError(f"quality of service {text!r:.80}: expected six parts, as ::,5:,:,:,,")
         (reliability,), (durability,), (history, depth), _, lifespan, _ = [
-            [int(one) if one else 0 for one in part] for part in parts
+            [int(number) if number else 0 for number in part] for part in parts
         ]
         seconds = lifespan[0] + lifespan[1] / 1e9
         endless = not seconds or tuple(lifespan) == _ENDLESS

@@ -114,10 +114,10 @@ class RosOut:
                 self._loop.call_soon_threadsafe(self._publish)
 
     def _fields(self, record: logging.LogRecord) -> dict[str, Any]:
-        seconds, rest = divmod(round(record.created * 1e9), 1_000_000_000)
+        seconds, nanoseconds = divmod(round(record.created * 1e9), 1_000_000_000)
         below = record.name.removeprefix(self._logger.name)
         return {
-            "stamp": {"sec": seconds, "nanosec": rest},
+            "stamp": {"sec": seconds, "nanosec": nanoseconds},
             "level": min(max(record.levelno // 10 * 10, DEBUG), FATAL),
             "name": _plain(self._name + below if below.startswith(".") else self._name),
             "msg": _plain(_text(record)),
@@ -143,7 +143,7 @@ class RosOut:
 
 
 class _Handler(logging.Handler):
-    """Passes records on, except those that are logged by this in the same thread."""
+    """Passes records on, except records that this logs in the same thread."""
 
     def __init__(self, take: Callable[[logging.LogRecord], None], level: int) -> None:
         super().__init__(level)

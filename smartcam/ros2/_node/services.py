@@ -44,7 +44,7 @@ MAX_WAITING_CALLS = 256
 MAX_REQUEST_BYTES = 1 << 24
 """Largest number of bytes of a request."""
 
-LOOK_AGAIN = 0.02
+SERVER_POLL_INTERVAL = 0.02
 """Seconds between two checks whether a server exists."""
 
 
@@ -242,7 +242,7 @@ class RosClient(RosEnd):
     def served(self) -> bool:
         """True if there is a server, as far as is known."""
         ends = self._context.graph.ends(self.name, SERVICE)
-        return not self._closed and any(one.key == self.entity.key for one in ends)
+        return not self._closed and any(endpoint.key == self.entity.key for endpoint in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until there is a server.
@@ -256,13 +256,15 @@ class RosClient(RosEnd):
             async with asyncio.timeout(timeout):
                 while not self.served:
                     self._check_open()
-                    await asyncio.sleep(LOOK_AGAIN)
+                    await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
-            others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
-            what = f", but one for {', '.join(others)}" if others else ""
+            others = [
+                endpoint.ros_type for endpoint in self._context.graph.ends(self.name, SERVICE)
+            ]
+            others_text = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} {self.type.hash} within "
-                f"{timeout:g} s{what}",
+                f"{timeout:g} s{others_text}",
                 service=self.name,
             ) from exc
 
@@ -296,7 +298,7 @@ class RosClient(RosEnd):
         try:
             self._ask(data, attachment, reply)
             async with asyncio.timeout_at(deadline):
-                found = await reply
+                reply_data = await reply
         except TimeoutError as exc:
             raise ServiceTimeoutError(
                 f"{self.name}: no reply within {timeout:g} s; whether the call was carried out is "
@@ -305,16 +307,16 @@ class RosClient(RosEnd):
             ) from exc
         finally:
             self._waiting.discard(reply)
-        return self.type.response.decode(found)
+        return self.type.response.decode(reply_data)
 
     def _ask(self, data: bytes, attachment: Attachment, reply: asyncio.Future[bytes]) -> None:
         zenoh = self._context.zenoh
         refused: list[str] = []
         came = False
 
-        def take(found: bytes) -> None:
+        def take(reply_data: bytes) -> None:
             if not reply.done():
-                reply.set_result(found)
+                reply.set_result(reply_data)
 
         def end() -> None:
             if not reply.done():
@@ -333,8 +335,8 @@ class RosClient(RosEnd):
             extra = None if answer.ok.attachment is None else answer.ok.attachment.to_bytes()
             if self._is_for(attachment, extra):
                 came = True
-                found = answer.ok.payload.to_bytes()
-                zenoh.in_loop(take, len(found), found)
+                payload = answer.ok.payload.to_bytes()
+                zenoh.in_loop(take, len(payload), payload)
 
         def on_end() -> None:
             if not came:  # after a reply the loop need not be woken again
@@ -349,13 +351,13 @@ class RosClient(RosEnd):
     def _is_for(self, wanted: Attachment, extra: bytes | None) -> bool:
         """Return True if a reply answers this call; called in a thread of the engine."""
         try:
-            got = Attachment.decode(extra)
+            attachment = Attachment.decode(extra)
         except RosMessageError as exc:
             logger.warning("%s ! a reply was ignored: %s", self.name, exc)
             return False
-        if (got.number, got.gid) == (wanted.number, wanted.gid):
+        if (attachment.number, attachment.gid) == (wanted.number, wanted.gid):
             return True
-        logger.warning("%s ! a reply to another call was ignored: %s", self.name, got)
+        logger.warning("%s ! a reply to another call was ignored: %s", self.name, attachment)
         return False
 
     def close(self) -> None:

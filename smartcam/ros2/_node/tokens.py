@@ -67,9 +67,9 @@ class Entity:
     def token(self) -> str:
         """The entity's liveliness token."""
         parts = [ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.id), self.kind]
-        parts += [_mangled(one) for one in (self.enclave, self.namespace, self.node)]
+        parts += [_mangled(part) for part in (self.enclave, self.namespace, self.node)]
         if self.kind != NODE:
-            parts += [_mangled(one) for one in (self.name, self.type, self.hash)]
+            parts += [_mangled(part) for part in (self.name, self.type, self.hash)]
             parts.append(self.qos.encode())
         return "/".join(parts)
 
@@ -108,11 +108,11 @@ class Entity:
                 f"{' '.join(KINDS)}, of 9 parts for a node and 13 else"
             )
         domain, zid, node_id, number = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
-        enclave, namespace, node = (_demangled(one) for one in parts[6:9])
+        enclave, namespace, node = (_demangled(part) for part in parts[6:9])
         made = cls(parts[5], domain, zid, node_id, number, namespace, node, enclave=enclave)  # type: ignore[arg-type]
         if made.kind == NODE:
             return made
-        name, kind, hashed = (_demangled(one) for one in parts[9:12])
+        name, kind, hashed = (_demangled(part) for part in parts[9:12])
         return cls(
             made.kind,
             domain,

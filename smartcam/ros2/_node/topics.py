@@ -47,7 +47,7 @@ def message_of(message: object, fields: dict[str, Any]) -> object:
 MAX_SHORT_MESSAGES = 10_000
 """Largest number of waiting short messages of a topic; for long ones it is the topic's depth."""
 
-HEARTBEAT = 0.5
+HEARTBEAT_INTERVAL = 0.5
 """Seconds between two heartbeats of a latched topic (``rmw_publisher_data.cpp``)."""
 
 
@@ -150,7 +150,7 @@ class RosPublisher(RosEnd):
         if qos.latched:
             import zenoh.ext as more
 
-            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
+            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_INTERVAL)
             self._publisher = more.declare_advanced_publisher(
                 session,
                 self.entity.key,
@@ -164,7 +164,7 @@ class RosPublisher(RosEnd):
         return self._publisher
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True if the topic has a known subscriber, and always if it is latched."""
         if self._closed:
             return False
@@ -173,7 +173,7 @@ class RosPublisher(RosEnd):
     def watch(self, call: Callable[[], None]) -> Callable[[], None]:
         """Call ``call`` when subscribers come and go; return a function that ends that.
 
-        ``heard`` may change a moment later.
+        ``has_subscribers`` may change a moment later.
         """
         return self._context.watch(self.name, SUBSCRIPTION, lambda _entity, _present: call())
 
@@ -200,7 +200,7 @@ class RosPublisher(RosEnd):
         attachment = self._attachment()
         waits = self._context.waits(self)
         if len(data) > MAX_DIRECT_BYTES and self._lane == "short" and not waits:
-            self._lane = "long"  # from now on, since a short message would overtake it
+            self._lane = "long"  # all later messages, too: a short one would overtake it
         if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
@@ -229,23 +229,23 @@ class RosPublisher(RosEnd):
         Cancellation: the message is published or not.
         """
         self._check_open()
-        what = message_of(message, fields)
+        encoded = message_of(message, fields)
         if self._slot is None:
             self._slot = self._context.slot()
             self._lane = self._slot.lane
         done: concurrent.futures.Future[None] = concurrent.futures.Future()
 
-        def say() -> None:
+        def publish() -> None:
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._send_newest(self.type.encode(what))
+                self._send_newest(self.type.encode(encoded))
             except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
                 done.set_exception(exc)
             else:
                 done.set_result(None)
 
-        self._context.send_later(self, say, self._lane)
+        self._context.send_later(self, publish, self._lane)
         await asyncio.wrap_future(done)
 
     def _send_newest(self, data: bytes) -> None:
@@ -317,9 +317,9 @@ class RosPublisher(RosEnd):
             self._take_back()
 
     def _take_back(self) -> None:
-        for one in (*self._patient.values(), self._hasty):
-            if one is not None:
-                quietly(one.undeclare)
+        for publisher in (*self._patient.values(), self._hasty):
+            if publisher is not None:
+                quietly(publisher.undeclare)
         self._patient, self._hasty = {}, None
         self._publisher = None
         self._outlet.close()

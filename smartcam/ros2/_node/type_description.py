@@ -49,24 +49,24 @@ class TypeDescriptions:
             self._node.serve("~/get_type_description", TYPE, self._describe)
 
     async def _describe(self, request: Any) -> dict[str, Any]:
-        asked = request.type_hash
-        if not asked.startswith(PREFIX) or len(asked) != len(PREFIX) + DIGITS:
-            return _failed(f"{asked!r:.100} is no hash: expected RIHS01_ and {DIGITS} digits")
+        wanted_hash = request.type_hash
+        if not wanted_hash.startswith(PREFIX) or len(wanted_hash) != len(PREFIX) + DIGITS:
+            return _failed(f"{wanted_hash!r:.100} is no hash: expected RIHS01_ and {DIGITS} digits")
         for entity in self._entities():
-            if entity.hash == asked:
+            if entity.hash == wanted_hash:
                 break
         else:
-            return _failed(f"{self._node.full_name} uses no type with the hash {asked}")
-        made = self._descriptions.get(asked)
+            return _failed(f"{self._node.full_name} uses no type with the hash {wanted_hash}")
+        made = self._descriptions.get(wanted_hash)
         if made is None:
-            made = self._descriptions[asked] = describe(self._node.types, entity.ros_type)
+            made = self._descriptions[wanted_hash] = describe(self._node.types, entity.ros_type)
         sources = self._sources(made) if request.include_type_sources else []
         return {"successful": True, "type_description": made, "type_sources": sources}
 
     def _sources(self, described: Any) -> list[dict[str, str]]:
         """Return the texts of the files of a type and of all nested types."""
         types = (described.type_description, *described.referenced_type_descriptions)
-        return [self._source(one.type_name) for one in types]
+        return [self._source(kind.type_name) for kind in types]
 
     def _source(self, name: str) -> dict[str, str]:
         encoding, text = self._node.types.source(name)

@@ -111,7 +111,7 @@ def packed(value: Any, code: str, least: int, most: int) -> Any:
         if isinstance(value, str | dict):
             raise MisfitError(f"expected numbers, got {type(value).__name__}")
         if code == "?":
-            value = [_FLAGS[one] for one in value]
+            value = [_FLAGS[flag] for flag in value]
         data = struct.pack(f"<{len(value)}{code}", *value)
         count = len(value)
     if count < least or (most and count > most):

@@ -50,7 +50,7 @@ class MessageField(NamedTuple):
 
     @property
     def attribute(self) -> str:
-        """Its name in Python."""
+        """Name of the field in Python."""
         return f"{self.name}_" if keyword.iskeyword(self.name) else self.name
 
     @property
@@ -92,7 +92,9 @@ class Definition:
         Args:
             defaults: whether fields have their defaults behind them.
         """
-        constants = (f"{self.kinds[name]} {name}={one}\n" for name, one in self.constants.items())
+        constants = (
+            f"{self.kinds[name]} {name}={constant}\n" for name, constant in self.constants.items()
+        )
         fields = (
             f"{field} {field.name}{_default_text(field.default) if defaults else ''}\n"
             for field in self.fields
@@ -128,8 +130,8 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
 
 def dds_name(name: str) -> str:
     """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
-    package, kind, own = name.split("/")
-    return f"{package}::{kind}::dds_::{own}_"
+    package, kind, short_name = name.split("/")
+    return f"{package}::{kind}::dds_::{short_name}_"
 
 
 def parse_message(name: str, text: str) -> Definition:
@@ -174,8 +176,8 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
 def bare(definition: Any) -> Any:
     """Return the fields of a message, or of a service's two, without defaults."""
     if isinstance(definition, tuple):
-        return [bare(one) for one in definition]
-    return [one._replace(default=None) for one in definition.fields]
+        return [bare(part) for part in definition]
+    return [field._replace(default=None) for field in definition.fields]
 
 
 def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
@@ -197,7 +199,7 @@ def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     constant = matched["constant"] is not None
     if constant and (shape or kind not in BASES):
         raise ValueError("a constant is of one basic value")
-    return field._replace(default=_value(field, value, whole=constant)), constant
+    return field._replace(default=_value(field, value, entire=constant)), constant
 
 
 def _full_name(package: str, name: str) -> str:
@@ -215,22 +217,22 @@ def _full_name(package: str, name: str) -> str:
     return name
 
 
-def _value(field: MessageField, text: str | None, *, whole: bool) -> Any:
-    """Return a constant or default; a constant's text is the ``whole`` rest of its line."""
-    if text is None or not (text := text.strip()) or (not whole and text.startswith("#")):
+def _value(field: MessageField, text: str | None, *, entire: bool) -> Any:
+    """Return a constant or default; a constant's text is the ``entire`` rest of its line."""
+    if text is None or not (text := text.strip()) or (not entire and text.startswith("#")):
         return None
     if field.type == "string" and not field.shape:
         quoted = re.match(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"", text)
         if quoted is None:
-            return text if whole else text.partition("#")[0].strip()
+            return text if entire else text.partition("#")[0].strip()
         return _fitting(field, [ast.literal_eval(quoted[0])])[0]
     if field.type != "string":
         text = text.partition("#")[0].strip()
         text = re.sub(r"(?i)\btrue\b", "True", re.sub(r"(?i)\bfalse\b", "False", text))
     value = ast.literal_eval(text)
     value = value if field.shape else [value]
-    one = float if field.type.startswith("float") else bool if field.type == "bool" else None
-    values = [one(x) for x in value] if one else list(value)
+    convert = float if field.type.startswith("float") else bool if field.type == "bool" else None
+    values = [convert(x) for x in value] if convert else list(value)
     return _fitting(field, values) if field.shape else _fitting(field, values)[0]
 
 

@@ -50,7 +50,7 @@ def _described(definition: Definition) -> dict[str, Any]:
 
 
 def description(definition: Definition, find: Callable[[str], Definition]) -> dict[str, Any]:
-    """Return a type's description with those of all nested types."""
+    """Return the description of a type and of all nested types."""
     within: dict[str, Definition] = {}
     ahead = definition.needs()
     while ahead:

@@ -98,11 +98,11 @@ class MessageType:
 
     @cached_property
     def text(self) -> str:
-        """The definition and those of all nested types, in recordings' form (``ros2msg``)."""
+        """The definitions of the type and all nested ones, in recordings' form (``ros2msg``)."""
         within = description(self._definition, self._types.definition)
         parts = [self._definition.text()]
-        for one in within["referenced_type_descriptions"]:
-            name: str = one["type_name"]
+        for referenced in within["referenced_type_descriptions"]:
+            name: str = referenced["type_name"]
             head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
             parts.append(head + self._types.definition(name).text())
         return "".join(parts)
@@ -144,8 +144,8 @@ class MessageType:
         if isinstance(message, Mapping):
             message = self._filled(message)
         elif getattr(message, "__msgtype__", None) != self.name:
-            got = getattr(message, "__msgtype__", type(message).__name__)
-            raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
+            actual = getattr(message, "__msgtype__", type(message).__name__)
+            raise RosMessageError(f"{self.name}: expected a message of this type, got {actual}")
         try:
             return self._encode(message)
         except _MISFITS as exc:
@@ -328,10 +328,10 @@ class RosTypes:
         with self._lock:
             if name in self.names():
                 if kind == "srv":
-                    there: Any = parse(name, self._service_text(name) or "")
+                    definitions: Any = parse(name, self._service_text(name) or "")
                 else:
-                    there = self.definition(name)
-                if bare(there) != bare(parsed):
+                    definitions = self.definition(name)
+                if bare(definitions) != bare(parsed):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )
@@ -371,7 +371,8 @@ class RosTypes:
             if (made := self._messages.get(name)) is None:
                 definition = self.definition(name)
                 nested = {
-                    one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
+                    needed: self.message_of(needed, (*within, name))
+                    for needed in sorted(definition.needs())
                 }
                 made = self._messages[name] = MessageType(definition, nested, self)
         return made

@@ -33,10 +33,10 @@ class RosMessage:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RosMessage) or other.__msgtype__ != self.__msgtype__:
             return NotImplemented
-        return all(_same(getattr(self, one), getattr(other, one)) for one in self.__slots__)
+        return all(_same(getattr(self, slot), getattr(other, slot)) for slot in self.__slots__)
 
     def __repr__(self) -> str:
-        parts = (f"{one}={_shown(getattr(self, one))}" for one in self.__slots__)
+        parts = (f"{slot}={_shown(getattr(self, slot))}" for slot in self.__slots__)
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
@@ -44,14 +44,14 @@ _MAX_SHOWN = 16
 """Number of elements or bytes above which a value is shown shortened."""
 
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        if isinstance(one, bytes | bytearray | memoryview):
-            one = np.frombuffer(one, np.uint8)
+def _same(first: Any, other: Any) -> bool:
+    if isinstance(first, np.ndarray) or isinstance(other, np.ndarray):
+        if isinstance(first, bytes | bytearray | memoryview):
+            first = np.frombuffer(first, np.uint8)
         if isinstance(other, bytes | bytearray | memoryview):
             other = np.frombuffer(other, np.uint8)
-        return np.array_equal(one, other)
-    return bool(one == other)
+        return np.array_equal(first, other)
+    return bool(first == other)
 
 
 def _shown(value: Any) -> str:
@@ -133,8 +133,8 @@ def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
         return (np.zeros(count, dtype) if usual is None else np.array(usual, dtype)).copy
     if field.default is not None:
         return functools.partial(list, field.default)
-    one = _zero(kind, field._replace(shape=""))
-    return lambda: [one() for _ in range(count)]
+    single = _zero(kind, field._replace(shape=""))
+    return lambda: [single() for _ in range(count)]
 
 
 _ZERO: Final[dict[str, Any]] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
@@ -181,18 +181,18 @@ def rule_of(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
             return value
 
         return numbers
-    one = field._replace(shape="", size=0)
-    rule = _rule_of_one(kind, one)
+    single_field = field._replace(shape="", size=0)
+    rule = _rule_of_one(kind, single_field)
 
     def each(values: Any) -> list[Any]:
         counted(values, least, field.size)
-        kept: list[Any] = []
+        array: list[Any] = []
         for place, value in enumerate(values):
             try:
-                kept.append(rule(value))
+                array.append(rule(value))
             except _MISFITS as exc:
-                raise _located(exc, one, value, f"[{place}]") from exc
-        return kept
+                raise _located(exc, single_field, value, f"[{place}]") from exc
+        return array
 
     return each
 
@@ -272,9 +272,9 @@ def check(kind: MessageType, message: Any) -> None:
         except _MISFITS as exc:
             raise _located(exc, field, value, place) from exc
         if field.nested:
-            for number, one in enumerate(value if field.shape else [value]):
+            for number, item in enumerate(value if field.shape else [value]):
                 try:
-                    check(kind.nested[field.type], one)
+                    check(kind.nested[field.type], item)
                 except LocatedError as exc:
                     exc.path.append(f"{place}[{number}]" if field.shape else place)
                     raise

@@ -22,7 +22,7 @@ class SaysWhatWasExpected:
 
 def _in_words(check: Callable[..., Any]) -> Callable[..., Any]:
     """Return a check whose failure begins with its expectation."""
-    what = check.__name__.removeprefix("test_").replace("_", " ")
+    words = check.__name__.removeprefix("test_").replace("_", " ")
     text = " ".join((check.__doc__ or "").split())
 
     @functools.wraps(check)
@@ -30,7 +30,7 @@ def _in_words(check: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return check(*args, **given)
         except AssertionError as exc:
-            exc.args = (f"expected: {what}. {text}\nfound otherwise: {exc}",)
+            exc.args = (f"expected: {words}. {text}\nfound otherwise: {exc}",)
             raise
 
     return run

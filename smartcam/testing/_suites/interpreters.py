@@ -112,11 +112,13 @@ class InterpreterSuite(SaysWhatWasExpected):
         """
         if "sample" not in metafunc.fixturenames:
             return
-        own = type(self)
+        suite = type(self)
         for name in ("spec", "samples"):
-            if not getattr(own, name, None):
-                raise pytest.UsageError(f"{own.__name__}.{name}: expected one, got none")
-        labels = [one.name or one.layout or f"sample {i}" for i, one in enumerate(self.samples)]
+            if not getattr(suite, name, None):
+                raise pytest.UsageError(f"{suite.__name__}.{name}: expected one, got none")
+        labels = [
+            sample.name or sample.layout or f"sample {i}" for i, sample in enumerate(self.samples)
+        ]
         metafunc.parametrize("sample", self.samples, ids=labels)
 
     def make(self, layout: str | None = None) -> Interpreter:
@@ -125,7 +127,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         Raises:
             ConfigurationError: the interpreter takes no layout, needs one, or not this one.
         """
-        spec = type(self).spec  # from the object, a function would be a method
+        spec = type(self).spec  # read from the object, a function would become a method
         if layout is None:
             return resolve(spec)
         if isinstance(spec, str):
@@ -148,11 +150,11 @@ class InterpreterSuite(SaysWhatWasExpected):
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """Check that the number is that of the layout's field, or None, or an error."""
+        """Check that the number is the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
-        found = interpreter.sequence(reader)
-        assert found == sample.sequence, f"expected number {sample.sequence}, got {found}"
+        sequence = interpreter.sequence(reader)
+        assert sequence == sample.sequence, f"expected number {sample.sequence}, got {sequence}"
         for data in (*_cuts(sample.data), *(sample.data + more for more in TRAILING)):
             try:
                 number = interpreter.sequence(_reader(interpreter, data))
@@ -165,12 +167,17 @@ class InterpreterSuite(SaysWhatWasExpected):
         """Check this after other containers, and with a new interpreter; values share nothing."""
         interpreter = self.make(sample.layout)
         first = interpret(interpreter, sample.data)
-        between = [one for one in self.samples if one.layout == sample.layout]
-        for data in (*(one.data for one in between), sample.data[:-1], sample.data + b"\0", b""):
+        between = [other for other in self.samples if other.layout == sample.layout]
+        for data in (
+            *(other.data for other in between),
+            sample.data[:-1],
+            sample.data + b"\0",
+            b"",
+        ):
             outcome(interpreter, data)
             again = interpret(interpreter, sample.data)
             assert _same(again, first), f"first {first!r}, after {data!r} {again!r}"
-            shared = [one for one in _mutable(first) if id(one) in set(map(id, _mutable(again)))]
+            shared = [part for part in _mutable(first) if id(part) in set(map(id, _mutable(again)))]
             assert not shared, f"two values share {shared[0]!r}"
         other = interpret(self.make(sample.layout), sample.data)
         assert _same(other, first), f"first {first!r}, of another interpreter {other!r}"
@@ -180,12 +187,12 @@ class InterpreterSuite(SaysWhatWasExpected):
         interpreter = self.make(sample.layout)
         outcome(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
-        kept, before = repr(vars(interpreter)), sys.getrefcount(data)
+        before_text, before = repr(vars(interpreter)), sys.getrefcount(data)
         for _ in range(3):
             outcome(interpreter, data)
         assert data == sample.data, f"the container was changed to {data!r}"
         now = repr(vars(interpreter))
-        assert now == kept, f"the interpreter was changed from {kept} to {now}"
+        assert now == before_text, f"the interpreter was changed from {before_text} to {now}"
         if sys.getrefcount(data) != before:
             gc.collect()
         assert sys.getrefcount(data) <= before or len(data) < 2, "the container's bytes are kept"
@@ -230,7 +237,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         from smartcam.testing._suites import strategies
 
         interpreter = self.make(sample.layout)
-        contents = strategies.noise([one.data for one in self.samples])
+        contents = strategies.noise([sample.data for sample in self.samples])
         orders = strategies.st.sampled_from(["little", "big"])
 
         def check(data: DataObject) -> None:
@@ -267,7 +274,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         interpreter = self.make(sample.layout)
         if not isinstance(interpreter, PlainInterpreter):
             return  # the client reads them one by one
-        burst = [one.data for one in self.samples if one.layout == sample.layout] * 2
+        burst = [other.data for other in self.samples if other.layout == sample.layout] * 2
         context = Context(camera="burst", number=5, received_at=_AT)
         values = interpreter.read_all(burst, context)
         assert len(values) == len(burst), f"{len(burst)} containers gave {len(values)} values"
@@ -387,29 +394,29 @@ def _parts(value: object) -> Iterator[object]:
     yield value
     inside: Sequence[object] = ()
     if isinstance(value, dict):
-        found = cast("dict[object, object]", value)
-        inside = [*found.keys(), *found.values()]
+        mapping_ = cast("dict[object, object]", value)
+        inside = [*mapping_.keys(), *mapping_.values()]
     elif isinstance(value, (list, tuple, set, frozenset)):
         inside = [*cast("Sequence[object]", value)]
     elif is_dataclass(value) and not isinstance(value, type):
         inside = [getattr(value, field.name) for field in fields(value)]
-    for one in inside:
-        yield from _parts(one)
+    for item in inside:
+        yield from _parts(item)
 
 
 def _poses(value: object) -> Iterator[Pose]:
-    return (one for one in _parts(value) if isinstance(one, Pose))
+    return (part for part in _parts(value) if isinstance(part, Pose))
 
 
 def _mutable(value: object) -> list[object]:
     """Return the mutable objects in a value."""
     kinds = (list, dict, set, bytearray)
     return [
-        one
-        for one in _parts(value)
-        if isinstance(one, kinds)
-        or bool(getattr(getattr(one, "flags", None), "writeable", False))
-        or _is_open(one)
+        part
+        for part in _parts(value)
+        if isinstance(part, kinds)
+        or bool(getattr(getattr(part, "flags", None), "writeable", False))
+        or _is_open(part)
     ]
 
 

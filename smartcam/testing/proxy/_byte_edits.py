@@ -82,14 +82,14 @@ class Editor:
 
         After a cut or a reset there are no more.
         """
-        rest = memoryview(data)
+        unread = memoryview(data)
         self._reach_marks()
-        while rest and not self._ended:
-            size = len(rest)
+        while unread and not self._ended:
+            size = len(unread)
             if self._marks:
                 size = min(size, self._marks[0].offset - self.position)
-            self._pass(bytes(rest[:size]))
-            rest = rest[size:]
+            self._pass(bytes(unread[:size]))
+            unread = unread[size:]
             self.position += size
             self._reach_marks()
         self._flush()
@@ -104,7 +104,7 @@ class Editor:
             elif begins:
                 if isinstance(rule, Drip):
                     self._flush()
-                    self._edits.append(_gap(0.0))  # its first byte is written alone, too
+                    self._edits.append(_gap(0.0))  # the first byte is written alone, too
                 self._active[order] = rule
                 self._active = dict(sorted(self._active.items()))
             else:

@@ -32,7 +32,7 @@ and inserted bytes may be added. It leaves room for the bytes that a rule may ho
 WRITE_INTERVAL = 0.01
 """Seconds between two writes if the rate is limited."""
 
-TURNS = 2
+TURNS_BETWEEN_WRITES = 2
 """Turns of the event loop between two writes that have to arrive separately: in the first, a
 receiver on this loop gets the written bytes, but after this callback."""
 
@@ -57,7 +57,7 @@ class Pipe:
         self._line = DelayLine[Edit](
             RealClock(),
             ordered=True,
-            turns=TURNS,
+            turns=TURNS_BETWEEN_WRITES,
             wake=self.run,
             carry=self._carry,
             end=self._end,

@@ -24,9 +24,9 @@ class Proxied(ABC):
         self.log: LinkLog = relay.log
         self._loop = asyncio.get_running_loop()
 
-    def note(self, what: str, direction: str = "", at: int | None = None) -> None:
+    def note(self, label: str, direction: str = "", at: int | None = None) -> None:
         """Log an event."""
-        self.log.note(what, self.number, direction, at)
+        self.log.note(label, self.number, direction, at)
 
     @abstractmethod
     def add(self, rules: Sequence[Rule]) -> None:
@@ -73,22 +73,22 @@ class Relay(ABC, Generic[C]):
 
     def chosen(self, connection: int | None) -> list[C]:
         """Return one connection, if it is open, or all."""
-        return [one for one in self.members.values() if connection in {None, one.number}]
+        return [member for member in self.members.values() if connection in {None, member.number}]
 
     def add(self, rules: Sequence[Rule]) -> None:
         """Apply rules from here on."""
-        for one in self.chosen(None):
-            one.add(rules)
+        for connection_ in self.chosen(None):
+            connection_.add(rules)
 
     def cut(self, connection: int | None) -> None:
         """End connections in order."""
-        for one in self.chosen(connection):
-            one.cut()
+        for relayed in self.chosen(connection):
+            relayed.cut()
 
     def reset(self, connection: int | None) -> None:
         """End connections hard."""
-        for one in self.chosen(connection):
-            one.reset()
+        for relayed in self.chosen(connection):
+            relayed.reset()
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""

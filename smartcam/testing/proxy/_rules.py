@@ -43,7 +43,7 @@ _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
 """Text on the allowed values, and the function that checks a value."""
 
 _BOUNDS: Mapping[str, _Bound] = {
-    "direction": ("direction must be 'up' or 'down'", lambda way: way in DIRECTIONS),
+    "direction": ("direction must be 'up' or 'down'", lambda direction: direction in DIRECTIONS),
     "connection": ("connections count from 1", lambda number: number is None or number >= 1),
     "at": ("at must be 0 or more bytes", lambda place: place >= 0),
     "count": ("count must be 1 or more bytes", lambda count: count is None or count >= 1),
@@ -90,10 +90,10 @@ class Rule:
         cls.name = name or cls.__name__.lower()
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            if one.name in self._bounds:
-                text, holds = self._bounds[one.name]
-                _check(self, holds(getattr(self, one.name)), text)
+        for field in fields(self):
+            if field.name in self._bounds:
+                text, holds = self._bounds[field.name]
+                _check(self, holds(getattr(self, field.name)), text)
 
     def concerns(self, connection: int, direction: Direction) -> bool:
         """Return True if the rule is for this direction of this connection."""
@@ -349,7 +349,7 @@ class Late(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(DatagramRule):
-    """Send the datagram after those that follow it.
+    """Send the datagram after the datagrams that follow it.
 
     Args:
         behind: number of datagrams of the same direction and connection that overtake it.

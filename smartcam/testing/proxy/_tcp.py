@@ -219,14 +219,14 @@ class StreamRelay(Relay[ProxiedConnection]):
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""
         super().stall(direction, connection)
-        for one in self.chosen(connection):
-            one.stall(direction)
+        for relayed in self.chosen(connection):
+            relayed.stall(direction)
 
     def resume(self) -> None:
         """Pass everything again."""
         super().resume()
-        for one in self.chosen(None):
-            one.resume()
+        for relayed in self.chosen(None):
+            relayed.resume()
 
     def take(self, client: socket.socket) -> None:
         """Pair a client's socket with one to the target."""

@@ -58,26 +58,26 @@ class _Peer(Proxied):
             self._sock.close()
             raise
         self._loop.add_reader(self._sock, self._receive)
-        self._seen: Counter[Direction] = Counter()
-        self._lines = {way: self._line(way) for way in DIRECTIONS}
+        self._datagrams: Counter[Direction] = Counter()
+        self._lines = {direction: self._line(direction) for direction in DIRECTIONS}
         self._rules: dict[Direction, list[tuple[DatagramRule, Random]]] = {
-            way: [] for way in DIRECTIONS
+            direction: [] for direction in DIRECTIONS
         }
         self.add(relay.rules)
 
     def add(self, rules: Sequence[Rule]) -> None:
         """Add rules after the others; their numbers count from here."""
-        for way in DIRECTIONS:
+        for direction in DIRECTIONS:
             for rule in rules:
-                if isinstance(rule, DatagramRule) and rule.concerns(self.number, way):
-                    seed = f"{rule.seed}:{self.number}:{way}"
+                if isinstance(rule, DatagramRule) and rule.concerns(self.number, direction):
+                    seed = f"{rule.seed}:{self.number}:{direction}"
                     chance = Random(seed)  # noqa: S311 - no secret
-                    self._rules[way].append((rule.ahead(self._seen[way]), chance))
+                    self._rules[direction].append((rule.ahead(self._datagrams[direction]), chance))
 
     def take(self, direction: Direction, data: bytes) -> None:
         """Apply the rules to a datagram."""
-        self._seen[direction] += 1
-        number = self._seen[direction]
+        self._datagrams[direction] += 1
+        number = self._datagrams[direction]
         if direction in self._relay.stalled:
             self.note("stall", direction, number)
             return
@@ -132,12 +132,12 @@ class _Peer(Proxied):
 
     # ------------------------------------------------------------------ inside
 
-    def _line(self, way: Direction) -> DelayLine[Transmission]:
+    def _line(self, direction: Direction) -> DelayLine[Transmission]:
         return DelayLine(
             RealClock(),
             ordered=False,
-            wake=lambda: self._lines[way].run(),
-            carry=functools.partial(self._send, way),
+            wake=lambda: self._lines[direction].run(),
+            carry=functools.partial(self._send, direction),
             end=lambda _: None,
             lost=lambda _: None,
         )

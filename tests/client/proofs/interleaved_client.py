@@ -277,7 +277,7 @@ class Client:
 
     def time_out(self) -> None:
         """The deadline of the trigger under way is reached."""
-        self.results._timer._go_off()
+        self.results._timer._on_timer()
 
     def cancel(self) -> None:
         """The task that awaits the trigger is cancelled; it was not woken yet."""
@@ -379,7 +379,15 @@ class Client:
             )
             for one in known
         )
-        memory = (last, evidence, at.doubted, at.satisfied, at._last_number, at._turn, at._given)
+        memory = (
+            last,
+            evidence,
+            at.doubted,
+            at.satisfied,
+            at._last_number,
+            at._turn,
+            at._newest_given,
+        )
         given_up = tuple(at._given_up.items())
         numbered = self.results._numbering is not None
         return self.state._last_status, numbered, call, waiting, owed, memory, given_up

@@ -279,7 +279,7 @@ async def test_wait_heard_gives_up_with_what_was_heard() -> None:
     async with EmulatedInSight([JOB]) as emulator, await TelnetClient.log_in(emulator) as client:
         await client.ask(b"GO\r\n", b"0\r\n")
         with pytest.raises(
-            ResponseTimeoutError, match=r"the emulator heard 1 of 2 GO in 0\.05 s"
+            ResponseTimeoutError, match=r"the emulator received 1 of 2 GO in 0\.05 s"
         ) as caught:
             await emulator.wait_heard("go", count=2, timeout=0.05)
         assert caught.value.waited == 0.05

@@ -439,7 +439,9 @@ class World:
             (
                 *(epoch, agent.has, agent.gate.holder, frozenset(agent.gate._reservations)),
                 tuple((line.program, line.reservation) for line in agent.gate._line),
-                tuple((n, g.floor, frozenset(g._known)) for n, g in sorted(agent.guests.items())),
+                tuple(
+                    (n, g.floor, frozenset(g._known_calls)) for n, g in sorted(agent.guests.items())
+                ),
                 tuple(sorted(agent.gone.items())),
                 frozenset((k, t.reservation, t.line.granted) for k, t in agent.tasks.items()),
             )

@@ -264,7 +264,7 @@ VARIABLES = {"A": 0, "B": 5, "A.Max": 7}
     ],
 )
 def test_formulas(formula: str, whole: bool, expected: float) -> None:
-    assert evaluate(formula, VARIABLES, whole=whole) == expected
+    assert evaluate(formula, VARIABLES, integral=whole) == expected
 
 
 @pytest.mark.parametrize(
@@ -284,10 +284,10 @@ def test_a_formula_of_two_readings_has_no_value_where_they_differ(
     formula: str, by_c: str, by_emva: str
 ) -> None:
     if by_c == by_emva:
-        assert evaluate(formula, VARIABLES, whole=True) == int(by_c)
+        assert evaluate(formula, VARIABLES, integral=True) == int(by_c)
         return
     with pytest.raises(MessageError, match=f"got {by_c} in C's order .* {by_emva} in that of EMVA"):
-        evaluate(formula, VARIABLES, whole=True)
+        evaluate(formula, VARIABLES, integral=True)
 
 
 @pytest.mark.parametrize(
@@ -298,13 +298,13 @@ def test_a_formula_of_two_readings_has_no_value_where_they_differ(
 )  # fmt: skip
 def test_a_formula_that_has_no_value_is_refused(formula: str) -> None:
     with pytest.raises(MessageError):
-        evaluate(formula, VARIABLES, whole=False)
+        evaluate(formula, VARIABLES, integral=False)
 
 
 @given(st.text("0123456789+-*/%&|^~<>=?:(),!AB. eEx", max_size=40), st.booleans())
 def test_any_formula_has_a_number_or_is_refused(formula: str, whole: bool) -> None:
     try:
-        value: Any = evaluate(formula, VARIABLES, whole=whole)
+        value: Any = evaluate(formula, VARIABLES, integral=whole)
     except MessageError:
         return
     assert isinstance(value, int if whole else float)

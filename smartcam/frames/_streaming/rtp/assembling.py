@@ -47,8 +47,8 @@ class OpenUnit(ABC):
         parts: received bytes, in order.
     """
 
-    def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
-        self.timestamp, self.whole, self.arrived = timestamp, whole, arrived
+    def __init__(self, timestamp: int, unbroken: bool, arrived: float) -> None:
+        self.timestamp, self.whole, self.arrived = timestamp, unbroken, arrived
         self.parts: list[bytes] = []
         self.size = 0
         self.has_picture = False
@@ -79,7 +79,7 @@ class OpenUnit(ABC):
 class UnitKind(Protocol):
     """The kind of access units in a stream's payloads."""
 
-    def open(self, timestamp: int, whole: bool, arrived: float, /) -> OpenUnit:
+    def open(self, timestamp: int, unbroken: bool, arrived: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
@@ -98,8 +98,8 @@ class NalUnit(OpenUnit):
     PART: ClassVar[int]
     """Kind of a packet with a fragment of a unit."""
 
-    def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
-        super().__init__(timestamp, whole, arrived)
+    def __init__(self, timestamp: int, unbroken: bool, arrived: float) -> None:
+        super().__init__(timestamp, unbroken, arrived)
         self._part_of = -1  # kind of the current fragmented unit; -1: none
 
     @staticmethod

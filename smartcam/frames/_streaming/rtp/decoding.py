@@ -34,7 +34,7 @@ FAILURE_GRACE: Final = 3.0
 DRAIN_TIMEOUT: Final = 5.0
 """Seconds for decoding queued frames after a stream's end."""
 
-DRAIN_LOOK_INTERVAL: Final = 0.005
+DRAIN_CHECK_INTERVAL: Final = 0.005
 """Seconds between two checks of the queue after a stream's end."""
 
 
@@ -89,7 +89,7 @@ class UnitDecoding:
         self._size = plan.size or (plan.coding.size_in(plan.sets) if plan.sets else None)
         self._loop = asyncio.get_running_loop()
         self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
-        self._came = asyncio.Event()
+        self._arrived = asyncio.Event()
         self.overflows = 0
         self._source: UnitSource | None = None
         self._skipped = 0  # number of units dropped since the last decoded one
@@ -142,19 +142,19 @@ class UnitDecoding:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(DRAIN_TIMEOUT):
                 while self._units and not self._ended:  # noqa: ASYNC110 - there is no event
-                    await asyncio.sleep(DRAIN_LOOK_INTERVAL)
+                    await asyncio.sleep(DRAIN_CHECK_INTERVAL)
         self.over(error)
 
     def take(self, units: list[AccessUnit]) -> None:
         """Queue encoded frames for the decoder: all, or none if there are too many."""
         source = self._source
         assert source is not None  # noqa: S101 - set by begin
-        self._units += [(one, source.utc(one.timestamp)) for one in units]
+        self._units += [(unit, source.utc(unit.timestamp)) for unit in units]
         if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
             self._skipped += len(self._units)
-            self._missed += sum(self._pace.lost(one) for one, _ in self._units)
-            self._anew |= any(one.begins for one, _ in self._units)
+            self._missed += sum(self._pace.lost(unit) for unit, _ in self._units)
+            self._anew |= any(unit.begins for unit, _ in self._units)
             self._units.clear()
             source.want_picture()
         if self._idle and self._units and self._run.short and not self._ended:
@@ -163,7 +163,7 @@ class UnitDecoding:
             except Exception as exc:  # noqa: BLE001 - passed on to readers
                 self._fail(exc)
         if self._units:
-            self._came.set()
+            self._arrived.set()
 
     def _fail(self, exc: Exception) -> None:
         """Report an error of any kind to the sink."""
@@ -178,9 +178,9 @@ class UnitDecoding:
         try:
             while not self._ended:
                 if not self._units:
-                    self._came.clear()
+                    self._arrived.clear()
                     self._idle = True
-                    await self._came.wait()
+                    await self._arrived.wait()
                 self._idle = False
                 if self._units:
                     await self._decode_next()

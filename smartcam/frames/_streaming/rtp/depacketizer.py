@@ -100,8 +100,8 @@ class Depacketizer:
         """Return the sequence numbers of missing packets."""
         if not self._held or self._next is None:
             return []
-        gone = (one for one in range(self._next, max(self._held)) if one not in self._held)
-        return [one & 0xFFFF for one in gone]
+        gone = (number for number in range(self._next, max(self._held)) if number not in self._held)
+        return [number & 0xFFFF for number in gone]
 
     def tail(self) -> int | None:
         """Return the next sequence number of the open frame.
@@ -139,18 +139,18 @@ class Depacketizer:
         """Return a packet's number with wraps counted; None for a duplicate or late packet."""
         if self._next is None:
             self._next = sequence
-        off = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
-        if not -MAX_PACKETS_LATE <= off <= MAX_PACKETS_AHEAD:
+        distance = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
+        if not -MAX_PACKETS_LATE <= distance <= MAX_PACKETS_AHEAD:
             if sequence != self._after_jump:
                 self._after_jump = sequence + 1 & 0xFFFF
                 return None
             self._damage_open()
             self._begin()
             self.streams += 1
-            self._next, off = sequence, 0
+            self._next, distance = sequence, 0
         self._after_jump = None
-        place = self._next + off
-        return None if off < 0 or place in self._held else place
+        place = self._next + distance
+        return None if distance < 0 or place in self._held else place
 
     def _ready(self, at_once: bool) -> list[AccessUnit]:
         """Return the frames of the packets before the first missing one."""
@@ -193,8 +193,8 @@ class Depacketizer:
         self.proofs += self._marked and self._unbroken and not again
         if again and self._unbroken and packet.payload:
             self._marks_lie, self.proofs = True, 0
-        whole = (self._unbroken or self._kind.begins(packet.payload)) and not again
-        opened = self._kind.open(packet.timestamp, whole, now)
+        unbroken = (self._unbroken or self._kind.begins(packet.payload)) and not again
+        opened = self._kind.open(packet.timestamp, unbroken, now)
         before, self._parameters = self._parameters, None
         if before is not None and self._unbroken:
             opened.parts, opened.size, opened.arrived = before.parts, before.size, before.arrived

@@ -95,7 +95,7 @@ class RtpDriver(FrameDriver):
         try:
             await self.start(first)
             async with asyncio.timeout(self._plan.timeout):
-                frame = await first.came
+                frame = await first.outcome
         except TimeoutError:
             raise FrameSourceError(
                 f"{self.name}: expected a whole picture of H.264 with payload type "
@@ -145,19 +145,19 @@ class FirstPicture(FrameSink):
     """A sink that waits for one picture."""
 
     def __init__(self) -> None:
-        self.came: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
+        self.outcome: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
 
     def frame(self, frame: Frame) -> None:
-        if not self.came.done():
-            self.came.set_result(frame)
+        if not self.outcome.done():
+            self.outcome.set_result(frame)
 
     def lost(self, count: int) -> None:
         pass
 
     def ended(self, error: FrameSourceError | None) -> None:
-        if error is not None and not self.came.done():
-            self.came.set_exception(error)
-            self.came.exception()  # mark the error as retrieved
+        if error is not None and not self.outcome.done():
+            self.outcome.set_exception(error)
+            self.outcome.exception()  # mark the error as retrieved
 
 
 class _RtpPlan(NamedTuple):
@@ -189,7 +189,7 @@ class _RtpStream:
             plan.payload,
             plan.repair,
             self._decoding.take,
-            self._gone,
+            self._on_goodbye,
             (plan.only,) * bool(plan.only),
         )
 
@@ -216,7 +216,7 @@ class _RtpStream:
         """Return the counts of packets received."""
         return self._receiver.statistics(self._decoding.overflows)
 
-    def _gone(self, reason: str) -> None:
+    def _on_goodbye(self, reason: str) -> None:
         why = f" ({reason})" if reason else ""
         self._decoding.over(FrameSourceError(f"{self._plan.name}: the sender said goodbye{why}"))
 

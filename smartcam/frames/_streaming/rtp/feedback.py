@@ -47,7 +47,7 @@ class RtpReceiver:
     age: float
 
 
-class _HeardReceiver(NamedTuple):
+class _ReportingReceiver(NamedTuple):
     address: str
     block: ReportBlock
     round_trip: float | None
@@ -63,25 +63,27 @@ class Audience:
 
     def __init__(self, ssrc: int) -> None:
         self._nothing = ReportBlock(ssrc, 0, 0, 0, 0)
-        self._heard: dict[int, _HeardReceiver] = {}
+        self._receivers: dict[int, _ReportingReceiver] = {}
 
     def report(self, report: ReceiverReport, address: str) -> bool:
         """Record a report; return True if it is the first of its receiver."""
         now = time.monotonic()
         self._forget(now)
-        new = report.ssrc not in self._heard
-        if new and len(self._heard) >= MAX_RECEIVERS:
+        new = report.ssrc not in self._receivers
+        if new and len(self._receivers) >= MAX_RECEIVERS:
             return False
-        known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
-        block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
+        known = self._receivers.get(
+            report.ssrc, _ReportingReceiver(address, self._nothing, None, now)
+        )
+        block = next((block for block in report.blocks if block.ssrc == self._nothing.ssrc), None)
         if block is not None:  # urgent requests have no report block
-            known = _HeardReceiver(address, block, _round_trip(block), now)
-        self._heard[report.ssrc] = known._replace(at=now)
+            known = _ReportingReceiver(address, block, _round_trip(block), now)
+        self._receivers[report.ssrc] = known._replace(at=now)
         return new
 
     def left(self, ssrc: int) -> None:
         """Forget a receiver that said goodbye."""
-        self._heard.pop(ssrc, None)
+        self._receivers.pop(ssrc, None)
 
     def receivers(self) -> tuple[RtpReceiver, ...]:
         """Return the reporting receivers."""
@@ -89,19 +91,21 @@ class Audience:
         self._forget(now)
         return tuple(
             RtpReceiver(
-                one.address,
-                one.block.fraction / 256,
-                one.block.lost,
-                one.block.jitter / CLOCK_RATE,
-                one.round_trip,
-                now - one.at,
+                receiver.address,
+                receiver.block.fraction / 256,
+                receiver.block.lost,
+                receiver.block.jitter / CLOCK_RATE,
+                receiver.round_trip,
+                now - receiver.at,
             )
-            for one in self._heard.values()
+            for receiver in self._receivers.values()
         )
 
     def _forget(self, now: float) -> None:
-        self._heard = {
-            ssrc: one for ssrc, one in self._heard.items() if now - one.at < RECEIVER_TIMEOUT
+        self._receivers = {
+            ssrc: receiver
+            for ssrc, receiver in self._receivers.items()
+            if now - receiver.at < RECEIVER_TIMEOUT
         }
 
 
@@ -134,12 +138,12 @@ class PacketHistory:
 
     def again(self, sequence: int) -> bytes | None:
         """Return a packet to send again; None if it is too old or was sent too often."""
-        found = self._sent.get(sequence)
+        packet = self._sent.get(sequence)
         if (
-            found is None
-            or found.times >= MAX_RESENDS
-            or time.monotonic() - found.at > MAX_RESEND_AGE
+            packet is None
+            or packet.times >= MAX_RESENDS
+            or time.monotonic() - packet.at > MAX_RESEND_AGE
         ):
             return None
-        found.times += 1
-        return found.data
+        packet.times += 1
+        return packet.data

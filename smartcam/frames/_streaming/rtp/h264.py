@@ -36,15 +36,15 @@ def units(access_unit: bytes) -> list[bytes]:
     place = data.find(b"\0\0\1")
     if place < 0 or data[:place].strip(b"\0"):
         raise _wrong("a start code first", data)
-    found = []
+    units_ready = []
     while place >= 0:
         after = data.find(b"\0\0\1", place + 3)
         unit = data[place + 3 : after if after >= 0 else len(data)].rstrip(b"\0")
         if not unit or unit[0] & 0x80 or not 1 <= unit[0] & 0x1F < STAP_A:
             raise _wrong("units of kinds 1 to 23", unit)
-        found.append(unit)
+        units_ready.append(unit)
         place = after
-    return found
+    return units_ready
 
 
 def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
@@ -126,11 +126,11 @@ class H264Packetizer:
         self.octets_made += sum(map(len, payloads))
         return made
 
-    def _groups(self, found: list[bytes]) -> Iterator[list[bytes]]:
+    def _groups(self, units_ready: list[bytes]) -> Iterator[list[bytes]]:
         """Yield groups of units for one packet: parameter sets and messages, as far as they fit."""
         group: list[bytes] = []
-        for unit in found:
-            fits = 1 + sum(2 + len(one) for one in (*group, unit)) <= self._mtu
+        for unit in units_ready:
+            fits = 1 + sum(2 + len(unit_) for unit_ in (*group, unit)) <= self._mtu
             if group and (unit[0] & 0x1F in SLICES or not fits):
                 yield group
                 group = []
@@ -198,8 +198,8 @@ class H264Units:
         return kind in (SPS, DELIMITER)
 
 
-def _wrong(expected: str, got: bytes) -> FrameFormatError:
+def _wrong(expected: str, actual: bytes) -> FrameFormatError:
     return FrameFormatError(
-        f"H264: expected {expected} (annex B), got {len(got)} bytes that begin with "
-        f"{got[:8].hex(' ') or 'nothing'}"
+        f"H264: expected {expected} (annex B), got {len(actual)} bytes that begin with "
+        f"{actual[:8].hex(' ') or 'nothing'}"
     )

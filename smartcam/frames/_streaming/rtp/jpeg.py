@@ -65,9 +65,9 @@ class JpegUnits:
         self.size = size
         self.tables: dict[int, tuple[bytes, ...]] = {}
 
-    def open(self, timestamp: int, whole: bool, arrived: float) -> JpegUnit:
+    def open(self, timestamp: int, unbroken: bool, arrived: float) -> JpegUnit:
         """Return a new picture."""
-        return JpegUnit(self, timestamp, whole, arrived)
+        return JpegUnit(self, timestamp, unbroken, arrived)
 
     @staticmethod
     def begins(payload: bytes) -> bool:
@@ -78,8 +78,8 @@ class JpegUnits:
 class JpegUnit(OpenUnit):
     """One picture."""
 
-    def __init__(self, kind: JpegUnits, timestamp: int, whole: bool, arrived: float) -> None:
-        super().__init__(timestamp, whole, arrived)
+    def __init__(self, kind: JpegUnits, timestamp: int, unbroken: bool, arrived: float) -> None:
+        super().__init__(timestamp, unbroken, arrived)
         self._of = kind
         self._next = 0  # offset of the next piece in the picture
 
@@ -99,8 +99,8 @@ class JpegUnit(OpenUnit):
             tables = self._tables(payload, place)
             if tables is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
                 return False
-            place, found = tables
-            self.parts.append(self._head(payload, found, restart))
+            place, tables_found = tables
+            self.parts.append(self._head(payload, tables_found, restart))
         piece = payload[place:]
         self._next += len(piece)
         self.parts.append(piece)
@@ -119,12 +119,12 @@ class JpegUnit(OpenUnit):
         if not length:
             known = self._of.tables.get(quality)
             return None if known is None else (place, known)
-        found = cut(payload[place : place + length], wide)
-        if len(found) < 1 or place + length > len(payload):
+        table_values = cut(payload[place : place + length], wide)
+        if len(table_values) < 1 or place + length > len(payload):
             return None
         if quality < 255 and len(self._of.tables) < MAX_QUANTIZATION_TABLES:
-            self._of.tables[quality] = found
-        return place + length, found
+            self._of.tables[quality] = table_values
+        return place + length, table_values
 
     def _head(self, payload: bytes, tables: tuple[bytes, ...], restart: bytes) -> bytes:
         width, height = payload[6] * 8, payload[7] * 8
@@ -149,21 +149,21 @@ def scaled(quality: int) -> tuple[bytes, ...]:
     """Return the tables of a quality from 1 to 99."""
     factor = 5000 // quality if quality < 50 else 200 - 2 * quality
     return tuple(
-        bytes(min(255, max(1, (int(one) * factor + 50) // 100)) for one in table.split())
+        bytes(min(255, max(1, (int(number) * factor + 50) // 100)) for number in table.split())
         for table in (_LUMA, _CHROMA)
     )
 
 
 def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
     """Return the tables in ``data``: each has 64 bytes, or 128 if its bit in ``wide`` is set."""
-    found: list[bytes] = []
-    while data and len(found) < 4:
-        size = 128 if wide >> len(found) & 1 else 64
+    tables: list[bytes] = []
+    while data and len(tables) < 4:
+        size = 128 if wide >> len(tables) & 1 else 64
         if len(data) < size:
             return ()
-        found.append(data[:size])
+        tables.append(data[:size])
         data = data[size:]
-    return tuple(found)
+    return tuple(tables)
 
 
 def size_in(picture: bytes) -> tuple[int, int] | None:

@@ -108,15 +108,15 @@ class ReportBlock(NamedTuple):
     def pack(self) -> bytes:
         """Return the block's 24 bytes; ``lost`` is limited to 24 bits."""
         lost = max(-(1 << 23), min(self.lost, (1 << 23) - 1)) & 0xFFFFFF
-        rest = (self.highest, self.jitter, self.last_report, self.delay)
-        return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *rest)
+        numbers = (self.highest, self.jitter, self.last_report, self.delay)
+        return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *numbers)
 
     @classmethod
     def parse(cls, data: bytes) -> ReportBlock:
         """Read 24 bytes."""
-        ssrc, lost, *rest = _BLOCK.unpack(data)
+        ssrc, lost, *numbers = _BLOCK.unpack(data)
         signed = ((lost & 0xFFFFFF) ^ 0x800000) - 0x800000
-        return cls(ssrc, lost >> 24, signed, *rest)
+        return cls(ssrc, lost >> 24, signed, *numbers)
 
 
 class SenderReport(NamedTuple):
@@ -152,7 +152,7 @@ class ReceiverReport(NamedTuple):
 
     def pack(self) -> bytes:
         """Return the report's bytes."""
-        body = self.ssrc.to_bytes(4, "big") + b"".join(one.pack() for one in self.blocks)
+        body = self.ssrc.to_bytes(4, "big") + b"".join(block.pack() for block in self.blocks)
         return _packet(RR, len(self.blocks), body)
 
 
@@ -177,7 +177,7 @@ class Goodbye(NamedTuple):
 
     def pack(self) -> bytes:
         """Return the packet's bytes; a reason is cut after 255 bytes."""
-        body = b"".join(one.to_bytes(4, "big") for one in self.ssrcs)
+        body = b"".join(ssrc.to_bytes(4, "big") for ssrc in self.ssrcs)
         if self.reason:
             reason = self.reason.encode()[:255]
             body += bytes((len(reason),)) + reason
@@ -204,8 +204,12 @@ class PacketsMissing(NamedTuple):
         left = list(self.sequences)
         while left:
             first = left[0]
-            mask = sum(1 << near - 1 for one in left if 1 <= (near := one - first & 0xFFFF) <= 16)
-            left = [one for one in left if one - first & 0xFFFF > 16]
+            mask = sum(
+                1 << distance - 1
+                for number in left
+                if 1 <= (distance := number - first & 0xFFFF) <= 16
+            )
+            left = [number for number in left if number - first & 0xFFFF > 16]
             body += struct.pack("!HH", first, mask)
         return _packet(RTPFB, NACK, body)
 
@@ -228,7 +232,7 @@ Report: TypeAlias = (
 
 def compound(*reports: Report) -> bytes:
     """Return one datagram of RTCP; the first should be a sender's or a receiver's report."""
-    return b"".join(one.pack() for one in reports)
+    return b"".join(report.pack() for report in reports)
 
 
 def parse_rtcp(data: bytes) -> list[Report]:
@@ -237,7 +241,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
     Raises:
         MessageError: a length or count is wrong, or the first packet is no report.
     """
-    found: list[Report] = []
+    reports: list[Report] = []
     place = 0
     while place < len(data) or not place:
         if len(data) - place < 4:
@@ -258,7 +262,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
         read = _READERS.get(kind)
         if read is not None:
             try:
-                found += read(first & 0x1F, body)
+                reports += read(first & 0x1F, body)
             except (struct.error, IndexError) as exc:
                 raise MessageError(
                     f"RTCP: a packet of type {kind} with a count of {first & 0x1F}: its "
@@ -267,7 +271,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
                     data=data[place:end],
                 ) from exc
         place = end
-    return found
+    return reports
 
 
 def is_rtcp(data: bytes) -> bool:
@@ -320,8 +324,8 @@ def _missing(kind: int, body: bytes) -> Iterable[Report]:
         return
     sequences: dict[int, None] = {}
     for first, mask in struct.iter_unpack("!HH", body[8:]):
-        near = [place + 1 for place in range(16) if mask >> place & 1]
-        sequences |= dict.fromkeys(first + one & 0xFFFF for one in (0, *near))
+        following = [place + 1 for place in range(16) if mask >> place & 1]
+        sequences |= dict.fromkeys(first + offset & 0xFFFF for offset in (0, *following))
     yield PacketsMissing(ssrc, media, tuple(sequences))
 
 
@@ -367,5 +371,5 @@ def _unpadded(body: bytes, last: bool, place: int, data: bytes) -> bytes:
     return body[:-padding]
 
 
-def _cut_off(what: str, expected: int, data: bytes | memoryview) -> MessageError:
-    return MessageError(f"{what}: expected {expected} bytes or more, got {len(data)}", data=data)
+def _cut_off(label: str, expected: int, data: bytes | memoryview) -> MessageError:
+    return MessageError(f"{label}: expected {expected} bytes or more, got {len(data)}", data=data)

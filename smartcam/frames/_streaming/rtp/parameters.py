@@ -186,12 +186,13 @@ def _lines(
     yield f"a=rtpmap:{payload_type} H264/{CLOCK_RATE}"
     parameters = ["packetization-mode=1"]
     if sets is not None:
-        shown = ",".join(base64.b64encode(one).decode() for one in sets)
+        shown = ",".join(base64.b64encode(parameter_set).decode() for parameter_set in sets)
         parameters += [f"profile-level-id={sets[0][1:4].hex()}", f"sprop-parameter-sets={shown}"]
     yield f"a=fmtp:{payload_type} {'; '.join(parameters)}"
 
 
-def _wrong(codec: str, expected: str, got: bytes) -> FrameFormatError:
+def _wrong(codec: str, expected: str, actual: bytes) -> FrameFormatError:
     return FrameFormatError(
-        f"{codec}: expected {expected}, got {len(got)} bytes that begin with {got[:8].hex(' ')}"
+        f"{codec}: expected {expected}, got {len(actual)} bytes that begin with "
+        f"{actual[:8].hex(' ')}"
     )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_WAITING_PACKETS: Final = 1024
 """Largest number of packets that wait for missing packets."""
 
-LOOK_INTERVAL: Final = 0.005
+CHECK_INTERVAL: Final = 0.005
 """Seconds between two checks for missing packets."""
 
 RESEND_INTERVAL: Final = 0.02
@@ -66,9 +66,9 @@ class RtpStatistics:
 
     Attributes:
         packets: number of received packets, duplicates included.
-        lost: packets that never came.
+        lost: packets that never arrived.
         repaired: packets received after a request.
-        duplicates: packets that came twice or too late.
+        duplicates: packets that arrived twice or too late.
         damaged: incomplete encoded frames.
         overflows: number of times that frames were dropped because decoding was too slow.
         strange: datagrams from other senders or without RTP.
@@ -115,7 +115,7 @@ class StreamReceiver:
         payload_type: payload type of the stream's packets.
         repair: seconds to wait for a missing packet after a request.
         done: function that is called with complete encoded frames.
-        gone: function that is called when the sender says goodbye.
+        gone: function that is called with the reason when the sender ends the stream.
         only: addresses of accepted hosts; empty: any host.
         kind: kind of the payloads; None: H.264.
         agreed: whether the stream was negotiated: then a new stream of the same host replaces it at
@@ -123,7 +123,7 @@ class StreamReceiver:
         proofs: number of earlier frames of the sender with a right marker.
 
     Attributes:
-        heard: time of the stream's last packet, on the loop's clock.
+        last_packet_at: time of the stream's last packet, on the loop's clock.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class StreamReceiver:
         proofs: int = 0,
     ) -> None:
         self._pair, self._payload_type, self._repair = pair, payload_type, repair
-        self._done, self._gone, self._only = done, gone, only
+        self._done, self._on_goodbye, self._only = done, gone, only
         self._agreed = agreed
         self._loop = asyncio.get_running_loop()
         self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, kind, wary=True)
@@ -151,7 +151,7 @@ class StreamReceiver:
         self._reports_to: tuple[Any, ...] = ()
         self._ssrc = secrets.randbits(32)
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
-        self._asked: dict[int, float] = {}
+        self._requested_at: dict[int, float] = {}
         self._vain = 0
         self._repaired = self._strange = self._packets = 0
         self._made: list[AccessUnit] = []
@@ -163,7 +163,7 @@ class StreamReceiver:
         pair.read(self._packet, self._report_came, self._read)
 
     def close(self) -> None:
-        """Say goodbye and stop receiving. Idempotent."""
+        """Send the RTCP message BYE and stop receiving. Idempotent."""
         for timer in (self._tick, self._next_report):
             if timer is not None:
                 timer.cancel()
@@ -192,7 +192,7 @@ class StreamReceiver:
         return self._depacketizer.proofs
 
     def utc(self, timestamp: int) -> float | None:
-        """Return a time on the sender's wall clock; None: not reported yet."""
+        """Return a time on the sender's wall clock; None if the sender has not reported it yet."""
         return None if self._reception is None else self._reception.utc(timestamp)
 
     def want_picture(self) -> None:
@@ -221,7 +221,7 @@ class StreamReceiver:
         self.last_packet_at = now = self._loop.time()
         self._packets += 1
         ours.packet(packet, now)
-        if self._asked.pop(packet.sequence, None) is not None:
+        if self._requested_at.pop(packet.sequence, None) is not None:
             self._repaired += 1
             self._vain = 0
         self._made += self._depacketizer.take(packet, now)
@@ -244,7 +244,7 @@ class StreamReceiver:
         self._sender = sender
         if self._reports_to[:1] != sender[:1]:
             self._reports_to = (sender[0], sender[1] + 1, *sender[2:])
-        self._asked.clear()
+        self._requested_at.clear()
         self._vain = 0
         self._report()
         self.want_picture()
@@ -275,7 +275,7 @@ class StreamReceiver:
         taken = self._depacketizer
         waits = taken.waits_since() is not None or taken.marked_at is not None
         if self._tick is None and (waits or self._tail_due()):
-            self._tick = self._loop.call_later(LOOK_INTERVAL, self._look)
+            self._tick = self._loop.call_later(CHECK_INTERVAL, self._look)
         if made:
             self._done(made)
 
@@ -288,7 +288,7 @@ class StreamReceiver:
         self._made += self._depacketizer.end_marked(now - MARKER_GRACE)
         if self._depacketizer.lost > lost:
             self._vain += 1
-            self._asked.clear()
+            self._requested_at.clear()
             self.want_picture()
         elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
             tail = self._depacketizer.tail()
@@ -314,10 +314,16 @@ class StreamReceiver:
         return self._depacketizer.tail() is not None
 
     def _ask(self, missing: list[int], now: float) -> None:
-        asked = self._asked
-        due = [one for one in missing if now - asked.get(one, float("-inf")) >= RESEND_INTERVAL]
+        asked_at = self._requested_at
+        due = [
+            number
+            for number in missing
+            if now - asked_at.get(number, float("-inf")) >= RESEND_INTERVAL
+        ]
         if due and self._reception is not None:
-            self._asked = {one: asked.get(one, now) for one in missing} | dict.fromkeys(due, now)
+            self._requested_at = {
+                number: asked_at.get(number, now) for number in missing
+            } | dict.fromkeys(due, now)
             self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
     def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
@@ -340,7 +346,7 @@ class StreamReceiver:
             if report.ntp >> 32:  # a sender without a clock sends 0
                 ours.sender(report, self._loop.time())
         elif isinstance(report, wire.Goodbye) and ours.ssrc in report.ssrcs:
-            self._gone(report.reason)
+            self._on_goodbye(report.reason)
 
     def _report(self) -> None:
         self._send_report()

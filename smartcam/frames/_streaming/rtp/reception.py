@@ -35,7 +35,7 @@ class Reception:
         self._transit: int | None = None
         self._jitter = 0.0
         self._before = (0, 0)  # expected and received packets at the last report
-        self._heard: tuple[SenderReport, float] | None = None
+        self._sender_report: tuple[SenderReport, float] | None = None
 
     @property
     def jitter(self) -> float:
@@ -53,13 +53,13 @@ class Reception:
         self._highest += ahead
         transit = int(now * CLOCK_RATE) - packet.timestamp
         if self._transit is not None:
-            off = (transit - self._transit + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
-            self._jitter += (abs(off) - self._jitter) / 16
+            difference = (transit - self._transit + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+            self._jitter += (abs(difference) - self._jitter) / 16
         self._transit = transit
 
     def sender(self, report: SenderReport, now: float) -> None:
         """Record a sender report that came at a moment."""
-        self._heard = (report, now)
+        self._sender_report = (report, now)
 
     def block(self, now: float) -> ReportBlock:
         """Return a report block for the time since the last report."""
@@ -69,8 +69,8 @@ class Reception:
         lost_now = expected_now - received_now
         fraction = min(255, 256 * lost_now // expected_now) if lost_now > 0 < expected_now else 0
         last, delay = 0, 0
-        if self._heard is not None:
-            report, at = self._heard
+        if self._sender_report is not None:
+            report, at = self._sender_report
             last, delay = middle(report.ntp), int(max(0.0, now - at) * 65536) & 0xFFFF_FFFF
         return ReportBlock(
             self.ssrc,
@@ -87,8 +87,8 @@ class Reception:
 
         None: the sender has not reported its clock yet.
         """
-        if self._heard is None:
+        if self._sender_report is None:
             return None
-        report = self._heard[0]
+        report = self._sender_report[0]
         since = (timestamp - report.timestamp + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
         return report.ntp / (1 << 32) - SECONDS_FROM_1900_TO_1970 + since / CLOCK_RATE

@@ -197,18 +197,18 @@ class RtpSender:
         if self._fps is None and rates:
             self._encoder = self._made_encoder(min(max(rates[0], 0.01), 1000.0))
         host, port = self._to
-        who = f"RTP to {host}:{port}"
-        self._endpoint = to = await resolved(host, port, who)
+        label = f"RTP to {host}:{port}"
+        self._endpoint = to = await resolved(host, port, label)
         try:
             self._link = link = _RtpOutlet(SocketPair.sending(to, self._ttl), to)
         except OSError as exc:
-            raise FrameSourceError(f"{who}: {exc}", source=self._source.name) from exc
+            raise FrameSourceError(f"{label}: {exc}", source=self._source.name) from exc
         try:
             await self._codecs.__aenter__()
             link.pair.read(None, partial(self._reported, link))
             self._tasks = [
-                asyncio.create_task(work, name=f"{what} to {to}")
-                for work, what in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
+                asyncio.create_task(work, name=f"{label} to {to}")
+                for work, label in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
             ]
         except BaseException:
             self._link = None

@@ -59,7 +59,7 @@ class Endpoint(NamedTuple):
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-async def resolved(host: str, port: int, who: str) -> Endpoint:
+async def resolved(host: str, port: int, label: str) -> Endpoint:
     """Return a host's address.
 
     Raises:
@@ -67,12 +67,12 @@ async def resolved(host: str, port: int, who: str) -> Endpoint:
     """
     loop = asyncio.get_running_loop()
     try:
-        found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        addresses = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as exc:
         raise FrameSourceError(
-            f"{who}: no address of {host!r} is known: {exc}", source=who
+            f"{label}: no address of {host!r} is known: {exc}", source=label
         ) from exc
-    family, *_, where = found[0]
+    family, *_, where = addresses[0]
     return Endpoint(family, str(where[0]), port)
 
 
@@ -112,14 +112,14 @@ class SocketPair:
         with contextlib.ExitStack() as stack:
             made = []
             for port in (at.port, at.port + 1):
-                one = stack.enter_context(_socket(at.family))
-                _grown(one)
+                sock = stack.enter_context(_socket(at.family))
+                _grown(sock)
                 if at.multicast:
-                    one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                one.bind((at.host if sys.platform == "linux" or not at.multicast else "", port))
+                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                sock.bind((at.host if sys.platform == "linux" or not at.multicast else "", port))
                 if at.multicast:
-                    _join(one, at)
-                made.append(one)
+                    _join(sock, at)
+                made.append(sock)
             stack.pop_all()
         return cls(*made)
 
@@ -160,9 +160,9 @@ class SocketPair:
                         raise
                     continue
                 rtp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-                for one in (rtp, rtcp):
+                for sock in (rtp, rtcp):
                     if to.multicast:
-                        _hops(one, to.family, ttl)
+                        _hops(sock, to.family, ttl)
                 stack.pop_all()
                 return cls(rtp, rtcp)
         raise AssertionError("unreachable")
@@ -180,13 +180,13 @@ class SocketPair:
             rtcp: function for reports.
             read: function that is called after each batch.
         """
-        for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
+        for sock, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
             if take is not None:
-                self._loop.add_reader(one, self._readable, one, take, read)
+                self._loop.add_reader(sock, self._readable, sock, take, read)
 
     def _readable(
         self,
-        one: socket.socket,
+        sock: socket.socket,
         take: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None],
     ) -> None:
@@ -194,7 +194,7 @@ class SocketPair:
             if self._closed:
                 return
             try:
-                data, sender = one.recvfrom(65536)
+                data, sender = sock.recvfrom(65536)
             except BlockingIOError:
                 break
             except OSError:  # an error of an earlier sent datagram; reading goes on
@@ -226,10 +226,10 @@ class SocketPair:
         if self._closed:
             return
         self._closed = True
-        for one in (self.rtp, self.rtcp):
-            self._loop.remove_reader(one)
-            self._loop.remove_writer(one)
-            one.close()
+        for sock in (self.rtp, self.rtcp):
+            self._loop.remove_reader(sock)
+            self._loop.remove_writer(sock)
+            sock.close()
 
 
 def _socket(family: socket.AddressFamily) -> socket.socket:
@@ -238,26 +238,26 @@ def _socket(family: socket.AddressFamily) -> socket.socket:
     return made
 
 
-def _grown(one: socket.socket) -> None:
+def _grown(sock: socket.socket) -> None:
     for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
         with contextlib.suppress(OSError):  # the second option is for privileged processes
-            one.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
+            sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
 
 
-def _join(one: socket.socket, group: Endpoint) -> None:
+def _join(sock: socket.socket, group: Endpoint) -> None:
     address = socket.inet_pton(group.family, group.host.partition("%")[0])
     if group.family == socket.AF_INET6:
         scope = group.host.partition("%")[2]
         index = socket.if_nametoindex(scope) if scope else 0
-        one.setsockopt(
+        sock.setsockopt(
             socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, address + struct.pack("@I", index)
         )
     else:
-        one.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, address + struct.pack("=I", 0))
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, address + struct.pack("=I", 0))
 
 
-def _hops(one: socket.socket, family: socket.AddressFamily, ttl: int) -> None:
+def _hops(sock: socket.socket, family: socket.AddressFamily, ttl: int) -> None:
     if family == socket.AF_INET6:
-        one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, ttl)
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, ttl)
     else:
-        one.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, ttl)
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, ttl)

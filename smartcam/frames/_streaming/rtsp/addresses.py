@@ -87,8 +87,8 @@ def requested_transport(header: str, client: str) -> RequestedTransport:
 
 
 def _read(text: str, client: str) -> RequestedTransport | None:
-    protocol, *rest = (part.strip() for part in text.split(";"))
-    options = {key.lower(): value for key, _, value in (one.partition("=") for one in rest)}
+    protocol, *parts = (part.strip() for part in text.split(";"))
+    options = {key.lower(): value for key, _, value in (option.partition("=") for option in parts)}
     tcp = protocol.upper() == "RTP/AVP/TCP"
     if not tcp and protocol.upper() not in ("RTP/AVP", "RTP/AVP/UDP"):
         return None
@@ -104,11 +104,11 @@ def _read(text: str, client: str) -> RequestedTransport | None:
 
 
 def _pair(text: str, least: int, most: int) -> tuple[int, int] | None:
-    found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text, re.ASCII)
-    if found is None:
+    match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text, re.ASCII)
+    if match is None:
         return None
-    first = int(found[1])
-    second = int(found[2]) if found[2] else first + 1
+    first = int(match[1])
+    second = int(match[2]) if match[2] else first + 1
     if not (least <= first <= most and least <= second <= most) or first == second:
         return None
     return first, second

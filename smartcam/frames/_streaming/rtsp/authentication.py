@@ -65,8 +65,8 @@ class Authentication:
         uri = parts.get("uri", "")
         if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
             return False  # live555 names the stream also in requests for its track
-        asked = _md5(request.method.encode(), uri.encode())
-        response = _md5(self._hashed.encode(), nonce.encode(), asked.encode())
+        hash_of_request = _md5(request.method.encode(), uri.encode())
+        response = _md5(self._hashed.encode(), nonce.encode(), hash_of_request.encode())
         return _same(parts.get("response", "").lower(), response) and all(same)
 
     def _accepts_basic(self, header: str) -> bool:
@@ -79,9 +79,9 @@ class Authentication:
     def challenge(self, nonce: str) -> tuple[tuple[str, str], ...]:
         """Return the headers that request authorization."""
         digest = f'Digest realm="{REALM}", nonce="{nonce}", algorithm="MD5"'
-        asked = (("WWW-Authenticate", digest),)
+        challenges = (("WWW-Authenticate", digest),)
         basic = (("WWW-Authenticate", f'Basic realm="{REALM}"'),)
-        return asked + basic if self.basic else asked
+        return challenges + basic if self.basic else challenges
 
 
 class PasswordGate:
@@ -117,11 +117,11 @@ def _parts(header: str) -> dict[str, str]:
     place = 0
     header = header.strip()
     while place < len(header):
-        found = _PART.match(header, place)
-        if found is None or found[1].lower() in parts:
+        match = _PART.match(header, place)
+        if match is None or match[1].lower() in parts:
             return {}
-        parts[found[1].lower()] = found[2] if found[2] is not None else found[3]
-        place = found.end()
+        parts[match[1].lower()] = match[2] if match[2] is not None else match[3]
+        place = match.end()
     return parts
 
 

@@ -101,7 +101,7 @@ class RtspConnection(asyncio.Protocol):
         self.address: tuple[str | int, ...] = ()
         self.peer: tuple[str | int, ...] = ()
         self._parser = RequestParser()
-        self._came, self._lost = asyncio.Event(), asyncio.Event()
+        self._arrived, self._lost = asyncio.Event(), asyncio.Event()
         self._serving = False  # an authorized request is being answered
         self._strays = 0
         self._closing = False
@@ -138,7 +138,7 @@ class RtspConnection(asyncio.Protocol):
         if self._closing:
             return
         self._parser.feed(data)
-        self._came.set()
+        self._arrived.set()
         if self._reading and self._parser.waiting > MAX_MESSAGE_BYTES:
             self._reading = False
             self.transport.pause_reading()
@@ -264,10 +264,10 @@ class RtspConnection(asyncio.Protocol):
         if not self._reading and not self._closing:
             self._reading = True
             self.transport.resume_reading()
-        self._came.clear()
+        self._arrived.clear()
         try:
             async with asyncio.timeout_at(end):
-                await self._came.wait()
+                await self._arrived.wait()
         except TimeoutError:
             return False
         return True

@@ -84,7 +84,7 @@ class ChannelDelivery:
 
     def _write(self, which: int, packets: list[bytes]) -> None:
         head = bytes((ord("$"), self.channels[which]))
-        pieces = (head + len(one).to_bytes(2, "big") + one for one in packets)
+        pieces = (head + len(packet).to_bytes(2, "big") + packet for packet in packets)
         self._connection.write(b"".join(pieces))
 
     def alive(self, now: float) -> bool | None:
@@ -105,7 +105,7 @@ class DatagramDelivery:
         sockets: bound sockets for RTP and RTCP.
         client: address of the client, from the RTSP connection.
         ports: ports of the client for RTP and RTCP.
-        heard: function that is called with RTCP from the client.
+        on_rtcp: function that is called with RTCP from the client.
     """
 
     def __init__(
@@ -142,8 +142,8 @@ class DatagramDelivery:
 
     def send(self, packets: list[bytes], key: bool, now: float) -> bool:
         try:
-            for one in packets:
-                self._socket.sendto(one, self._to)
+            for packet in packets:
+                self._socket.sendto(packet, self._to)
         except OSError:  # the socket is full, or there is no route now
             return False
         return True

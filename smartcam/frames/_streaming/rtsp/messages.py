@@ -96,7 +96,7 @@ class RequestParser:
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # number of searched bytes without an end of line
+        self._searched = 0  # number of searched bytes without an end of line
         self._start: tuple[str, str] | None = None  # method and URL
         self._headers: dict[str, str] = {}
 
@@ -155,25 +155,25 @@ class RequestParser:
 
     def _line(self, body: int = 0) -> bytes | None:
         """Return the next line, the last of a header only with its complete body; else None."""
-        end = self._data.find(b"\n", self._seen)
+        end = self._data.find(b"\n", self._searched)
         if end < 0 or end > MAX_LINE_BYTES:
-            self._seen = len(self._data)
-            if end > 0 or self._seen > MAX_LINE_BYTES:
+            self._searched = len(self._data)
+            if end > 0 or self._searched > MAX_LINE_BYTES:
                 _refuse(f"a line: expected {MAX_LINE_BYTES} bytes at most, got more")
             return None
         line = bytes(self._data[:end]).removesuffix(b"\r")
         if not line and len(self._data) - end - 1 < body:
             return None
         del self._data[: end + 1]
-        self._seen = 0
+        self._searched = 0
         return line
 
     def _add_header(self, line: bytes) -> None:
-        found = _HEADER.fullmatch(line)
-        if found is None:
+        match = _HEADER.fullmatch(line)
+        if match is None:
             _refuse(f"a header: expected NAME: VALUE, got {line[:60]!r}")
-        name = found[1].decode("ascii").lower()
-        value = found[2].decode("latin-1").strip()
+        name = match[1].decode("ascii").lower()
+        value = match[2].decode("latin-1").strip()
         if name in self._headers:
             if name in _ONCE:
                 _refuse(f"{name}: expected once, got it twice")
@@ -193,12 +193,12 @@ MAX_MESSAGE_BYTES: Final = 4 + 0xFFFF
 
 
 def _start_line(line: bytes) -> tuple[str, str]:
-    found = _REQUEST.fullmatch(line)
-    if found is None:
+    match = _REQUEST.fullmatch(line)
+    if match is None:
         _refuse(f"expected METHOD URL RTSP/1.0, got {line[:60]!r}")
-    if found[3] != b"1.0":
-        _refuse(f"expected RTSP/1.0, got RTSP/{found[3].decode()}", 505)
-    return found[1].decode(), found[2].decode()
+    if match[3] != b"1.0":
+        _refuse(f"expected RTSP/1.0, got RTSP/{match[3].decode()}", 505)
+    return match[1].decode(), match[2].decode()
 
 
 def _is_number(text: str) -> bool:

@@ -36,7 +36,10 @@ class UnitCutter:
         """
         if unit is not self._unit:
             packets = self._packetizer.packets(bytes(unit.data), 0)
-            self._unit, self._pieces = unit, [(one[1], one[_HEAD.size :]) for one in packets]
+            self._unit, self._pieces = (
+                unit,
+                [(packet[1], packet[_HEAD.size :]) for packet in packets],
+            )
         return self._pieces
 
 

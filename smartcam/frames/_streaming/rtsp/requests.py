@@ -56,7 +56,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
         raise RtspError(
             551, f"no option is known, {wanted[:80]!r} neither", (("Unsupported", wanted),)
         )
-    if method == "OPTIONS":  # this request needs no password
+    if method == "OPTIONS":  # OPTIONS needs no password
         return await _options(connection, request)
     connection.gate.check(request)
     for session in connection.sessions.values():
@@ -135,7 +135,7 @@ async def _delivery(
 def _channels(connection: RtspConnection, requested: RequestedTransport) -> tuple[int, int]:
     taken = set(connection.channels())
     if requested.rtp is None or requested.rtcp is None:
-        first = next(one for one in range(0, 256, 2) if not {one, one + 1} & taken)
+        first = next(channel for channel in range(0, 256, 2) if not {channel, channel + 1} & taken)
         return first, first + 1
     if {requested.rtp, requested.rtcp} & taken:
         raise RtspError(461, f"Transport: channels {requested.rtp}-{requested.rtcp} are in use")

@@ -22,7 +22,7 @@ def describe(
     """
     kind = "IP6" if ":" in host else "IP4"
     nothing = "::" if kind == "IP6" else "0.0.0.0"  # noqa: S104 - "any", to SDP
-    coded = ",".join(base64.b64encode(one).decode() for one in sets)
+    coded = ",".join(base64.b64encode(parameter_set).decode() for parameter_set in sets)
     lines = (
         "v=0",
         f"o=- {session} 1 IN {kind} {host}",

@@ -86,10 +86,10 @@ class RtspServer(Server):
         max_connections: int = 64,
         max_viewers: int = 32,
     ) -> None:
-        who = "RtspServer"
-        check_kind(sources, Mapping, "sources", "a mapping from name to source", who)
+        caller = "RtspServer"
+        check_kind(sources, Mapping, "sources", "a mapping from name to source", caller)
         for name, source in sources.items():
-            check_kind(source, FrameSource, "sources", "sources of frames", who)
+            check_kind(source, FrameSource, "sources", "sources of frames", caller)
             if not isinstance(name, str) or not NAME.fullmatch(name):
                 raise ConfigurationError(
                     "RtspServer: a name: expected 1 to 64 letters, digits and . _ ~ -, the first a "
@@ -99,19 +99,21 @@ class RtspServer(Server):
             raise ConfigurationError("RtspServer: expected a source, got none")
         for word, value in (("user", user), ("password", password)):
             if value is not None:
-                check_text(value, word, who, least=1, most=200)
-        self.host: str = check_text(host, "host", who, least=1, most=300)
-        self._authentication = Authentication(user, password, basic=check_flag(basic, "basic", who))
+                check_text(value, word, caller, least=1, most=200)
+        self.host: str = check_text(host, "host", caller, least=1, most=300)
+        self._authentication = Authentication(
+            user, password, basic=check_flag(basic, "basic", caller)
+        )
         self._sources = dict(sources)
-        self._port = check_integer(port, "port", 0, 0xFFFF, who)
-        self._fps = None if fps is None else check_number(fps, "fps", 0.01, 1000.0, who)
-        self._keyint = check_integer(keyint, "keyint", 2, 600, who)
-        self._crf = check_number(crf, "crf", 0, 51, who)
+        self._port = check_integer(port, "port", 0, 0xFFFF, caller)
+        self._fps = None if fps is None else check_number(fps, "fps", 0.01, 1000.0, caller)
+        self._keyint = check_integer(keyint, "keyint", 2, 600, caller)
+        self._crf = check_number(crf, "crf", 0, 51, caller)
         if bitrate is not None:
-            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
+            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, caller)
         self._bitrate = bitrate
-        self._max_connections = check_integer(max_connections, "max_connections", 1, 1000, who)
-        self._max_viewers = check_integer(max_viewers, "max_viewers", 1, 1000, who)
+        self._max_connections = check_integer(max_connections, "max_connections", 1, 1000, caller)
+        self._max_viewers = check_integer(max_viewers, "max_viewers", 1, 1000, caller)
         self._streams: dict[str, RtspStream] = {}
         self._serving: RtspServing | None = None
 
@@ -186,7 +188,9 @@ class RtspServer(Server):
             options = {"keyint": self._keyint, "crf": self._crf, "bitrate": self._bitrate}
             encoder = H264Encoder(StreamRuns(codecs), fps=rate, **options)  # type: ignore[arg-type]
             shared[id(source)] = SharedH264(source, encoder), rate
-        return {name: RtspStream(name, *shared[id(one)]) for name, one in self._sources.items()}
+        return {
+            name: RtspStream(name, *shared[id(source)]) for name, source in self._sources.items()
+        }
 
 
 def _rate(source: FrameSource) -> float:

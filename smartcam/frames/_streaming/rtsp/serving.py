@@ -69,10 +69,12 @@ class RtspServing:
         connections = list(self.places)
         for connection in connections:
             connection.close("the server is stopped")
-        tasks = {one.task for one in connections if one.task is not None}
+        tasks = {connection.task for connection in connections if connection.task is not None}
         if tasks:
             await asyncio.wait(tasks)
-        for shared in {id(one.shared): one.shared for one in self._streams.values()}.values():
+        for shared in {
+            id(stream.shared): stream.shared for stream in self._streams.values()
+        }.values():
             await shared.close()
         await self._codecs.close()
 

@@ -63,7 +63,7 @@ class RtspSession:
         self._offset = secrets.randbits(32)
         self._last = -1  # last timestamp without the offset
         self._wants_key, self._skips = True, False
-        self._told_at = -REPORT_INTERVAL
+        self._reported_at = -REPORT_INTERVAL
         self._heard_at = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
 
@@ -116,9 +116,9 @@ class RtspSession:
             reports = parse_rtcp(data)
         except MessageError:
             return
-        if any(isinstance(one, ReceiverReport | SenderReport) for one in reports):
+        if any(isinstance(report, ReceiverReport | SenderReport) for report in reports):
             self.keep_alive()
-        if any(isinstance(one, PictureLost) and one.media == self.ssrc for one in reports):
+        if any(isinstance(report, PictureLost) and report.media == self.ssrc for report in reports):
             self.stream.shared.key_frame()
 
     # called by the stream
@@ -152,7 +152,7 @@ class RtspSession:
     ) -> bool:
         pieces = self.stream.cutter.pieces(unit)
         packets = self._numbering.numbered(pieces, self._timestamp(ticks))
-        if now - self._told_at >= REPORT_INTERVAL:
+        if now - self._reported_at >= REPORT_INTERVAL:
             self._send_report(now)
         return delivery.send(packets, key, now)
 
@@ -170,7 +170,7 @@ class RtspSession:
         return report, SourceDescription(self.ssrc, "smartcam")
 
     def _send_report(self, now: float) -> None:
-        self._told_at = now
+        self._reported_at = now
         if self.delivery is not None:
             self.delivery.report(compound(*self._report()))
 
@@ -189,7 +189,7 @@ class RtspSession:
         elif now - self._heard_at >= SESSION_TIMEOUT:
             self.stream.silent += 1
             self._end(f"no request or report came for {SESSION_TIMEOUT} s")
-        elif self.playing and now - self._told_at >= REPORT_INTERVAL:
+        elif self.playing and now - self._reported_at >= REPORT_INTERVAL:
             self._send_report(now)
 
     def _end(self, why: str) -> None:

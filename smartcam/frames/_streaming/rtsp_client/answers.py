@@ -82,7 +82,7 @@ class AnswerParser:
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._seen = 0  # number of searched bytes without the end of a header
+        self._searched = 0  # number of searched bytes without the end of a header
         self._strays = 0
         self._channels = set(USUAL_CHANNELS)
         self._head: ServerAnswer | ServerRequest | None = None
@@ -123,14 +123,14 @@ class AnswerParser:
 
     def _begins(self) -> bool | None:
         """Return True if a message begins; None: bytes that resembled a message were skipped."""
-        found = _BEGINS.search(self._data)
-        gone = found.start() if found else max(0, len(self._data) - MAX_BEGIN_BYTES)
+        match = _BEGINS.search(self._data)
+        gone = match.start() if match else max(0, len(self._data) - MAX_BEGIN_BYTES)
         if gone:
             self._strays += len(self._data[:gone].strip(b"\r\n\0 "))
             del self._data[:gone]
-            self._seen = 0
-        if found is None or not self._strays or self._data[:1] != b"$":
-            return found is not None
+            self._searched = 0
+        if match is None or not self._strays or self._data[:1] != b"$":
+            return match is not None
         if len(self._data) <= 4:  # after skipped bytes, a dollar may be data
             return False
         if self._data[4] >> 6 == 2 and self._data[1] in self._channels:
@@ -156,16 +156,16 @@ class AnswerParser:
 
         Lines may end by either character, or by both.
         """
-        found = _HEAD_ENDS.search(self._data, max(0, self._seen - 10))
-        size = found.end() if found else len(self._data)
+        match = _HEAD_ENDS.search(self._data, max(0, self._searched - 10))
+        size = match.end() if match else len(self._data)
         if size > MAX_HEAD_BYTES:
             raise MessageError(f"RTSP: an answer: expected lines of {MAX_HEAD_BYTES} bytes at most")
-        if found is None:
-            self._seen = size
+        if match is None:
+            self._searched = size
             return False
         lines = bytes(self._data[:size]).replace(b"\r", b"").split(b"\n")
         del self._data[:size]
-        self._seen = 0
+        self._searched = 0
         self._head = _message(lines[0], _headers(lines[1:]))
         if self._head is not None:
             self._strays = 0
@@ -177,11 +177,11 @@ def _message(
     line: bytes, headers: Mapping[str, Sequence[str]]
 ) -> ServerAnswer | ServerRequest | None:
     """Return the message for its first line; None: the line is no beginning of a message."""
-    if (found := _ANSWER.match(line)) is not None:
-        reason = (found[2] or b"").decode("latin-1").strip()
-        return ServerAnswer(int(found[1]), reason, headers)
-    asked = _REQUEST.fullmatch(line)
-    return None if asked is None else ServerRequest(asked[1].decode(), headers)
+    if (match := _ANSWER.match(line)) is not None:
+        reason = (match[2] or b"").decode("latin-1").strip()
+        return ServerAnswer(int(match[1]), reason, headers)
+    request = _REQUEST.fullmatch(line)
+    return None if request is None else ServerRequest(request[1].decode(), headers)
 
 
 def _headers(lines: list[bytes]) -> dict[str, list[str]]:

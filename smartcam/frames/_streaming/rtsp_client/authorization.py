@@ -49,8 +49,8 @@ class Challenge(NamedTuple):
 
 def challenge_of(headers: Sequence[str]) -> Challenge | None:
     """Return the preferred supported challenge of an answer; None: there is none."""
-    read = [_read(one) for one in headers[:MAX_CHALLENGES]]
-    best = max(read, key=lambda one: one.rank, default=None)
+    read = [_read(header) for header in headers[:MAX_CHALLENGES]]
+    best = max(read, key=lambda challenge: challenge.rank, default=None)
     return best if best is not None and best.rank else None
 
 
@@ -58,10 +58,10 @@ def _read(header: str) -> Challenge:
     scheme, _, given = header.strip().partition(" ")
     parts: dict[str, str] = {}
     place = 0
-    while (found := _PART.match(given, place)) is not None:
-        value = found[3] if found[2] is None else re.sub(r"\\(.)", r"\1", found[2])
-        parts.setdefault(found[1].lower(), value)
-        place = found.end()
+    while (match := _PART.match(given, place)) is not None:
+        value = match[3] if match[2] is None else re.sub(r"\\(.)", r"\1", match[2])
+        parts.setdefault(match[1].lower(), value)
+        place = match.end()
     return Challenge(scheme.lower(), parts)
 
 
@@ -85,13 +85,13 @@ class Credentials:
 
     def challenged(self, headers: Sequence[str]) -> bool:
         """Store a refusal's challenge; return whether another request may succeed."""
-        found = challenge_of(headers)
-        if not self.known or found is None:
+        challenge = challenge_of(headers)
+        if not self.known or challenge is None:
             return False
-        before, self._challenge = self._challenge, found
+        before, self._challenge = self._challenge, challenge
         self._count = 0
-        stale = found.parts.get("stale", "").lower() == "true"
-        return before is None or stale or found.parts != before.parts
+        stale = challenge.parts.get("stale", "").lower() == "true"
+        return before is None or stale or challenge.parts != before.parts
 
     def header(self, method: str, uri: str) -> str:
         """Return the value of ``Authorization``; "" without a challenge."""
@@ -108,21 +108,21 @@ class Credentials:
         given, hashed = challenge.parts, _hash(challenge.algorithm)
         realm, nonce = given.get("realm", ""), given["nonce"]
         secret = hashed(f"{self._user}:{realm}:{self._password}")
-        count, mine = f"{self._count:08x}", secrets.token_hex(8)
+        count, client_nonce = f"{self._count:08x}", secrets.token_hex(8)
         session = given.get("algorithm", "").upper().endswith("-SESS")
         if session:
-            secret = hashed(f"{secret}:{nonce}:{mine}")
-        asked, quality = hashed(f"{method}:{uri}"), "qop" in given
-        middle = f"{nonce}:{count}:{mine}:auth" if quality else nonce
+            secret = hashed(f"{secret}:{nonce}:{client_nonce}")
+        hash_of_request, quality = hashed(f"{method}:{uri}"), "qop" in given
+        middle = f"{nonce}:{count}:{client_nonce}:auth" if quality else nonce
         parts = {"username": self._user, "realm": realm, "nonce": nonce, "uri": uri}
-        parts["response"] = hashed(f"{secret}:{middle}:{asked}")
+        parts["response"] = hashed(f"{secret}:{middle}:{hash_of_request}")
         shown = [f"{name}={_quoted(value)}" for name, value in parts.items()]
         if "algorithm" in given:
             shown.append(f"algorithm={given['algorithm']}")
         if "opaque" in given:
             shown.append(f"opaque={_quoted(given['opaque'])}")
         if quality or session:
-            shown.append(f'cnonce="{mine}"')
+            shown.append(f'cnonce="{client_nonce}"')
         if quality:
             shown += ("qop=auth", f"nc={count}")
         return f"Digest {', '.join(shown)}"

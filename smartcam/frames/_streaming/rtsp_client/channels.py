@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 def options_of(transport: str) -> dict[str, str]:
     """Return the options of a header's first transport, by names in lower case."""
     protocol, *rest = transport.partition(",")[0].split(";")
-    parts = (one.strip().partition("=") for one in rest)
+    parts = (option.strip().partition("=") for option in rest)
     options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
     return {"": protocol.strip().upper()} | options
 
 
 def pair_of(text: str, most: int) -> tuple[int, int] | None:
     """Parse a pair of channels or ports; a missing second number is the first plus one."""
-    found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
-    if found is None:
+    match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
+    if match is None:
         return None
-    first = int(found[1])
-    second = int(found[2]) if found[2] else first + 1
+    first = int(match[1])
+    second = int(match[2]) if match[2] else first + 1
     return (first, second) if max(first, second) <= most and first != second else None
 
 

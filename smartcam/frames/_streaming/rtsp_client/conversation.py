@@ -266,23 +266,26 @@ class RtspConversation:
 
     def _take_description(self, answer: ServerAnswer) -> None:
         self._expect_ok("DESCRIBE", answer)
-        found = described(answer.body)
-        track = found.chosen()
+        description = described(answer.body)
+        track = description.chosen()
         if track is None:
-            raise self._none_of(found.tracks, found.others, answer)
+            raise self._none_of(description.tracks, description.others, answer)
         base = answer.header("content-base") or answer.header("content-location")
         if not re.match(r"(?i)rtsps?://", base):
             base = self._plain()
         self.track, self._base = track, base
-        self._aggregate = url_of(found.control, base)
+        self._aggregate = url_of(description.control, base)
 
     def _none_of(
         self, tracks: tuple[VideoTrack, ...], others: tuple[str, ...], answer: ServerAnswer
     ) -> FrameFormatError:
-        got = [f"{'encrypted ' * one.secure}{one.encoding or one.payload_type}" for one in tracks]
-        shown = ", ".join((*got, *others)) or f"{len(answer.body)} bytes without a stream"
+        actual = [
+            f"{'encrypted ' * track.secure}{track.encoding or track.payload_type}"
+            for track in tracks
+        ]
+        shown = ", ".join((*actual, *others)) or f"{len(answer.body)} bytes without a stream"
         kind = FrameFormatError
-        if any(one.encoding and not one.secure for one in tracks):
+        if any(track.encoding and not track.secure for track in tracks):
             kind = OtherEncodingError
         text = f"{self._plan.name}: expected video in H264, H265 or JPEG, got {shown[:200]}"
         return kind(text, source=self._plan.name)
@@ -299,10 +302,10 @@ class RtspConversation:
         return await (self._by_channels() if transport == "tcp" else self._by_ports())
 
     async def _by_channels(self) -> ServerAnswer:
-        asked = "RTP/AVP/TCP;unicast;interleaved=0-1"
-        answer = await self._set_up_track(asked)
+        transport = "RTP/AVP/TCP;unicast;interleaved=0-1"
+        answer = await self._set_up_track(transport)
         if answer.status == 200:
-            given = options_of(answer.header("transport") or asked)
+            given = options_of(answer.header("transport") or transport)
             self._check_transport(given, "RTP/AVP/TCP")
             channels = pair_of(given.get("interleaved", ""), 255) or (0, 1)
             self.channels = InterleavedChannels(self.link, channels, self.track.payload_type)
@@ -330,12 +333,12 @@ class RtspConversation:
             self._sockets = SocketPair.waiting(Endpoint(family, host, 0))
         return self._sockets
 
-    def _check_transport(self, given: dict[str, str], asked: str) -> None:
-        got = given[""].removesuffix("/UDP") or asked
-        if got != asked or "multicast" in given:
-            shown = f"{got}{';multicast' * ('multicast' in given)}"
+    def _check_transport(self, given: dict[str, str], transport: str) -> None:
+        actual = given[""].removesuffix("/UDP") or transport
+        if actual != transport or "multicast" in given:
+            shown = f"{actual}{';multicast' * ('multicast' in given)}"
             raise self._plan.wrong(
-                f"SETUP: expected {asked};unicast, as it was asked for, got {shown[:80]!r}"
+                f"SETUP: expected {transport};unicast, as it was asked for, got {shown[:80]!r}"
             )
 
     async def _set_up_track(self, transport: str) -> ServerAnswer:
@@ -351,9 +354,9 @@ class RtspConversation:
     def _take_session(self, answer: ServerAnswer) -> None:
         session, _, options = answer.header("session").partition(";")
         self._session = session.strip() or self._session
-        found = re.search(r"(?i)timeout\s*=\s*([0-9]{1,6})", options)
-        if found is not None and int(found[1]):
-            self._timeout = max(MIN_SESSION_TIMEOUT, float(found[1]))
+        match = re.search(r"(?i)timeout\s*=\s*([0-9]{1,6})", options)
+        if match is not None and int(match[1]):
+            self._timeout = max(MIN_SESSION_TIMEOUT, float(match[1]))
 
     # while it plays
 
@@ -404,10 +407,10 @@ class RtspConversation:
 def _address(text: str) -> str:
     """Return the text if it is the unicast address of a host, else ""."""
     try:
-        found = ipaddress.ip_address(text)
+        address = ipaddress.ip_address(text)
     except ValueError:
         return ""
-    return "" if found.is_multicast or found.is_unspecified else str(found)
+    return "" if address.is_multicast or address.is_unspecified else str(address)
 
 
 def _open_firewall(pair: SocketPair, host: str, ports: tuple[int, int]) -> None:

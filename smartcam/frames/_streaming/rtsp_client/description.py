@@ -53,8 +53,8 @@ class VideoTrack(NamedTuple):
     def sets(self) -> bytes:
         """Parameter sets for the decoder, as in a file; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
-        units = [one for name in names for one in self.parameters.get(name, "").split(",")]
-        return b"".join(START_CODE + unit for one in units if (unit := _decoded(one)))
+        units = [value for name in names for value in self.parameters.get(name, "").split(",")]
+        return b"".join(START_CODE + unit for text in units if (unit := _decoded(text)))
 
 
 class StreamDescription(NamedTuple):
@@ -72,7 +72,7 @@ class StreamDescription(NamedTuple):
 
     def chosen(self) -> VideoTrack | None:
         """Return the first supported stream of video; None: there is none."""
-        ours = (one for one in self.tracks if one.coding is not None and not one.secure)
+        ours = (track for track in self.tracks if track.coding is not None and not track.secure)
         return next(ours, None)
 
 
@@ -85,18 +85,20 @@ def described(body: bytes) -> StreamDescription:
             sections.append([])
         sections[-1].append(line)
     session, *media = sections
-    kinds = [one[0][2:].split() for one in media]
+    kinds = [section[0][2:].split() for section in media]
     tracks = [
-        _track(kind, one) for kind, one in zip(kinds, media, strict=True) if kind[:1] == ["video"]
+        _track(kind, section)
+        for kind, section in zip(kinds, media, strict=True)
+        if kind[:1] == ["video"]
     ]
     others = tuple(kind[0] for kind in kinds if kind and kind[0] != "video")
     return StreamDescription(_attribute(session, "control"), tuple(tracks), others)
 
 
 def _track(kind: list[str], lines: list[str]) -> VideoTrack:
-    numbers = [int(one) for one in kind[3:] if re.fullmatch(r"[0-9]{1,3}", one)] or [-1]
+    numbers = [int(number) for number in kind[3:] if re.fullmatch(r"[0-9]{1,3}", number)] or [-1]
     names = {number: _encoding(number, lines) for number in numbers}
-    number = next((one for one in numbers if names[one] in CODINGS), numbers[0])
+    number = next((number for number in numbers if names[number] in CODINGS), numbers[0])
     secure = len(kind) > 2 and kind[2].upper().startswith("RTP/SAVP")
     parameters = _parameters(_of_type(lines, "fmtp", number))
     encoding = names[number]
@@ -114,27 +116,27 @@ def _encoding(number: int, lines: list[str]) -> str:
 
 def _attribute(lines: list[str], name: str) -> str:
     begins = f"a={name}:"
-    found = next((line for line in lines if line.lower().startswith(begins)), begins)
-    return found[len(begins) :].strip()
+    value_line = next((line for line in lines if line.lower().startswith(begins)), begins)
+    return value_line[len(begins) :].strip()
 
 
 def _of_type(lines: list[str], name: str, number: int) -> str:
     """Return the texts of an attribute for a payload type, joined."""
     matches = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
-    return ";".join(one[2] for one in matches if one is not None and int(one[1]) == number)
+    return ";".join(match[2] for match in matches if match is not None and int(match[1]) == number)
 
 
 def _parameters(text: str) -> dict[str, str]:
-    parts = (one.partition("=") for one in text.split(";"))
+    parts = (parameter.partition("=") for parameter in text.split(";"))
     return {key.strip().lower(): value.strip(' \t"') for key, equals, value in parts if equals}
 
 
 def _size(lines: list[str]) -> tuple[int, int] | None:
     """Return the size of the pictures, which some senders of large JPEGs describe."""
     for name, between in (("x-dimensions", ","), ("framesize", "-")):
-        found = re.search(rf"([0-9]{{1,5}})\s*{between}\s*([0-9]{{1,5}})", _attribute(lines, name))
-        if found is not None and int(found[1]) and int(found[2]):
-            return int(found[1]), int(found[2])
+        match = re.search(rf"([0-9]{{1,5}})\s*{between}\s*([0-9]{{1,5}})", _attribute(lines, name))
+        if match is not None and int(match[1]) and int(match[2]):
+            return int(match[1]), int(match[2])
     return None
 
 
@@ -154,9 +156,9 @@ def url_of(control: str, base: str) -> str:
     if not control or control == "*":
         return base
     try:
-        whole = urlsplit(control).scheme.lower() in ("rtsp", "rtsps")
+        absolute = urlsplit(control).scheme.lower() in ("rtsp", "rtsps")
     except ValueError:
-        whole = False
-    if whole:
+        absolute = False
+    if absolute:
         return control
     return f"{base}{control}" if base.endswith("/") else f"{base}/{control.removeprefix('/')}"

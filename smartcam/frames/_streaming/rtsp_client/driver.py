@@ -129,7 +129,7 @@ class RtspDriver(FrameDriver):
         try:
             await self._start(first)
             async with asyncio.timeout(self._plan.timeout):
-                frame = await first.came
+                frame = await first.outcome
         except OtherEncodingError:
             self._other = VideoDriver(self.address)
             return await self._other.open()

@@ -99,11 +99,11 @@ class RtspLink(asyncio.Protocol):
         """End the link with a reason for :attr:`on_end`."""
         self._end(why)
 
-    def _of_socket(self, what: str) -> Any:
-        found = None if self._transport is None else self._transport.get_extra_info(what)
-        if not found:
+    def _of_socket(self, label: str) -> Any:
+        value = None if self._transport is None else self._transport.get_extra_info(label)
+        if not value:
             raise self._error(self.ended or "the connection is lost")
-        return found
+        return value
 
     async def ask(
         self, method: str, url: str, headers: dict[str, str] | None = None, body: bytes = b""
@@ -115,7 +115,7 @@ class RtspLink(asyncio.Protocol):
         """
         async with self._turn:
             for refusals in range(1, MAX_REFUSALS + 1):
-                answer = await self._asked(method, url, headers or {}, body)
+                answer = await self._request_bytes(method, url, headers or {}, body)
                 if answer.status != 401:
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
@@ -133,7 +133,7 @@ class RtspLink(asyncio.Protocol):
             cure = "wrong user or password"
         return self._error(f"{method}: 401 Unauthorized: {cure}")
 
-    async def _asked(
+    async def _request_bytes(
         self, method: str, url: str, headers: dict[str, str], body: bytes
     ) -> ServerAnswer:
         self._cseq += 1
@@ -186,8 +186,8 @@ class RtspLink(asyncio.Protocol):
             return
         self._parser.feed(data)
         try:
-            while not self.ended and (came := self._parser.next()) is not None:
-                self._take(came)
+            while not self.ended and (item := self._parser.next()) is not None:
+                self._take(item)
         except MessageError as error:
             self._end(str(error))
         self.on_read()
@@ -199,13 +199,13 @@ class RtspLink(asyncio.Protocol):
 
     # received messages
 
-    def _take(self, came: ServerAnswer | ServerRequest | ChannelPacket) -> None:
-        if isinstance(came, ChannelPacket):
-            self.on_packet(came.channel, came.data)
-        elif isinstance(came, ServerAnswer):
-            self._answered(came)
+    def _take(self, item: ServerAnswer | ServerRequest | ChannelPacket) -> None:
+        if isinstance(item, ChannelPacket):
+            self.on_packet(item.channel, item.data)
+        elif isinstance(item, ServerAnswer):
+            self._answered(item)
         else:
-            self._requested(came)
+            self._requested(item)
 
     def _answered(self, answer: ServerAnswer) -> None:
         """Pass an answer on; some servers send a wrong CSeq, or none."""

@@ -57,15 +57,15 @@ class RtspParameters(DeviceFeatures):
         answer = await self._answered(READ, name, f"{name}\r\n")
         body = answer.body.decode(errors="replace")
         for line in body.splitlines():
-            found, colon, value = line.partition(":")
-            if colon and found.strip().lower() == name.lower():
+            given_name, colon, value = line.partition(":")
+            if colon and given_name.strip().lower() == name.lower():
                 return value.strip()
-        got = (
+        actual = (
             f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
             if body.strip()
             else ("got none: the camera only takes the request for a sign of life")
         )
-        raise self._wrong(name, f"expected its value from {READ}, {got}")
+        raise self._wrong(name, f"expected its value from {READ}, {actual}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a parameter; return the camera's new value, or the given value if it reports none.
@@ -103,8 +103,8 @@ class RtspParameters(DeviceFeatures):
         }.get(answer.status, "it refuses that")
         raise self._wrong(name, f"{why}: {status}")
 
-    def _cannot(self, what: str) -> NoReturn:
-        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {what}")
+    def _cannot(self, label: str) -> NoReturn:
+        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {label}")
 
     def _wrong(self, name: str, text: str) -> FrameFeatureError:
         shown = name[:MAX_SHOWN_CHARACTERS]

@@ -69,7 +69,9 @@ async def _watched(check: Coroutine[Any, Any, None]) -> None:
 
 def needs(camera_kind: CameraKind, *applications: int) -> None:
     """Skip the check if a camera does not have all of these applications."""
-    missing = [one for one in applications if one not in camera_kind.applications]
+    missing = [
+        application for application in applications if application not in camera_kind.applications
+    ]
     if missing:
         pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
 
@@ -125,5 +127,5 @@ def balance(statistics: Statistics) -> None:
         + statistics.uninterpretable
         + statistics.unclaimed
     )
-    for one in statistics.subscribers:
-        assert one.offered == one.taken + one.dropped + one.queued
+    for subscriber in statistics.subscribers:
+        assert subscriber.offered == subscriber.taken + subscriber.dropped + subscriber.queued

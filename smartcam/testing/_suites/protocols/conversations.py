@@ -31,7 +31,7 @@ class Sent(NamedTuple):
 
     Attributes:
         message: the message.
-        wire: the bytes written for it; those of several datagrams one after the other.
+        wire: the bytes written for it; bytes of several datagrams one after the other.
     """
 
     message: Message
@@ -91,13 +91,13 @@ class Conversation:
 
 def flat(events: Iterable[Event]) -> list[Any]:
     """Return events with each burst as its containers, and errors by their kind."""
-    found: list[Any] = []
+    steps: list[Any] = []
     for event in events:
         if isinstance(event, ResultBurst):
-            found += event
+            steps += event
         else:
-            found.append(type(event.error) if isinstance(event, LinkFailed) else event)
-    return found
+            steps.append(type(event.error) if isinstance(event, LinkFailed) else event)
+    return steps
 
 
 class Player:

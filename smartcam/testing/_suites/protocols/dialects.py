@@ -80,7 +80,7 @@ class DialectChecks(Parameters):
         assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
 
     def test_every_dialect_is_tried(self) -> None:
-        """Check that a client tries each dialect, and gets the one that is pinned."""
+        """Check that a client tries each dialect, and gets the pinned one."""
         protocol = self.protocol
         used = set(protocol.schemes.values())
         surplus = set(protocol.detection) - used
@@ -127,7 +127,9 @@ class DialectChecks(Parameters):
 
     def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
         """Check for a session, a sign of life, results, and the status: by itself or on request."""
-        missing = [one.__name__ for one in NEEDED if not dialect.has(one)]
+        missing = [
+            message_type.__name__ for message_type in NEEDED if not dialect.has(message_type)
+        ]
         assert not missing, f"has() is False for {', '.join(missing)}"
         assert dialect.answers(m.Connect), "Connect must be answered"
         assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
@@ -140,8 +142,8 @@ class DialectChecks(Parameters):
         """Check that each ability has its messages, and the other way round."""
         for name, needed in ABILITIES.items():
             can = getattr(dialect.capabilities, name)
-            has = [dialect.has(one) for one in needed]
-            names = " and ".join(one.__name__ for one in needed)
+            has = [dialect.has(message_type) for message_type in needed]
+            names = " and ".join(message_type.__name__ for message_type in needed)
             if can:
                 assert all(has), f"capabilities.{name} is True, but it has not {names}"
             else:
@@ -165,8 +167,8 @@ class DialectChecks(Parameters):
         for kind in MESSAGES:
             if dialect.has(kind):
                 continue
-            for asked in (kind, example(kind, dialect)):
-                text = _refusal(UnsupportedError, dialect.message_id, asked)
+            for message in (kind, example(kind, dialect)):
+                text = _refusal(UnsupportedError, dialect.message_id, message)
                 assert text is not None, f"has() is False for {kind.__name__}, but it has an id"
                 assert dialect.name in text, f"{text}: which dialect?"
 
@@ -229,9 +231,9 @@ class DialectChecks(Parameters):
         """Check that a URL with everything pinned is read back, and has no password."""
         parameters: list[tuple[tuple[str, str], ...]] = [()]
         parameters += [
-            tuple(one.parameters.items())
-            for one in self.conversations
-            if one.dialect == dialect.name and one.parameters
+            tuple(conversation.parameters.items())
+            for conversation in self.conversations
+            if conversation.dialect == dialect.name and conversation.parameters
         ]
         for scheme in self.protocol.schemes:
             for host in ("192.0.2.7", "2001:db8::7"):

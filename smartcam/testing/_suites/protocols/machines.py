@@ -66,13 +66,13 @@ class MachineChecks(Parameters):
     def test_conversation_goes_as_written(self, conversation: Conversation) -> None:
         """Check that each request is the written bytes, and each answer the written message."""
         Player(self.protocol, conversation).play()
-        kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
+        kinds = [type(step.message) for step in conversation.steps if isinstance(step, Sent)]
         assert m.Connect in kinds, f"{conversation}: no step sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
         """Check any cut of a stream: each piece may come alone, or with the next."""
         for room in (True, False):
-            for cuts in (_bytewise, _whole):
+            for cuts in (_bytewise, _unsplit):
                 player = Player(self.protocol, stream)
                 for step in stream.steps:
                     player.step(step, cuts(step), room=room)
@@ -100,14 +100,14 @@ class MachineChecks(Parameters):
 
         def compare(place: int, whole: bytes, chunks: list[bytes]) -> None:
             first = outcome(place, [whole])
-            for cut in (chunks, [bytes([one]) for one in whole]):
+            for cut in (chunks, [bytes([byte]) for byte in whole]):
                 other = outcome(place, cut)
                 assert other == first, f"whole: {first}, in pieces: {other}"
 
         def check(data: DataObject) -> None:
             place = data.draw(strategies.st.sampled_from(places), label="at step")
-            whole = b"".join(data.draw(pieces, label="comes"))
-            compare(place, whole, strategies.cut(data, whole))
+            data_whole = b"".join(data.draw(pieces, label="comes"))
+            compare(place, data_whole, strategies.cut(data, data_whole))
 
         for place in places:
             compare(place, b"".join(samples), samples)
@@ -122,7 +122,7 @@ class MachineChecks(Parameters):
         places = range(len(conversation.steps) + 1)
         comes = strategies.noise(_samples(conversation))
         dialect = conversation.group(self.protocol)[0]
-        says = strategies.st.sampled_from([example(one, dialect) for one in REQUESTS])
+        says = strategies.st.sampled_from([example(request, dialect) for request in REQUESTS])
         actions = strategies.st.lists(strategies.st.one_of(comes, says), max_size=8)
 
         def check(data: DataObject) -> None:
@@ -170,7 +170,7 @@ class MachineChecks(Parameters):
         for _ in range(4 * self.max_waiting // len(chunk)):
             machine.receive_data(chunk)
             events = machine.events()
-            failed = any(isinstance(one, LinkFailed) for one in events)
+            failed = any(isinstance(event, LinkFailed) for event in events)
             messages += len(events)
             waiting = len(machine.pending)
             assert waiting <= self.max_waiting, f"{where}: {waiting} bytes are kept"
@@ -180,10 +180,10 @@ class MachineChecks(Parameters):
             if datagrams:
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
             if messages > MAX_MESSAGES:
-                break  # they are messages
-        kept = tracemalloc.get_traced_memory()[0] - before
-        assert kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
-            f"{where}: the machine has grown by {kept} bytes"
+                break  # reports are messages
+        bytes_kept = tracemalloc.get_traced_memory()[0] - before
+        assert bytes_kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
+            f"{where}: the machine has grown by {bytes_kept} bytes"
         )
 
     # ------------------------------------------------------------------ requests
@@ -233,9 +233,9 @@ class MachineChecks(Parameters):
         """Check that the answer is kept back, since it would pass for the next request's."""
         for place, answer, data in _answers(conversation):
             player = Player(self.protocol, conversation).play(place)
-            events = [event for one in data for event in player.deliver(one)]
-            found = [one for one in events if isinstance(one, answer)]
-            assert not found, f"at step {place}, no request was open, but it reported {found}"
+            events = [event for data_part in data for event in player.deliver(data_part)]
+            answers = [event for event in events if isinstance(event, answer)]
+            assert not answers, f"at step {place}, no request was open, but it reported {answers}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
         """Check that Disconnect can be sent in any session, and that nothing is sent after it."""
@@ -246,7 +246,7 @@ class MachineChecks(Parameters):
                 continue
             machine.send(m.Disconnect())
             player.written()
-            later = [one.data for one in conversation.steps[place:] if isinstance(one, Received)]
+            later = [step.data for step in conversation.steps[place:] if isinstance(step, Received)]
             for data in (b"", *later):
                 machine.receive_data(data)
                 machine.events()
@@ -303,9 +303,9 @@ class MachineChecks(Parameters):
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
         """Check the counter of bytes, which is in an attempt's error."""
         player = Player(self.protocol, conversation).play()
-        came = sum(len(one.data) for one in conversation.steps if isinstance(one, Received))
+        received = sum(len(step.data) for step in conversation.steps if isinstance(step, Received))
         counted = player.machine.counters.bytes_received
-        assert counted == came, f"counters.bytes_received is {counted}, {came} came"
+        assert counted == received, f"counters.bytes_received is {counted}, {received} came"
 
     def test_trace_shows_what_is_said(self, conversation: Conversation) -> None:
         """Check that a trace has both sides' frames, in words, without the password."""
@@ -325,7 +325,7 @@ class MachineChecks(Parameters):
         spoken = {
             sender
             for sender, frames in (
-                (m.Sender.CLIENT, [one.wire for one in conversation.steps]),
+                (m.Sender.CLIENT, [step.wire for step in conversation.steps]),
                 (m.Sender.CAMERA, [*_samples(conversation)]),
             )
             if any(frames)
@@ -383,8 +383,8 @@ class _Judge:
             elif isinstance(event, LinkEnded):
                 assert event.pending >= 0, f"{event}: expected the number of bytes left"
             else:
-                whole = isinstance(event, (m.Report, m.UnknownMessage, ResultBurst))
-                assert whole, f"{event!r} is none of a camera's messages"
+                is_report = isinstance(event, (m.Report, m.UnknownMessage, ResultBurst))
+                assert is_report, f"{event!r} is none of a camera's messages"
         for data in self.machine.data_to_send():
             assert isinstance(data, bytes), f"data_to_send() has {data!r}"
 
@@ -423,23 +423,23 @@ def _samples(conversation: Conversation) -> list[bytes]:
 
 
 def _bytewise(step: Step) -> list[bytes] | None:
-    return [bytes([one]) for one in step.data] if isinstance(step, Received) else None
+    return [bytes([byte]) for byte in step.data] if isinstance(step, Received) else None
 
 
-def _whole(_: Step) -> None:
+def _unsplit(_: Step) -> None:
     return None
 
 
 def _joined(steps: Sequence[Step]) -> list[Step]:
     """Return the steps with consecutive deliveries joined."""
-    found: list[Step] = []
+    joined: list[Step] = []
     for step in steps:
-        last = found[-1] if found else None
+        last = joined[-1] if joined else None
         if isinstance(step, Received) and isinstance(last, Received) and not last.wire:
-            found[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
+            joined[-1] = Received(last.data + step.data, last.events + step.events, step.wire)
         else:
-            found.append(step)
-    return found
+            joined.append(step)
+    return joined
 
 
 def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
@@ -452,7 +452,7 @@ def _places(conversation: Conversation) -> Iterator[tuple[int, list[bytes]]]:
         yield place, []
         if isinstance(step, Received):
             yield place, [step.data[: len(step.data) // 2]]
-            failed = any(isinstance(one, type) for one in step.events)
+            failed = any(isinstance(event, type) for event in step.events)
     if not failed:
         yield len(conversation.steps), []
 

@@ -180,7 +180,7 @@ class OptionalFeatureChecks(Parameters):
         """Check that the link is given up, since a late answer would pass for the next one."""
         async with visiting(camera_kind, request_timeout=SHORT_TIMEOUT) as (_, camera):
             if camera.capabilities.result_codes or camera_kind.silent_request is None:
-                return  # it answers everything
+                return  # such a camera answers everything
             with pytest.raises(ResponseTimeoutError):
                 await camera.request(camera_kind.silent_request)
             await until(lambda: not camera.connected)

@@ -38,24 +38,24 @@ class Parameters(SaysWhatWasExpected):
         """
         for name in ("dialect", "conversation", "stream", "camera_kind"):
             if name in metafunc.fixturenames:
-                found = self._found(name)
-                metafunc.parametrize(name, found, ids=_label)
+                cases = self._parameters_named(name)
+                metafunc.parametrize(name, cases, ids=_label)
 
-    def _found(self, name: str) -> list[Any]:
-        own = type(self)
+    def _parameters_named(self, name: str) -> list[Any]:
+        suite = type(self)
         if name == "camera_kind":
-            return list(self.camera_kinds) or _nothing(f"{own.__name__}.camera_kinds is empty")
-        if not isinstance(getattr(own, "protocol", None), Protocol):
-            raise pytest.UsageError(f"{own.__name__}.protocol: expected a Protocol")
+            return list(self.camera_kinds) or _nothing(f"{suite.__name__}.camera_kinds is empty")
+        if not isinstance(getattr(suite, "protocol", None), Protocol):
+            raise pytest.UsageError(f"{suite.__name__}.protocol: expected a Protocol")
         if name == "dialect":
             return dialects_of(self.protocol)
-        found = [
-            one
-            for one in self.conversations
-            if name == "conversation" or one.transport is Transport.TCP
+        conversations = [
+            conversation
+            for conversation in self.conversations
+            if name == "conversation" or conversation.transport is Transport.TCP
         ]
-        return found or _nothing(
-            f"{own.__name__}.conversations has none"
+        return conversations or _nothing(
+            f"{suite.__name__}.conversations has none"
             + (" over TCP" if name == "stream" and self.conversations else "")
         )
 
@@ -71,9 +71,11 @@ def _label(value: object) -> str | None:
 
 def dialects_of(protocol: Protocol) -> list[Dialect]:
     """Return the dialects of a protocol, and those with quirks that a client tries."""
-    found: list[Dialect] = list(protocol.dialects.values())
-    tried = [one for groups in protocol.detection.values() for group in groups for one in group]
+    dialects: list[Dialect] = list(protocol.dialects.values())
+    tried = [
+        dialect for groups in protocol.detection.values() for group in groups for dialect in group
+    ]
     for dialect in tried:
-        if dialect not in found:
-            found.append(dialect)
-    return found
+        if dialect not in dialects:
+            dialects.append(dialect)
+    return dialects

@@ -104,7 +104,7 @@ class TriggerChecks(Parameters):
             for _ in range(3):
                 with pytest.raises(TriggerTimeoutError) as caught:
                     await camera.trigger(timeout=SHORT_TIMEOUT)
-                if "no trigger was sent" not in str(caught.value):  # as on a slow machine
+                if "no trigger was sent" not in str(caught.value):  # like a slow machine
                     inspections += 1
                 assert await number(camera) == inspections
                 inspections += 1
@@ -131,7 +131,7 @@ class TriggerChecks(Parameters):
         """Check an overtrigger while the trigger of another program comes in between."""
         async with visiting(camera_kind, application=SLOW) as (live, camera):
             if not camera.capabilities.unasked_results:
-                return  # it knows no triggers but the client's
+                return  # the camera has no other triggers than the client's
             task = asyncio.create_task(camera.trigger(timeout=SOON_TIMEOUT))
             await until(lambda: live.inspects)
             live.trigger()

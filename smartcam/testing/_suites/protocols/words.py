@@ -13,16 +13,18 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
 
 MESSAGES: tuple[type[m.Message], ...] = tuple(
-    found
+    value
     for name in m.__all__
-    for found in [getattr(m, name)]
-    if isinstance(found, type)
-    and issubclass(found, (m.Request, m.Report))
-    and found not in {m.Request, m.Report, m.Acknowledgement}
+    for value in [getattr(m, name)]
+    if isinstance(value, type)
+    and issubclass(value, (m.Request, m.Report))
+    and value not in {m.Request, m.Report, m.Acknowledgement}
 )
 """Every message that a dialect may have."""
 
-REQUESTS: tuple[type[m.Request], ...] = tuple(one for one in MESSAGES if issubclass(one, m.Request))
+REQUESTS: tuple[type[m.Request], ...] = tuple(
+    message for message in MESSAGES if issubclass(message, m.Request)
+)
 """The types of all messages that a client sends."""
 
 NEEDED: tuple[type[m.Message], ...] = (
