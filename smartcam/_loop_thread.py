@@ -168,10 +168,10 @@ class _ThreadCall:
             self._fail(asyncio.CancelledError())
             return
         try:
-            got = self._function()
-            if inspect.iscoroutine(got):
-                self._work = got
-                task = self._task = start_task(self._finish_by(got))
+            outcome = self._function()
+            if inspect.iscoroutine(outcome):
+                self._work = outcome
+                task = self._task = start_task(self._finish_by(outcome))
                 if sys.version_info < (3, 12):
                     task.add_done_callback(self._end_unbegun)
                 return

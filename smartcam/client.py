@@ -191,8 +191,7 @@ class SmartCamera(Camera[ValueT]):
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline, timeout)
             deadline = self._connection.in_seconds(timeout)
-            if not lock.take_if_free():  # as hold() does, without an object for it
-                await lock.wait_for_turn(deadline, timeout)
+            await lock.turn(deadline, timeout)  # same effect as hold(), without an object
             try:
                 return await triggers.trigger(request, deadline, timeout)
             finally:

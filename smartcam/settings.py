@@ -386,9 +386,9 @@ class CameraSettings:
 
 
 _DEFAULTS = {
-    one.name: one.default
-    for one in dataclasses.fields(CameraSettings)
-    if one.default is not dataclasses.MISSING
+    field.name: field.default
+    for field in dataclasses.fields(CameraSettings)
+    if field.default is not dataclasses.MISSING
 }
 
 _UNUSUAL = object()

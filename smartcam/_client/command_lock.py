@@ -61,26 +61,9 @@ class Hold:
         self._lock.give_back()
 
 
-class _Lock(asyncio.Lock):
-    """A lock that a task can take without a coroutine if it is free."""
-
-    _locked: bool  # asyncio's own
-
-    def take(self) -> bool:
-        """Take the lock if no task has it or is in line for it; return whether it was taken."""
-        if self._locked or self._waiters:
-            return False
-        self._locked = True
-        return True
-
-
 @dataclass(eq=False)
 class CommandLock:
-    """Gives commands their turn.
-
-    Attributes:
-        give_back: function that gives the turn to the next waiting command.
-    """
+    """Gives commands their turn."""
 
     _connection: Connection
     _commands: Commands
@@ -93,8 +76,7 @@ class CommandLock:
         # tasks of the session; None between two sessions
         self._jobs: asyncio.TaskGroup | None = None
         self._to_restore: Before | None = None  # state to restore in the next session
-        self._lock = _Lock()
-        self.give_back: Callable[[], None] = self._lock.release
+        self._lock = asyncio.Lock()
         self._waiting_commands = 0  # commands that wait for the lock
         self._leaving: set[asyncio.Task[None]] = set()
         self._failed: SmartCamError | None = None
@@ -157,30 +139,28 @@ class CommandLock:
     async def take(self, timeout: float) -> float:
         """Take the turn and return the deadline; for :class:`Hold`, which gives it back."""
         deadline = self._connection.deadline(timeout)
-        if not self.take_if_free():
-            await self.wait_for_turn(deadline, timeout)
+        await self.turn(deadline, timeout)
         return deadline
 
-    def take_if_free(self) -> bool:
-        """Take the turn if no command has it and nothing has to be done before; say whether.
-
-        Call :attr:`give_back` if it was taken, :meth:`wait_for_turn` if not.
+    def turn(self, deadline: float, timeout: float) -> Coroutine[Any, Any, object]:
+        """Return a coroutine that waits for the turn; after it call :meth:`give_back`.
 
         Raises:
             LinkError: there is no session.
         """
         self._connection.require_link()
-        if self._waiting_commands or self._leaving or self._failed is not None:
-            return False
-        return not self._commands.unconfirmed and self._lock.take()
+        lock = self._lock
+        if lock.locked() or self._waiting_commands or self._leaving:
+            return self._wait_for_turn(deadline, timeout)
+        if self._failed is not None or self._commands.unconfirmed:
+            return self._wait_for_turn(deadline, timeout)
+        return lock.acquire()  # the lock is free: no wait
 
-    async def wait_for_turn(self, deadline: float, timeout: float) -> None:
-        """Wait for the turn; after it call :attr:`give_back`.
+    def give_back(self) -> None:
+        """Give the turn to the next waiting command."""
+        self._lock.release()
 
-        Raises:
-            ResponseTimeoutError: others had it until ``deadline``.
-            SmartCamError: the reason why going back failed before this command.
-        """
+    async def _wait_for_turn(self, deadline: float, timeout: float) -> None:
         self._waiting_commands += 1
         try:
             async with asyncio.timeout_at(deadline):

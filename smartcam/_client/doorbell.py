@@ -46,7 +46,7 @@ class Doorbell:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop  # asyncio's tasks read it
-        # outcomes of the present delivery; None: outcomes wake by way of the loop
+        # outcomes of the present delivery; None: outcomes wake their tasks through the loop
         self.due: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
         # function that wakes the waiting task; None if no task waits
@@ -101,7 +101,7 @@ class Doorbell:
         return DirectFuture(self, self._loop)
 
     def give(self, outcome: Outcome, value: object) -> None:
-        """Give an outcome its result: its task goes on at once, unless another task runs."""
+        """Set the result of an outcome: its task continues at once, unless another task runs."""
         if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
             outcome.set_result(value)
             return

@@ -200,8 +200,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._closed = False
         self._closers: list[asyncio.Future[None]] = []  # futures of the waits for the link's end
         self._loss: BaseException | None = None
-        self._full = False  # the transport takes no more at present
-        self._writable: asyncio.Event | None = None  # made if the transport takes no more
+        self._full = False  # whether the transport's send buffer is full
+        self._writable: asyncio.Event | None = None  # made when the send buffer is full
         self._closing = False
         self._paused = False
 
@@ -242,7 +242,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         return not self._full
 
     async def drain(self) -> None:
-        """Wait until the transport takes more; bounded by the caller's deadline."""
+        """Wait until the send buffer has room; bounded by the caller's deadline."""
         if self._writable is not None:
             await self._writable.wait()
 
@@ -450,7 +450,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             self.machine.receive_data(data)
         return None
 
-    def _say_goodbye(self) -> None:
+    def _send_goodbye(self) -> None:
         state = self.machine.state
         if state is State.CONNECTED or state is State.CONNECTING:
             self.machine.send(Disconnect())
@@ -476,7 +476,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._doorbell.deliver()
 
     async def _give_way(self) -> None:
-        """Let the loop make a turn, or several if busy other links share it."""
+        """Wait for a turn of the loop, or for several if other busy links share it."""
         for _ in range(MAX_PASSES if self._beside.open > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)

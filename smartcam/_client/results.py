@@ -105,7 +105,7 @@ class Results:
         # reads the numbers in results after the first trigger with a number
         self._numbering: Interpretation | None = None
         self._warned_extra = self._warned_others = False
-        self._lossy = False  # a message may come twice, or not
+        self._lossy = False  # whether a message may arrive twice, or not at all
         self._timer = DeadlineTimer(weak_callback(self, Results._time_out))
 
     def _time_out(self) -> None:

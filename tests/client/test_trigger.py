@@ -30,7 +30,6 @@ from smartcam import (
     TriggerTimeoutError,
     WrongApplicationError,
 )
-from smartcam._client.command_lock import _Lock
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
     BUSY,
@@ -604,20 +603,6 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
 
 
 TELLING = (WAITING, RUNNING, BUSY, OVERTRIGGERED, SYSTEM_ERROR)
-
-
-async def test_free_lock_is_not_taken_from_a_task_in_line() -> None:
-    lock = _Lock()
-    assert lock.take()
-    assert not lock.take()
-    in_line = asyncio.create_task(lock.acquire())
-    await asyncio.sleep(0)
-    lock.release()
-    assert not lock.locked()
-    assert not lock.take()  # the task in line is woken, and has not gone on yet
-    assert await in_line
-    lock.release()
-    assert lock.take()
 
 
 async def test_triggers_at_once_take_turns() -> None:

@@ -120,7 +120,9 @@ class Lengths:
 
     def __init__(self, by_id: Mapping[int, range]) -> None:
         self.by_id = by_id
-        self.shortest: int = min((one.stop - 1 for one in by_id.values()), default=sys.maxsize)
+        self.shortest: int = min(
+            (length.stop - 1 for length in by_id.values()), default=sys.maxsize
+        )
 
 
 class Framer:
