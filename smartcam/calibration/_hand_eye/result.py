@@ -188,13 +188,23 @@ class HandEyeCalibration(storage.SavedCalibration):
             more="take more views",
             where=f" without view{several} {', '.join(left_out)}" if left_out else "",
         )
-        if judgement.verdict.level != "good" or self.used[-1]:
+        if judgement.verdict.level != "good":
             return judgement
-        text = (
-            "Not known how good: the last view does not fit, and may show that something moved: "
-            "take more views"
-        )
-        return Judgement(CalibrationVerdict("unknown", text), option="more")
+        if not self.used[-1]:
+            text = (
+                "Not known how good: the last view does not fit, and may show that something "
+                "moved: take more views"
+            )
+            return Judgement(CalibrationVerdict("unknown", text), option="more")
+        place = 1e3 * self.translation_error
+        if place > self.allowed.error:
+            text = (
+                f"{judgement.verdict.text}. Only while the hand is turned as in these views: the "
+                f"camera's place is known to {place:.2g} mm, so points seen at other orientations "
+                "may be that far off; views with larger turns show the place better"
+            )
+            return judgement._replace(verdict=CalibrationVerdict("good", text))
+        return judgement
 
     @property
     def rotation_error(self) -> float:

@@ -159,6 +159,15 @@ def test_hand_eye_of_which_the_last_view_does_not_fit_is_not_good(number: int, l
     assert found.verdict.level == level
 
 
+@pytest.mark.judged
+def test_hand_eye_whose_camera_has_no_sure_place_says_where_it_is_good() -> None:
+    found = calibrated(*measured("eye-in-hand", poses=9))
+    unsure = dataclasses.replace(found, covariance=0.01**2 * np.eye(12))
+    assert unsure.verdict.level == found.verdict.level == "good"
+    assert unsure.verdict.text.startswith(f"{found.verdict.text}. Only while the hand is turned")
+    assert "the camera's place is known to 17 mm" in unsure.verdict.text
+
+
 @pytest.mark.long
 def test_hand_eye_of_a_robot_that_stood_for_half_of_the_views_is_refused() -> None:
     """The fits end where nothing is determined, with a target in the camera."""
