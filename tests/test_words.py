@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+import textwrap
 from collections.abc import Callable, Iterator
 from functools import cache, wraps
 from typing import NamedTuple
@@ -321,3 +322,27 @@ def test_loop_variables_name_what_they_hold() -> None:
         if name.id in UNNAMED
     ]
     assert not found, "\n".join(found)
+
+
+def test_code_in_docstrings_is_whole() -> None:
+    """A block that begins as Python is Python to its end: no lines were joined."""
+    starts = (ast.Assign, ast.AsyncWith, ast.With, ast.Import, ast.ImportFrom)
+    broken = []
+    for text in docstrings():
+        for block in re.findall(r"::\n\n((?: {4}.*\n|\n)+)", f"{text.text}\n"):
+            lines = textwrap.dedent(block).strip().splitlines()
+            first = lines[0] + ("\n    pass" if lines[0].endswith(":") else "")
+            if isinstance(parsed(f"async def _():\n{textwrap.indent(first, '    ')}"), starts):
+                whole = textwrap.indent("\n".join(lines), "    ")
+                if parsed(f"async def _():\n{whole}") is None:
+                    broken.append(str(text))
+    assert not broken, "\n".join(broken)
+
+
+def parsed(code: str) -> ast.AST | None:
+    """Return the first statement of a function, None if the code is not Python."""
+    try:
+        function = ast.parse(code).body[0]
+    except SyntaxError:
+        return None
+    return function.body[0] if isinstance(function, ast.AsyncFunctionDef) else None

@@ -3,8 +3,10 @@
 ::
 
     sheet = make_sheet(Checkerboard(columns=9, rows=6, square=0.025), page="A4")
-    Path("sheet.svg").write_text(sheet.svg()) Path("sheet.pdf").write_bytes(sheet.pdf()) ... target
-    = scaled(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
+    Path("sheet.svg").write_text(sheet.svg())
+    Path("sheet.pdf").write_bytes(sheet.pdf())
+    ...
+    target = scaled(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
 
 A description is printed on each sheet; both files carry the target's description, as
 :func:`~smartcam.calibration.target_from_data` reads it.

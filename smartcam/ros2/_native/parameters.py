@@ -63,7 +63,7 @@ class NativeParameters(RosParameters):
 
     # ------------------------------------------------------------------ from here to ROS
 
-    def _change_parameters(self, **lists: Any) -> None:
+    def _notify(self, **lists: Any) -> None:
         """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
@@ -113,7 +113,7 @@ class NativeParameters(RosParameters):
             except SmartCamError as exc:
                 logger.warning("%s ! parameter %s: %s", self._native.full_name, name, exc)
                 _asked_by_ros.set(False)
-                self._change_parameters(changed=[name])
+                self._notify(changed=[name])
 
         task = asyncio.get_running_loop().create_task(begin())
         self._tasks.add(task)
