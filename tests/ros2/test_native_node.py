@@ -182,7 +182,8 @@ async def test_a_node_that_is_closed_while_a_hook_waits() -> None:
         cam.submit = late  # type: ignore[method-assign]
         cam.parameters.declare("exposure", 1, on_set=hook)
         setting = asyncio.create_task(set_value(viewer, "exposure", type=2, integer_value=7))
-        await begun.wait()
+        async with asyncio.timeout(20):
+            await begun.wait()
         start = time.monotonic()
         await cam.stop()
         assert time.monotonic() - start < 6
