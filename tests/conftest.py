@@ -87,13 +87,13 @@ def pytest_configure() -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Run side by side where there are cores; a few files or tests not, for their start is dear."""
+    """Run side by side, two more than cores, since many tests wait; not for a few files or tests."""
     few = len(config.args) <= 3 and all(".py" in one for one in config.args)
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return 0 if few or cores == 1 else cores
+    return 0 if few or cores == 1 else cores + 2
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
