@@ -110,7 +110,7 @@ class Places(Generic[G]):
     Args:
         most: largest number of connections at a time.
         within: seconds that a connection may stay without a session.
-        label: name of the missing thing, which the log gives as the reason for closing.
+        missing: name of the missing thing, which the log gives as the reason for closing.
         own: name of a session in the log, "a session".
 
     Attributes:
@@ -123,12 +123,12 @@ class Places(Generic[G]):
         most: int,
         *,
         within: float = HANDSHAKE_TIMEOUT,
-        label: str = "no session",
+        missing: str = "no session",
         own: str = "a session",
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._within, self._missing, self._session_text = within, label, own
+        self._within, self._missing, self._session_name = within, missing, own
         self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
 
     def __len__(self) -> int:
@@ -150,20 +150,15 @@ class Places(Generic[G]):
         if len(crowd) < self.most:
             crowd = []
             if not is_loopback(peer):
-                places_of_peer = [
-                    occupant for occupant, place in self._places.items() if place.peer == peer
-                ]
-                if len(places_of_peer) >= share_of(self.most):
-                    crowd, taken = (
-                        places_of_peer,
-                        f"{len(places_of_peer)} others of {peer} are open",
-                    )
+                same = [other for other, place in self._places.items() if place.peer == peer]
+                if len(same) >= share_of(self.most):
+                    crowd, taken = same, f"{len(same)} others of {peer} are open"
         if crowd:
             self.crowded_out += 1
             evicted = next((occupant for occupant in crowd if not occupant.settled), None)
             if evicted is None:
-                return f"{taken}, and each has {self._session_text}"
-            self._send_away(evicted, f"{taken}, it was without {self._session_text} for longest")
+                return f"{taken}, and each has {self._session_name}"
+            self._send_away(evicted, f"{taken}, it was without {self._session_name} for longest")
         self._places[occupant] = _TakenPlace(
             peer, now, self._within, self._missing, now + self._within
         )
@@ -180,31 +175,26 @@ class Places(Generic[G]):
             place.since = now
             self._places[occupant] = place
 
-    def expect(self, occupant: G, within: float | None, label: str, now: float) -> None:
+    def expect(self, occupant: G, within: float | None, missing: str, now: float) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            label: name of the missing thing, for the log.
+            missing: name of the missing thing, for the log.
             now: the moment.
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.within, place.missing = math.inf if within is None else within, label
+            place.within, place.missing = math.inf if within is None else within, missing
             place.deadline = now + place.within
 
     def waits_longest(self) -> tuple[float, G] | None:
         """Return the connection that has had no session for longest, and since when; None: none."""
-        longest_waiting = next(
-            (
-                occupant_and_place
-                for occupant_and_place in self._places.items()
-                if not occupant_and_place[0].settled
-            ),
-            None,
-        )
-        return None if longest_waiting is None else (longest_waiting[1].since, longest_waiting[0])
+        for occupant, place in self._places.items():
+            if not occupant.settled:
+                return place.since, occupant
+        return None
 
     def make_room(self, why: str) -> None:
         """Close the connection that has had no session for longest."""
@@ -332,15 +322,15 @@ class Acceptor(Generic[G]):
         """Put a connection last in the line to make room: it was served, or its session ended."""
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
-    def expect(self, occupant: G, within: float | None, label: str) -> None:
+    def expect(self, occupant: G, within: float | None, missing: str) -> None:
         """Set the seconds within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            label: name of the missing thing, for the log.
+            missing: name of the missing thing, for the log.
         """
-        self.places.expect(occupant, within, label, asyncio.get_running_loop().time())
+        self.places.expect(occupant, within, missing, asyncio.get_running_loop().time())
         self._set_timer()
 
     def _set_timer(self) -> None:
@@ -465,14 +455,10 @@ def _make_room() -> bool:
     """Close the connection without a session for longest, of all on this event loop."""
     loop = asyncio.get_running_loop()
     open_here = [acceptor.places for acceptor in _here.acceptors if acceptor.loop is loop]
-    waiting = [
-        (longest_waiting[0], acceptor)
-        for acceptor in open_here
-        if (longest_waiting := acceptor.waits_longest()) is not None
-    ]
+    waiting = [(longest[0], places) for places in open_here if (longest := places.waits_longest())]
     if not waiting:
         return False
-    _, places = min(waiting, key=lambda time_and_acceptor: time_and_acceptor[0])
+    _, places = min(waiting, key=lambda pair: pair[0])
     places.make_room("the process has too few file descriptors left")
     return True
 

@@ -37,7 +37,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
-        caller = function.__qualname__.removesuffix(".__init__")
+        owner = function.__qualname__.removesuffix(".__init__")
 
         @functools.wraps(function)
         def call(*args: P.args, **options: P.kwargs) -> R:
@@ -49,7 +49,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 given = signature.bind(*args, **options)
                 for name, check in checks.items():
                     if name in given.arguments:
-                        given.arguments[name] = check(given.arguments[name], name, caller)
+                        given.arguments[name] = check(given.arguments[name], name, owner)
             return function(*given.args, **given.kwargs)
 
         return call
@@ -57,7 +57,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return decorate
 
 
-def a_number(value: Any, name: str, caller: str) -> Any:
+def a_number(value: Any, name: str, owner: str) -> Any:
     """Return a plain number that a float has room for; ``bool`` is not one."""
     number = plain(value)
     if isinstance(number, (int, float)) and not isinstance(number, bool):
@@ -67,31 +67,31 @@ def a_number(value: Any, name: str, caller: str) -> Any:
             pass
         else:
             return number
-    raise wrong_argument(name, "a number", value, caller)
+    raise wrong_argument(name, "a number", value, owner)
 
 
-def a_finite_number(value: Any, name: str, caller: str) -> Any:
+def a_finite_number(value: Any, name: str, owner: str) -> Any:
     """Return a plain number that is neither infinite nor NaN."""
-    number = a_number(value, name, caller)
+    number = a_number(value, name, owner)
     if not math.isfinite(number):
-        raise wrong_argument(name, "a finite number", value, caller)
+        raise wrong_argument(name, "a finite number", value, owner)
     return number
 
 
-def an_integer(value: Any, name: str, caller: str) -> Any:
+def an_integer(value: Any, name: str, owner: str) -> Any:
     """Return a plain integer of at most 64 bits; ``bool`` is not one."""
     number = plain(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number
-    raise wrong_argument(name, "a whole number", value, caller)
+    raise wrong_argument(name, "a whole number", value, owner)
 
 
-def a_list(value: Any, name: str, caller: str) -> Any:
+def a_list(value: Any, name: str, owner: str) -> Any:
     """Return the items of a sequence; a text is not one."""
-    return check_all(value, name, "a list", caller)
+    return check_all(value, name, "a list", owner)
 
 
-def numbers(value: Any, name: str, caller: str) -> Any:
+def numbers(value: Any, name: str, owner: str) -> Any:
     """Return an array of numbers, of any shape."""
     import numpy as np
 
@@ -99,7 +99,7 @@ def numbers(value: Any, name: str, caller: str) -> Any:
         array = np.asarray(value)
         if array.dtype.kind in "fiubO":  # objects: fractions, and integers too large for numpy's
             return array.astype(np.float64)
-    raise wrong_argument(name, "an array of numbers", value, caller)
+    raise wrong_argument(name, "an array of numbers", value, owner)
 
 
 def as_array(value: Any, name: str) -> Any:
@@ -119,29 +119,29 @@ def as_array(value: Any, name: str) -> Any:
 def of_class(name: str) -> Check:
     """Return a check for an object of a class of this name, which need not be imported."""
 
-    def check(value: Any, argument: str, caller: str) -> Any:
+    def check(value: Any, argument: str, owner: str) -> Any:
         if any(class_.__name__ == name for class_ in cast("Any", type(value)).__mro__):
             return value
-        raise wrong_argument(argument, f"a {name}", value, caller)
+        raise wrong_argument(argument, f"a {name}", value, owner)
 
     return check
 
 
-def a_target(value: Any, name: str, caller: str) -> Any:
+def a_target(value: Any, name: str, owner: str) -> Any:
     """Return a target that is printed and found in images."""
     if hasattr(type(value), "kind") and hasattr(type(value), "points"):
         return value
-    raise wrong_argument(name, "a target, such as a Checkerboard", value, caller)
+    raise wrong_argument(name, "a target, such as a Checkerboard", value, owner)
 
 
 def each(check: Check, count: int | None = None) -> Check:
     """Return a check for a list whose items pass ``check``, with ``count`` items if given."""
 
-    def check_each(value: Any, name: str, caller: str) -> Any:
-        items = a_list(value, name, caller)
+    def check_each(value: Any, name: str, owner: str) -> Any:
+        items = a_list(value, name, owner)
         if count is not None and len(items) != count:
-            raise wrong_argument(name, f"{count} of them", value, caller)
-        return tuple(check(item, name, caller) for item in items)
+            raise wrong_argument(name, f"{count} of them", value, owner)
+        return tuple(check(item, name, owner) for item in items)
 
     return check_each
 
@@ -149,7 +149,7 @@ def each(check: Check, count: int | None = None) -> Check:
 def or_none(check: Check) -> Check:
     """Return a check that accepts None, too."""
 
-    def check_unless_none(value: Any, name: str, caller: str) -> Any:
-        return None if value is None else check(value, name, caller)
+    def check_unless_none(value: Any, name: str, owner: str) -> Any:
+        return None if value is None else check(value, name, owner)
 
     return check_unless_none

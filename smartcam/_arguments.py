@@ -5,7 +5,7 @@ subclass may compare, hash and print as it likes. A value that cannot work is a
 :exc:`~smartcam.ConfigurationError` that names the argument, the expected value, and the given
 value. Nothing is searched, sent or waited for.
 
-``caller`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
+``owner`` names the owner of the argument, such as a camera; "" if the argument's name suffices.
 """
 
 from __future__ import annotations
@@ -77,15 +77,15 @@ def shown_time(seconds: float, *, coarse: bool = False) -> str:
     return f"{seconds:.1f} s" if coarse else f"{round(seconds, 2):g} s"
 
 
-def wrong_argument(name: str, expected: str, value: object, caller: str = "") -> ConfigurationError:
+def wrong_argument(name: str, expected: str, value: object, owner: str = "") -> ConfigurationError:
     """Return the error for an argument that cannot work."""
     return ConfigurationError(
-        f"{caller}{': ' if caller else ''}{name}: expected {expected}, got {shown(value)}"
+        f"{owner}{': ' if owner else ''}{name}: expected {expected}, got {shown(value)}"
     )
 
 
 def check_integer(
-    value: object, name: str, least: int, most: int | None = None, caller: str = ""
+    value: object, name: str, least: int, most: int | None = None, owner: str = ""
 ) -> int:
     """Return an integer from ``least`` to ``most``; None: without an upper limit.
 
@@ -94,7 +94,7 @@ def check_integer(
     number = value if type(value) is int else _as_integer(value)
     if number is None or number < least or (most is not None and number > most):
         up_to = "or more" if most is None else f"to {most}"
-        raise wrong_argument(name, f"an integer, {least} {up_to}", value, caller)
+        raise wrong_argument(name, f"an integer, {least} {up_to}", value, owner)
     return number
 
 
@@ -131,7 +131,7 @@ def check_number(
     name: str,
     least: float,
     most: float,
-    caller: str = "",
+    owner: str = "",
     *,
     above: bool = False,
     unit: str = "a number",
@@ -143,7 +143,7 @@ def check_number(
     number = value if type(value) is float else _as_float(value)
     if number is None or not least <= number <= most or (above and number == least):
         raise wrong_argument(
-            name, f"{unit}, {'above ' if above else ''}{least:g} to {most:g}", value, caller
+            name, f"{unit}, {'above ' if above else ''}{least:g} to {most:g}", value, owner
         )
     return number
 
@@ -157,45 +157,45 @@ def _as_float(value: Any) -> float | None:
         return None
 
 
-def check_seconds(value: object, name: str, caller: str = "", *, above: bool = False) -> float:
+def check_seconds(value: object, name: str, owner: str = "", *, above: bool = False) -> float:
     """Return a time in seconds, 0 or more; with ``above``, more than 0."""
     if type(value) is float and 0.0 < value <= MAX_SECONDS:
         return value
-    return check_number(value, name, 0.0, MAX_SECONDS, caller, above=above, unit="seconds")
+    return check_number(value, name, 0.0, MAX_SECONDS, owner, above=above, unit="seconds")
 
 
 def check_seconds_or_none(
-    value: object, name: str, caller: str = "", *, above: bool = False
+    value: object, name: str, owner: str = "", *, above: bool = False
 ) -> float | None:
     """Return a time in seconds as :func:`check_seconds` does, or None."""
-    return None if value is None else check_seconds(value, name, caller, above=above)
+    return None if value is None else check_seconds(value, name, owner, above=above)
 
 
-def check_moment(value: object, name: str, caller: str = "") -> float:
+def check_moment(value: object, name: str, owner: str = "") -> float:
     """Return a moment of a clock: any finite number of seconds."""
     if type(value) is float and math.isfinite(value):
         return value
     number = _as_float(value)
     if number is None or not math.isfinite(number):
-        raise wrong_argument(name, "a finite number of seconds", value, caller)
+        raise wrong_argument(name, "a finite number of seconds", value, owner)
     return number
 
 
-def check_age(value: object, name: str, caller: str = "") -> float:
+def check_age(value: object, name: str, owner: str = "") -> float:
     """Return an age in seconds, 0 or more; ``inf`` is any age."""
     number = _as_float(value)
     if number is None or not number >= 0:
-        raise wrong_argument(name, "0 or more seconds, or inf", value, caller)
+        raise wrong_argument(name, "0 or more seconds, or inf", value, owner)
     return number
 
 
-def check_flag(value: object, name: str, caller: str = "") -> bool:
+def check_flag(value: object, name: str, owner: str = "") -> bool:
     """Return True or False; numpy's truth values are accepted, too."""
     if isinstance(value, bool):
         return value
     if _is_numpy_bool(value):
         return bool(value)
-    raise wrong_argument(name, "True or False", value, caller)
+    raise wrong_argument(name, "True or False", value, owner)
 
 
 def _is_numpy_bool(value: object) -> bool:
@@ -204,14 +204,14 @@ def _is_numpy_bool(value: object) -> bool:
 
 
 def check_text(
-    value: object, name: str, caller: str = "", *, least: int = 0, most: int = MAX_TEXT_LENGTH
+    value: object, name: str, owner: str = "", *, least: int = 0, most: int = MAX_TEXT_LENGTH
 ) -> str:
     """Return a text of ``least`` to ``most`` characters that UTF-8 can encode."""
     if isinstance(value, str):
         text = str.__str__(value)
         if least <= len(text) <= most and (text.isascii() or not _has_surrogates(text)):
             return text
-    raise wrong_argument(name, f"a text of {least} to {most} characters", value, caller)
+    raise wrong_argument(name, f"a text of {least} to {most} characters", value, owner)
 
 
 def _has_surrogates(text: str) -> bool:
@@ -222,14 +222,14 @@ def _has_surrogates(text: str) -> bool:
     return False
 
 
-def check_choice(value: object, name: str, known: Collection[str], caller: str = "") -> str:
+def check_choice(value: object, name: str, known: Collection[str], owner: str = "") -> str:
     """Return a word that is one of the known words."""
     if isinstance(value, str) and str.__str__(value) in known:
         return str.__str__(value)
-    raise wrong_argument(name, " or ".join(map(repr, known)), value, caller)
+    raise wrong_argument(name, " or ".join(map(repr, known)), value, owner)
 
 
-def check_bytes(value: object, name: str, caller: str = "") -> bytes:
+def check_bytes(value: object, name: str, owner: str = "") -> bytes:
     """Return a byte string: bytes, or an object with a buffer, such as a ``bytearray``."""
     if type(value) is bytes:
         return value
@@ -237,68 +237,68 @@ def check_bytes(value: object, name: str, caller: str = "") -> bytes:
         view = memoryview(cast("Any", value))
         if view.ndim and view.nbytes <= MAX_DATA_BYTES:  # a number of numpy has a buffer, too
             return view.tobytes()
-    raise wrong_argument(name, f"bytes, {MAX_DATA_BYTES} at most", value, caller)
+    raise wrong_argument(name, f"bytes, {MAX_DATA_BYTES} at most", value, owner)
 
 
-def check_callable(value: FunctionT, name: str, caller: str = "") -> FunctionT:
+def check_callable(value: FunctionT, name: str, owner: str = "") -> FunctionT:
     """Return the value if it can be called, else raise."""
     if not callable(value):
-        raise wrong_argument(name, "a function", value, caller)
+        raise wrong_argument(name, "a function", value, owner)
     return value
 
 
-def check_kind(value: T, kind: type[Any], name: str, expected: str, caller: str = "") -> T:
+def check_kind(value: T, kind: type[Any], name: str, expected: str, owner: str = "") -> T:
     """Return an object of a class; ``expected`` describes the class in words."""
     if not isinstance(value, kind):
-        raise wrong_argument(name, expected, value, caller)
+        raise wrong_argument(name, expected, value, owner)
     return value
 
 
-def check_all(value: Iterable[T], name: str, expected: str, caller: str = "") -> tuple[T, ...]:
+def check_all(value: Iterable[T], name: str, expected: str, owner: str = "") -> tuple[T, ...]:
     """Return the items of an iterable; a text is refused."""
     with contextlib.suppress(Exception):  # a class of the user may raise anything
         if not isinstance(value, (str, bytes)):
             return tuple(value)
-    raise wrong_argument(name, expected, value, caller)
+    raise wrong_argument(name, expected, value, owner)
 
 
-def check_instant(value: datetime | None, name: str, caller: str = "") -> datetime | None:
+def check_instant(value: datetime | None, name: str, owner: str = "") -> datetime | None:
     """Return a date and time with a time zone, or None."""
     if value is not None and (not isinstance(value, datetime) or value.tzinfo is None):
-        raise wrong_argument(name, "a datetime with a time zone, or None", value, caller)
+        raise wrong_argument(name, "a datetime with a time zone, or None", value, owner)
     return value
 
 
-def check_time(value: datetime, name: str, caller: str = "") -> datetime:
+def check_time(value: datetime, name: str, owner: str = "") -> datetime:
     """Return a date with a time."""
-    return check_kind(value, datetime, name, "a datetime", caller)
+    return check_kind(value, datetime, name, "a datetime", owner)
 
 
-def check_application(value: object, name: str = "application", caller: str = "") -> int:
+def check_application(value: object, name: str = "application", owner: str = "") -> int:
     """Return an application's id; 0 passes, since the camera itself refuses it."""
-    return check_integer(value, name, 0, MAX_APPLICATION_ID, caller)
+    return check_integer(value, name, 0, MAX_APPLICATION_ID, owner)
 
 
 def check_application_or_name(
-    value: object, argument: str = "application", caller: str = ""
+    value: object, argument: str = "application", owner: str = ""
 ) -> int | str:
     """Return an application's id, or the name of its file."""
     if not isinstance(value, str):
-        return check_application(value, argument, caller)
-    name = check_text(value, argument, caller, least=1, most=200)
+        return check_application(value, argument, owner)
+    name = check_text(value, argument, owner, least=1, most=200)
     if not name.isprintable():
-        raise wrong_argument(argument, "a file's name that can be printed", value, caller)
+        raise wrong_argument(argument, "a file's name that can be printed", value, owner)
     return name
 
 
-def check_message_id(value: object, name: str = "message_id", caller: str = "") -> int | str:
+def check_message_id(value: object, name: str = "message_id", owner: str = "") -> int | str:
     """Return a message's id: a number of 32 bits, or a command's text."""
     if isinstance(value, str):
-        return check_text(value, name, caller, least=1, most=200)
-    return check_integer(value, name, 0, 0xFFFFFFFF, caller)
+        return check_text(value, name, owner, least=1, most=200)
+    return check_integer(value, name, 0, 0xFFFFFFFF, owner)
 
 
-def check_path(value: object, name: str, caller: str = "") -> Path:
+def check_path(value: object, name: str, owner: str = "") -> Path:
     """Return the path of a file or folder: a text, or an object such as a ``Path``."""
     text: object = value
     if isinstance(value, os.PathLike):
@@ -308,7 +308,7 @@ def check_path(value: object, name: str, caller: str = "") -> Path:
         path = str.__str__(text)
         if 0 < len(path) <= MAX_TEXT_LENGTH and "\0" not in path and _is_name_of_file(path):
             return Path(path)
-    raise wrong_argument(name, "the path of a file or folder", value, caller)
+    raise wrong_argument(name, "the path of a file or folder", value, owner)
 
 
 def _is_name_of_file(path: str) -> bool:
@@ -324,19 +324,19 @@ def fspath_of(value: object) -> object:
     return str(value) if isinstance(value, PurePath) else value
 
 
-def check_seed(value: object, caller: str = "") -> int:
+def check_seed(value: object, owner: str = "") -> int:
     """Return the seed of random choices: any integer of 64 bits."""
-    return check_integer(value, "seed", -(1 << 63), (1 << 64) - 1, caller)
+    return check_integer(value, "seed", -(1 << 63), (1 << 64) - 1, owner)
 
 
-def check_port(value: object, caller: str = "") -> int:
+def check_port(value: object, owner: str = "") -> int:
     """Return the number of a port to listen on; 0 means any free port."""
-    return check_integer(value, "port", 0, 0xFFFF, caller)
+    return check_integer(value, "port", 0, 0xFFFF, owner)
 
 
-def check_texts(value: object, name: str, caller: str = "") -> dict[str, str]:
+def check_texts(value: object, name: str, owner: str = "") -> dict[str, str]:
     """Return a mapping from texts to texts."""
     if not isinstance(value, Mapping):
-        raise wrong_argument(name, "a mapping from texts to texts", value, caller)
+        raise wrong_argument(name, "a mapping from texts to texts", value, owner)
     pairs = cast("Mapping[object, object]", value).items()
-    return {check_text(key, name, caller): check_text(text, name, caller) for key, text in pairs}
+    return {check_text(key, name, owner): check_text(text, name, owner) for key, text in pairs}

@@ -70,16 +70,16 @@ Age = Annotated[float, _amount(SECONDS, MIN_AGE_SECONDS, MAX_AGE_SECONDS, "1 h")
 
 
 def _patterns(given: object) -> tuple[str, ...]:
-    names: list[str] = []
-    for place in cast("list[object]", given) if isinstance(given, (list, tuple)) else [given]:
-        if not isinstance(place, str) or _PATTERN.fullmatch(place) is None:
+    patterns: list[str] = []
+    for pattern in cast("list[object]", given) if isinstance(given, (list, tuple)) else [given]:
+        if not isinstance(pattern, str) or _PATTERN.fullmatch(pattern) is None:
             raise ValueError(
-                f"expected a camera's name, or a pattern such as line1/**; got {place!r:.80}"
+                f"expected a camera's name, or a pattern such as line1/**; got {pattern!r:.80}"
             )
-        names.append(place)
-    if not 1 <= len(names) <= MAX_PATTERNS:
-        raise ValueError(f"{len(names)} patterns, expected 1 to {MAX_PATTERNS}")
-    return tuple(names)
+        patterns.append(pattern)
+    if not 1 <= len(patterns) <= MAX_PATTERNS:
+        raise ValueError(f"{len(patterns)} patterns, expected 1 to {MAX_PATTERNS}")
+    return tuple(patterns)
 
 
 _ONE = {"type": "string", "pattern": f"^{_PATTERN.pattern}$"}

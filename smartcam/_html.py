@@ -59,7 +59,7 @@ def records_html(value: Any) -> str:
     kind: Any = type(records[0])
     units = kind._units  # noqa: SLF001 - of records, as their fields
     names = [f"{name} [{units[name]}]" if name in units else name for name in kind._fields]
-    return _table(names, ([_cell(cell) for cell in record] for record in records))
+    return _table(names, ([_cell(field) for field in record] for record in records))
 
 
 def _cell(value: object) -> str:

@@ -51,9 +51,7 @@ _PART = (
 
 def object_text(fields: Mapping[str, object]) -> str:
     """Return the text of an object."""
-    return (
-        f"{{{','.join([f'{_quoted(name)}:{text_of(field)}' for name, field in fields.items()])}}}"
-    )
+    return f"{{{','.join([f'{_quoted(name)}:{text_of(item)}' for name, item in fields.items()])}}}"
 
 
 def bytes_text(data: bytes) -> str:
@@ -127,7 +125,7 @@ def _table_text(table: Any) -> str | None:
     if table.ndim != 1 or row is None:
         return None
     form, texts, numbers = row
-    found: list[str] = []
+    rows: list[str] = []
     for values in table.tolist():
         fields = [*values]
         total = 0.0
@@ -137,8 +135,8 @@ def _table_text(table: Any) -> str | None:
             return None  # the sum is not finite if a value is not
         for place in texts:
             fields[place] = _quoted(_text_or_hex(fields[place]))
-        found.append(form % (*fields,))
-    return f"[{','.join(found)}]"
+        rows.append(form % (*fields,))
+    return f"[{','.join(rows)}]"
 
 
 @functools.lru_cache(maxsize=256)
@@ -152,7 +150,7 @@ def _row_form(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None
         return None
     fields = zip(dtype.names, kinds, strict=True)
     form = ",".join(
-        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[field.kind]}" for name, field in fields]
+        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[kind.kind]}" for name, kind in fields]
     )
     texts = tuple(place for place, kind in enumerate(kinds) if kind.kind == "S")
     floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")

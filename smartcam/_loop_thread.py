@@ -168,17 +168,17 @@ class _ThreadCall:
             self._fail(asyncio.CancelledError())
             return
         try:
-            outcome = self._function()
-            if inspect.iscoroutine(outcome):
-                self._work = outcome
-                task = self._task = start_task(self._finish_by(outcome))
+            returned = self._function()
+            if inspect.iscoroutine(returned):
+                self._work = returned
+                task = self._task = start_task(self._finish_by(returned))
                 if sys.version_info < (3, 12):
                     task.add_done_callback(self._end_unbegun)
                 return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
-            self._succeed(outcome)
+            self._succeed(returned)
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
         """Run a coroutine; the waiting thread goes on without another turn of the loop."""

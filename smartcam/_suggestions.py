@@ -71,7 +71,7 @@ def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | Non
     scores = _scores_by_parts(word, words)
     for candidate, score in _scores_by_edits(word, words).items():
         scores[candidate] = max(score, scores.get(candidate, 0.0))
-    close = (word for word in words if scores.get(word, -1.0) >= least)
+    close = (likely for likely in words if scores.get(likely, -1.0) >= least)
     return max(close, key=scores.__getitem__, default=None)
 
 

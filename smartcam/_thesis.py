@@ -306,13 +306,13 @@ def _spec_of_localizations(face: ThesisFace, application: int | None) -> Any:
         return "localizations"
     if not reading.by_application:
         return _with_poses(reading, None)
-    named = {application, face.application} - {None}
-    return {name: _with_poses(reading, name) for name in {*reading.applications, *named}}
+    ids = {*reading.applications, application, face.application} - {None}
+    return {number: _with_poses(reading, number) for number in ids}
 
 
 def _with_poses(reading: Interpretation, application: int | None) -> Any:
-    own_spec = reading.interpreter(application)
-    return "localizations" if own_spec is None or without_poses(own_spec) is not None else own_spec
+    known = reading.interpreter(application)
+    return "localizations" if known is None or without_poses(known) is not None else known
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:

@@ -225,10 +225,10 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
         reading: interpretation of the camera's results; None if their contents are not known.
         application: the active application; None if that is not known.
     """
-    interpretation = None if reading is None else reading.interpreter(application)
-    if interpretation is None or without_poses(interpretation) is not None:
+    interpreter = None if reading is None else reading.interpreter(application)
+    if interpreter is None or without_poses(interpreter) is not None:
         return "localizations", "m"
-    return interpretation, "px" if in_pixels(interpretation) else "m"
+    return interpreter, "px" if in_pixels(interpreter) else "m"
 
 
 def checked_localizations(value: object, camera: str) -> list[Localization]:

@@ -220,10 +220,7 @@ def _end_lingering(ports: frozenset[int]) -> None:
         except OSError:
             continue  # a file, or closed by now
         try:
-            if sock.family in INTERNET and ports & {
-                sock.getsockname()[1],
-                sock.getpeername()[1],
-            }:
+            if sock.family in INTERNET and ports & {sock.getsockname()[1], sock.getpeername()[1]}:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
         except OSError:
             pass  # the socket has no peer
@@ -264,16 +261,16 @@ class ZenohSession:
     Args:
         link: endpoints and certificates that the session uses.
         more: further settings of the engine, by their paths.
-        bus_text: name of the bus in texts.
+        bus_name: name of the bus in texts.
     """
 
     def __init__(
         self,
         link: BusLink,
         more: Mapping[str, Any] | None = None,
-        bus_text: str = "the fleet's bus",
+        bus_name: str = "the fleet's bus",
     ) -> None:
-        self._link, self._more, self._bus_text = link, dict(more or {}), bus_text
+        self._link, self._more, self._bus_name = link, dict(more or {}), bus_name
         self._zenoh = engine()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
@@ -305,7 +302,7 @@ class ZenohSession:
         """
         if _use.in_a_fork:
             raise LocalProtocolError(
-                f"{self._bus_text}: this process is a fork of one in which the engine's threads "
+                f"{self._bus_name}: this process is a fork of one in which the engine's threads "
                 "run, and it has none of them: start it by another method, such as "
                 "multiprocessing's 'spawn', or before the first session"
             )
@@ -344,7 +341,7 @@ class ZenohSession:
                 return
         logger.warning(
             "%s ! no router at %s yet: ends behind it can be reached once it runs",
-            self._bus_text,
+            self._bus_name,
             self._link.place,
         )
 
@@ -358,7 +355,7 @@ class ZenohSession:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
                 raise ConfigurationError(
-                    f"{self._bus_text}: the engine refuses {path}: {value!r}"
+                    f"{self._bus_name}: the engine refuses {path}: {value!r}"
                 ) from exc
         opening = self._loop.run_in_executor(None, zenoh.open, config)
         try:
@@ -390,7 +387,7 @@ class ZenohSession:
                 async with asyncio.timeout(CLOSE_TIMEOUT):
                     await asyncio.shield(closing)
         if not self._reopening:
-            raise ConfigurationError(f"{self._bus_text} is not open")
+            raise ConfigurationError(f"{self._bus_name} is not open")
         await self._open(timeout)
         for number, declared in enumerate(tuple(self._declared)):
             if number % MAX_DECLARED_AT_ONCE == 0:
@@ -418,7 +415,7 @@ class ZenohSession:
 
     def _failed(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
-        text = f"{self._bus_text}: cannot {doing} {self._link.place}: {why}"
+        text = f"{self._bus_name}: cannot {doing} {self._link.place}: {why}"
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
@@ -581,7 +578,7 @@ class ZenohSession:
             ConfigurationError: the session is not open.
         """
         if self._session is None:
-            raise ConfigurationError(f"{self._bus_text} is not open")
+            raise ConfigurationError(f"{self._bus_name} is not open")
         return self._session
 
     @property
@@ -671,10 +668,10 @@ class ZenohDeclared:
 
     def lose(self) -> Any:
         """Prepare for the end of the session; return the object to keep until then."""
-        declared, self._declaration = self._declaration, None
+        declaration, self._declaration = self._declaration, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
-        return None if self._by_dropping else declared
+        return None if self._by_dropping else declaration
 
     def again(self) -> None:
         """Declare the key again at the present session."""
@@ -691,9 +688,9 @@ class ZenohDeclared:
         if not self._closed:
             self._closed = True
             self._end.forget(self)
-            declared, self._declaration = self._declaration, None
-            if not self._by_dropping and declared is not None:
-                quietly(declared.undeclare)
+            declaration, self._declaration = self._declaration, None
+            if not self._by_dropping and declaration is not None:
+                quietly(declaration.undeclare)
 
 
 def _lose(session: Any, declared: list[Any], router: bool) -> None:
@@ -723,8 +720,8 @@ def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     engine's thread while holding the interpreter lock, and that thread may wait for the lock to
     call another session of this process.
     """
-    for thread in threads:
-        thread.shutdown()
+    for pool in threads:
+        pool.shutdown()
     if router:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
@@ -757,10 +754,10 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
     ``ended`` is called when no more calls will come.
     """
 
-    def called(declaration: Any) -> None:
+    def called(received: Any) -> None:
         if not _thread.known:
             keep_thread()
-        call(declaration)
+        call(received)
 
     return engine().handlers.Callback(called, ended, indirect=False)
 

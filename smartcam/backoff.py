@@ -71,19 +71,19 @@ class Backoff:
     transient: Callable[[BaseException], bool] = field(default=is_transient, repr=False)
 
     def __post_init__(self) -> None:
-        caller = "Backoff"
-        initial = check_seconds(self.initial, "initial", caller)
+        owner = "Backoff"
+        initial = check_seconds(self.initial, "initial", owner)
         checked: dict[str, object] = {
             "initial": initial,
-            "factor": check_number(self.factor, "factor", 1, MAX_FACTOR, caller),
+            "factor": check_number(self.factor, "factor", 1, MAX_FACTOR, owner),
             "maximum": check_number(
-                self.maximum, "maximum", initial, MAX_SECONDS, caller, unit="seconds"
+                self.maximum, "maximum", initial, MAX_SECONDS, owner, unit="seconds"
             ),
-            "jitter": check_number(self.jitter, "jitter", 0, 1, caller),
-            "transient": check_callable(self.transient, "transient", caller),
+            "jitter": check_number(self.jitter, "jitter", 0, 1, owner),
+            "transient": check_callable(self.transient, "transient", owner),
         }
         if self.attempts is not None:
-            checked["attempts"] = check_integer(self.attempts, "attempts", 1, caller=caller)
+            checked["attempts"] = check_integer(self.attempts, "attempts", 1, owner=owner)
         for name, value in checked.items():
             object.__setattr__(self, name, value)  # plain value, since the class is frozen
 
@@ -98,7 +98,7 @@ class Backoff:
                 pause.
             chance: random source of the jitter; seed it to get the same delays again.
         """
-        check_integer(short_lived, "short_lived", 0, caller="Backoff")
+        check_integer(short_lived, "short_lived", 0, owner="Backoff")
         if chance is None:
             from random import Random  # imported late, since it takes longer than this whole module
 

@@ -619,21 +619,21 @@ class Camera(abc.ABC, Generic[ValueT]):
         interpretation = (
             self._default if interpret_as is None else self._interpretation(interpret_as)
         )
-        caller = self.settings.name
+        owner = self.settings.name
         if application is not None:
-            application = check_application(self._named(application), caller=caller)
+            application = check_application(self._named(application), owner=owner)
         wait = (
             when_busy is WAIT
-            or check_choice(when_busy, "when_busy", (WAIT, "refuse"), caller) == WAIT
+            or check_choice(when_busy, "when_busy", (WAIT, "refuse"), owner) == WAIT
         )
         wanted = 1
         if results_per_trigger is not None:
             wanted = check_integer(
-                results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, caller
+                results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, owner
             )
-        data = None if input is None else check_bytes(input, "input", caller)
+        data = None if input is None else check_bytes(input, "input", owner)
         if timeout is not DEFAULT_TRIGGER_TIMEOUT:
-            timeout = check_seconds(timeout, "timeout", caller)
+            timeout = check_seconds(timeout, "timeout", owner)
         request = self._usual_trigger
         if (
             data is not None
@@ -673,7 +673,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Source: SC manual p. 34 (published).
         """
         application = check_application_or_name(
-            self._named(application, file=True), caller=self.name
+            self._named(application, file=True), owner=self.name
         )
         limit = self._limit(timeout, self.settings.switch_timeout)
         await self._switch_application(application, limit)
@@ -689,7 +689,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: the client's supervisor finishes the return; the next call waits for it.
         """
-        return self._in_application(check_application(self._named(application), caller=self.name))
+        return self._in_application(check_application(self._named(application), owner=self.name))
 
     def _named(self, application: object, *, file: bool = False) -> object:
         """Return the id of an application's name; anything else as it is.
@@ -1073,7 +1073,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
-        message_id = check_message_id(message_id, caller=self.name)
+        message_id = check_message_id(message_id, owner=self.name)
         payload = check_bytes(payload, "payload", self.name)
         if answered is not None:
             answered = check_flag(answered, "answered", self.name)

@@ -124,7 +124,7 @@ _NAMED_BITS = sum(member.value for member in Status)
 
 def as_status(word: int) -> Status:
     """Return the status of a word; for the receiving path, since ``Status(word)`` is slow."""
-    known = Status._value2member_map_.get(word)  # texts of named bits only, so at most 256
+    known = Status._value2member_map_.get(word)  # of named bits only, so at most 256
     return Status(word) if known is None else cast("Status", known)
 
 

@@ -305,4 +305,4 @@ def _depth(observer: Observer, name: str) -> int:
     if name in getattr(observer, "__dict__", ()):
         return -1
     classes = type(observer).__mro__
-    return next((at for at, kind in enumerate(classes) if name in vars(kind)), len(classes))
+    return next((at for at, class_ in enumerate(classes) if name in vars(class_)), len(classes))

@@ -73,8 +73,8 @@ class Registry:
 
     def __contains__(self, name: object) -> bool:
         """Return True if ``name`` is known, as a name or an alias."""
-        registries = (self._builtins, self._aliases, self._registered)
-        return any(name in registry for registry in registries) or name in self._entry_points()
+        known = (self._builtins, self._aliases, self._registered)
+        return any(name in names for names in known) or name in self._entry_points()
 
     def register(self, name: str, plugin: object) -> None:
         """Register a plug-in for this process, without a package that provides it.
@@ -154,23 +154,21 @@ def _distribution(point: EntryPoint) -> str:
 
 def _points(group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group; for a distribution found twice, the first one's."""
-    found_distributions = [
-        (distribution, _entry_points_text(distribution)) for distribution in _distributions()
-    ]
-    if not any(text is None or group in text for _, text in found_distributions):
+    distributions = [(each, _entry_points_text(each)) for each in _distributions()]
+    if not any(text is None or group in text for _, text in distributions):
         return  # the usual case; names are slow to read
     seen: set[str] = set()
-    for candidate, text in found_distributions:
+    for distribution, text in distributions:
         try:
-            name = _key(candidate)
+            name = _key(distribution)
             wanted = name not in seen and (text is None or group in text)
-            points = list(candidate.entry_points.select(group=group)) if wanted else []
-            seen.add(name or str(id(candidate)))
+            points = list(distribution.entry_points.select(group=group)) if wanted else []
+            seen.add(name or str(id(distribution)))
         except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
             _log.warning(
                 "%s: the entry points of %s cannot be read, they are left out: %r",
                 group,
-                getattr(candidate, "_path", None) or "a distribution",
+                getattr(distribution, "_path", None) or "a distribution",
                 exc,
             )
         else:

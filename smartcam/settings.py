@@ -77,8 +77,8 @@ class Address(NamedTuple):
         host = f"[{self.host}]" if ":" in self.host else self.host
         user = query = ""
         if self.parameters or self.quirks:
-            named = [quote(value, safe="") for key, value in self.parameters if key == USER]
-            user = "".join(f"{part}@" for part in named)
+            users = [quote(value, safe="") for key, value in self.parameters if key == USER]
+            user = "".join(f"{name}@" for name in users)
             pairs = [("dialect", self.dialect), ("quirks", ",".join(self.quirks)), *self.parameters]
             query = urlencode(
                 [(key, value) for key, value in pairs if value and key not in {USER, PASSWORD}],
@@ -447,18 +447,18 @@ def with_ids(options: dict[str, Any]) -> dict[str, Any]:
     names = options.get("application_names")
     if not isinstance(names, Mapping) or not names:
         return options
-    options_by_id = dict(options)
-    if isinstance(options_by_id.get("application"), str):
-        options_by_id["application"] = id_of(options_by_id["application"], names)
+    changed = dict(options)
+    if isinstance(changed.get("application"), str):
+        changed["application"] = id_of(changed["application"], names)
     for option in ("interpret_as", "calibration"):
-        given: Any = options_by_id.get(option)
+        given: Any = changed.get(option)
         if isinstance(given, Mapping):
             each: Mapping[Any, Any] = given
-            options_by_id[option] = {
+            changed[option] = {
                 id_of(key, names) if isinstance(key, str) else key: value
                 for key, value in each.items()
             }
-    return options_by_id
+    return changed
 
 
 def id_of(application: str, names: Mapping[str, int]) -> int:

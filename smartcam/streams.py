@@ -68,18 +68,18 @@ class Queue(Generic[T]):
         max_queue_bytes: int = sys.maxsize,
         size_of: Callable[[T], int] = _weightless,
     ) -> None:
-        caller = f"{name}()"
+        owner = f"{name}()"
         self._name = name
-        self._max_queue = check_integer(max_queue, "max_queue", 1, caller=caller)
-        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, caller=caller)
-        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, caller))
-        self._min_interval = check_seconds(min_interval, "min_interval", caller)
+        self._max_queue = check_integer(max_queue, "max_queue", 1, owner=owner)
+        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, owner=owner)
+        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, owner))
+        self._min_interval = check_seconds(min_interval, "min_interval", owner)
         self._size_of = size_of
         self._items: collections.deque[T | SmartCamError] = collections.deque()
         self._ready = asyncio.Event()
         self._ended = False
         self._end_error: SmartCamError | None = None
-        self._last_item: object = None
+        self._source: object = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
@@ -110,7 +110,7 @@ class Queue(Generic[T]):
     def keep(self, source: object) -> None:
         """Keep a reference to the items' source, for a program that keeps the stream alone."""
         if not self._ended:
-            self._last_item = source
+            self._source = source
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
@@ -218,7 +218,7 @@ class Queue(Generic[T]):
         if not self._ended:
             self._ended = True
             self._end_error = error
-            self._last_item = None
+            self._source = None
         self._ready.set()
 
     # ------------------------------------------------------------------ inside

@@ -191,7 +191,7 @@ async def examine(
     loaded again. The same happens when the generator is closed: use :func:`contextlib.aclosing`.
     """
     if application is not None:
-        application = check_application(application, caller="doctor")
+        application = check_application(application, owner="doctor")
     gige = _is_gige(url)
     if gige and (trigger or application is not None or interpret_as is not None):
         raise ConfigurationError(

@@ -138,19 +138,19 @@ class EmulatedCamera(WireCamera):
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
-        caller = "emulator"
+        owner = "emulator"
         if port is not None:
-            port = check_port(port, caller)
+            port = check_port(port, owner)
         if name is not None:
-            name = check_text(name, "name", caller, most=200)
+            name = check_text(name, "name", owner, most=200)
         if active is not None:
-            active = check_application(active, "active", caller)
+            active = check_application(active, "active", owner)
         if running is not None:
-            running = check_flag(running, "running", caller)
+            running = check_flag(running, "running", owner)
         if seed is not None:
-            seed = check_seed(seed, caller)
+            seed = check_seed(seed, owner)
         if builtins is not None:
-            builtins = check_flag(builtins, "builtins", caller)
+            builtins = check_flag(builtins, "builtins", owner)
         plan = make_plan(
             scenario,
             applications,
@@ -244,9 +244,9 @@ class EmulatedCamera(WireCamera):
             return ("quirks",), str(exc)
         for number, cue in enumerate(plan.timeline):
             for place, fault in enumerate(cue.do):
-                misfit_text = misfit(fault, spoken, known)
-                if misfit_text is not None:
-                    return ("timeline", number, "do", place, misfit_text[0]), misfit_text[1]
+                problem = misfit(fault, spoken, known)
+                if problem is not None:
+                    return ("timeline", number, "do", place, problem[0]), problem[1]
         return None
 
     @classmethod
@@ -289,9 +289,7 @@ class EmulatedCamera(WireCamera):
     def table(self) -> TableScene | None:
         """The table that its pages show; None if all applications inspect real pictures."""
         applications = self.device.applications.values()
-        inspects = all(
-            isinstance(application, InspectedApplication) for application in applications
-        )
+        inspects = all(isinstance(each, InspectedApplication) for each in applications)
         return None if inspects else self.scene
 
     @property
@@ -326,8 +324,7 @@ class EmulatedCamera(WireCamera):
             "next_number": device.next_number,
             "queued_inputs": device.queued_inputs,
             "applications": [
-                {key: getattr(application, key) for key in SHOWN}
-                for application in device.applications.values()
+                {key: getattr(each, key) for key in SHOWN} for each in device.applications.values()
             ],
             "quirks": self.quirks,
             "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),

@@ -115,9 +115,7 @@ class LinkOwner(Protocol):
         """Note that a connection has ended."""
         ...
 
-    def traced(
-        self, link: ClientLink, sender: m.Sender, message: Frame | RemoteProtocolError
-    ) -> None:
+    def traced(self, link: ClientLink, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
@@ -181,7 +179,7 @@ class ClientLink(ABC):
     def session_ended(self) -> None:  # noqa: B027  only TCP has an order of links
         """Note that the client has ended its session; the link may stay open."""
 
-    def answer_received(self) -> None:
+    def answer_messages(self) -> None:
         """Write the camera's answers to the received messages."""
         self.flush()
 
@@ -237,9 +235,9 @@ class ClientLink(ABC):
         if self._faulty is not None:
             self._faulty.close()
 
-    def _trace(self, sender: m.Sender, message: Frame | RemoteProtocolError) -> None:
+    def _trace(self, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
         if self._faulty is None or sender is m.Sender.CLIENT:
-            self._owner.traced(self, sender, message)
+            self._owner.traced(self, sender, seen)
 
 
 @dataclass(eq=False)
@@ -336,13 +334,13 @@ class FaultyLink:
         """Add bytes of the client: a part of a stream, or one datagram."""
         if self.dead:
             return
-        is_heard = self._owner.queue.on_client
+        faults_wait = self._owner.queue.on_client
         if self.machine.transport is Transport.UDP:
             self._take_message(cut_datagram(data, self._owner.codec))
             return
         if self._framer is None:
-            data = self._finish_frame(data) if is_heard else data
-            if not is_heard or self.machine.buffered:
+            data = self._finish_frame(data) if faults_wait else data
+            if not faults_wait or self.machine.buffered:
                 self._link.feed(data)
                 return
             self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
@@ -391,7 +389,7 @@ class FaultyLink:
         with self._owner.step():
             self._incoming.run()
             self._stop_cutting()
-            self._link.answer_received()
+            self._link.answer_messages()
 
     # ------------------------------------------------------------------ both
 

@@ -91,14 +91,14 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             return
         with self._owner.step():
             self._take(data)
-            self.answer_received()
+            self.answer_messages()
 
     def eof_received(self) -> bool:
         """Note that the client has closed its side; bytes that faults hold back are read first."""
         self._end_waits = self._faulty is not None and self._faulty.holds_input
         return self._end_waits
 
-    def answer_received(self) -> None:
+    def answer_messages(self) -> None:
         self.flush()  # also answers before a Disconnect in the same bytes
         if self.machine.state is State.FAILED:
             self.close("a broken frame came")

@@ -150,18 +150,18 @@ class WireCamera(Server):
         timeline: Sequence[Cue],
         applications: Container[int] = (),
     ) -> None:
-        caller = "emulator"
-        host = check_text(host, "host", caller, least=1, most=300)
-        port = check_port(port, caller)
-        name = check_text(name, "name", caller, most=200)
+        owner = "emulator"
+        host = check_text(host, "host", owner, least=1, most=300)
+        port = check_port(port, owner)
+        name = check_text(name, "name", owner, most=200)
         if clock is not None:
-            check_kind(clock, Clock, "clock", "a Clock", caller)
+            check_kind(clock, Clock, "clock", "a Clock", owner)
         self.host: str = host
         self.transport: Literal["tcp", "udp"] = transport
         self.dialect: str = dialect
         self.name: str = name
         self.clock: Clock = clock if clock is not None else RealClock()
-        self.seed: int = check_seed(seed, caller)
+        self.seed: int = check_seed(seed, owner)
         self.fault_kinds: frozenset[str] = kinds_of(device)
         self.codec: WireCodec = spoken
         self._cues = timeline
@@ -355,7 +355,7 @@ class WireCamera(Server):
             what = check_integer(what, "what", 0, 0xFFFFFFFF, "wait_received")
         elif not issubclass(what, m.Message):
             raise wrong_argument("what", "a message's id or type", what, "wait_received")
-        count = check_integer(count, "count", 0, caller="wait_received")
+        count = check_integer(count, "count", 0, owner="wait_received")
         timeout = check_seconds(timeout, "timeout", "wait_received")
         await self._traffic.wait_received(what, count=count, timeout=timeout)
 
@@ -516,19 +516,17 @@ class WireCamera(Server):
         by: Literal["client", "camera"] = "client" if by_client else "camera"
         self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
 
-    def traced(
-        self, link: ClientLink, sender: m.Sender, message: Frame | RemoteProtocolError
-    ) -> None:
+    def traced(self, link: ClientLink, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         traffic, now = self._traffic, self._step_at
         if now is None:
             now = self.clock.now
-        if isinstance(message, Frame):
-            traffic.entries.keep(now, link.peer, sender, message, link.input_faults)
+        if isinstance(seen, Frame):
+            traffic.entries.keep(now, link.peer, sender, seen, link.input_faults)
             if sender is _CLIENT:
-                traffic.count(message)
+                traffic.count(seen)
         else:
-            traffic.add(now, link.peer, sender, message, link.input_faults)
+            traffic.add(now, link.peer, sender, seen, link.input_faults)
         if self._shows:
             self._show_last()
 
@@ -541,11 +539,11 @@ class WireCamera(Server):
         self,
         peer: str,
         sender: m.Sender,
-        message: Frame | bytes,
+        content: Frame | bytes,
         fault: str | None,
         wire: bytes | None,
     ) -> None:
-        self._traffic.add(self.clock.now, peer, sender, message, fault, wire)
+        self._traffic.add(self.clock.now, peer, sender, content, fault, wire)
         if _log.isEnabledFor(logging.DEBUG):
             self._show_last()
 

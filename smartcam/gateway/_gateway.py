@@ -51,7 +51,7 @@ class Gateway(Server):
         self._shared = GatewayCamera(camera, self.settings, parts, self._account)
         self._writer = AnswerWriter(self.settings.style, parts.names)
         places: Places[RobotLink] = Places(
-            self.settings.clients, within=self.settings.idle, label="no request", own="a robot"
+            self.settings.clients, within=self.settings.idle, missing="no request", own="a robot"
         )
         self._acceptor: Acceptor[RobotLink] = Acceptor(
             self._make, places, _log, name="smartcam.gateway"

@@ -155,7 +155,7 @@ class CellCamera:
         Raises:
             ConfigurationError: there is no such application.
         """
-        application = check_application_or_name(application, caller="program")
+        application = check_application_or_name(application, owner="program")
         for number, program in self.programs.items():
             if application in (number, str(number), program.name):
                 return program

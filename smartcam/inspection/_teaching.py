@@ -68,7 +68,7 @@ class Teaching:
     def __init__(self, path: str | Path, camera: str, application: int | str) -> None:
         self.path: Path = check_path(path, "path", "Teaching")
         self.camera: str = check_text(camera, "camera", "Teaching")
-        application = check_application_or_name(application, caller="Teaching")
+        application = check_application_or_name(application, owner="Teaching")
         software = self._software(self._read())
         self.application: int = self._number(software["applications"], application)
         self.frames: str = Software.model_validate(software).frames_address(self.path.parent)

@@ -53,7 +53,7 @@ class Visitors:
         self.make: Callable[[], asyncio.Protocol] = make
         self.closed: bool = False
         self.places: Places[Visitor] = Places(
-            MAX_CONNECTIONS, within=HEAD_TIMEOUT, label="no request", own="a request"
+            MAX_CONNECTIONS, within=HEAD_TIMEOUT, missing="no request", own="a request"
         )
         self.acceptor: Acceptor[Visitor] = Acceptor(
             lambda: Visitor(self), self.places, _log, name="smartcam.web"

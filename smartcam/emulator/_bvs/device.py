@@ -384,7 +384,7 @@ class Device:
         Raises:
             ConfigurationError: no application has that id.
         """
-        application = check_application(application, caller="device")
+        application = check_application(application, owner="device")
         running = check_flag(running, "running", "device")
         target = self._applications[self._known_application(application)]
         with self.around():
@@ -457,7 +457,7 @@ class Device:
 
     def drop_triggers(self, count: int) -> None:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
-        self._trigger_drops += check_integer(count, "count", 0, caller="device")
+        self._trigger_drops += check_integer(count, "count", 0, owner="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the running inspection, or else the next one.

@@ -114,14 +114,14 @@ class EmulatedInSight(LineCamera):
         quirks: InSightQuirks | Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        caller = "emulator"
-        online = check_flag(online, "online", caller)
-        model = check_text(model, "model", caller, least=1, most=100)
+        owner = "emulator"
+        online = check_flag(online, "online", owner)
+        model = check_text(model, "model", owner, least=1, most=100)
         if active is not None:
-            active = check_application_or_name(active, "active", caller)
-        jobs = check_all(jobs, "jobs", "a list of jobs", caller)
+            active = check_application_or_name(active, "active", owner)
+        jobs = check_all(jobs, "jobs", "a list of jobs", owner)
         users, evaluations, info = (
-            None if given is None else check_texts(given, option, caller)
+            None if given is None else check_texts(given, option, owner)
             for option, given in (("users", users), ("evaluations", evaluations), ("info", info))
         )
         self.device = InSightDevice(jobs, active=active, online=online, image=image)
@@ -174,7 +174,7 @@ class EmulatedInSight(LineCamera):
     def shown(self) -> dict[str, Any]:
         """Return the state of the camera that its page shows."""
         device, job = self.device, self.device.job
-        jobs = [job for job in device.jobs.values() if job.id is not None]
+        jobs = [each for each in device.jobs.values() if each.id is not None]
         return {
             **super().shown(),
             "mode": device.mode,
@@ -187,13 +187,13 @@ class EmulatedInSight(LineCamera):
             "applications": [
                 {
                     **dict.fromkeys(SHOWN),
-                    "id": job.id,
-                    "name": job.file,
-                    "rate": job.rate,
-                    "load_time": job.load_time,
-                    "processing_time": job.processing_time,
+                    "id": each.id,
+                    "name": each.file,
+                    "rate": each.rate,
+                    "load_time": each.load_time,
+                    "processing_time": each.processing_time,
                 }
-                for job in jobs
+                for each in jobs
             ],
             "cells": dict(device.cells),
             "quirks": self.quirks,
@@ -298,7 +298,7 @@ class EmulatedInSight(LineCamera):
         Cancellation: safe.
         """
         mnemonic = check_text(command, "command", "wait_heard", least=1, most=100).upper()
-        count = check_integer(count, "count", 0, caller="wait_heard")
+        count = check_integer(count, "count", 0, owner="wait_heard")
         timeout = check_seconds(timeout, "timeout", "wait_heard")
         try:
             await self._commands_received.wait(mnemonic, count, timeout)
@@ -396,5 +396,5 @@ class EmulatedInSight(LineCamera):
 
     def _due(self) -> int | None:
         due, later = self.device.due, super()._due()
-        own_time = None if due is None else due + self._offset
-        return min((time for time in (own_time, later) if time is not None), default=None)
+        device_due = None if due is None else due + self._offset
+        return min((time for time in (device_due, later) if time is not None), default=None)

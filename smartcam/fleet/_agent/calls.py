@@ -77,7 +77,7 @@ class ProgramCall(NamedTuple):
             ConfigurationError: the value is not valid.
         """
         value = self.arguments.get(name)
-        return None if value is None else check(value, name, *bounds, caller=self.host.name)
+        return None if value is None else check(value, name, *bounds, owner=self.host.name)
 
     def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
         """Return a required argument."""
@@ -87,17 +87,17 @@ class ProgramCall(NamedTuple):
         return value
 
 
-def _check_layouts(value: object, name: str, caller: str) -> Any:
+def _check_layouts(value: object, name: str, owner: str) -> Any:
     """Return the layouts that have a number: one, or one for each application."""
     if not isinstance(value, dict):
-        return check_text(value, name, caller)
+        return check_text(value, name, owner)
     try:
         return {
-            int(key): check_text(text, name, caller)
+            int(key): check_text(text, name, owner)
             for key, text in cast("dict[str, object]", value).items()
         }
     except ValueError as exc:
-        raise wrong_argument(name, "layouts by application id", value, caller) from exc
+        raise wrong_argument(name, "layouts by application id", value, owner) from exc
 
 
 _PLAIN = Carrier()

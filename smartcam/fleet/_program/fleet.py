@@ -493,9 +493,7 @@ class Fleet:
         self._require_open()
         program = self._program
         summaries = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
-        best = by_name(
-            summaries, lambda reported: (reported.summary.connected, reported.summary.agent)
-        )
+        best = by_name(summaries, lambda camera: (camera.summary.connected, camera.summary.agent))
         return {name: best[name].summary for name in sorted(best)}
 
     async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ReportedOutlet]:
@@ -538,15 +536,15 @@ class Fleet:
 
         Cancellation: safe.
         """
-        caller = "stored_results"
-        at = check_instant(since, "since", caller)
+        owner = "stored_results"
+        at = check_instant(since, "since", owner)
         request = StoredRequest(
             since=None if at is None else at.astimezone(UTC).isoformat(),
-            failed=check_flag(failed, "failed", caller),
+            failed=check_flag(failed, "failed", owner),
             camera=check_pattern(pattern),
-            most=check_integer(most, "most", 0, MAX_STORED_ROWS, caller),
+            most=check_integer(most, "most", 0, MAX_STORED_ROWS, owner),
         )
-        timeout = check_seconds(timeout, "timeout", caller)
+        timeout = check_seconds(timeout, "timeout", owner)
         self._require_open()
         return await ask_stores(self._program.bus, self._program.keys, request, timeout)
 
@@ -730,13 +728,10 @@ class Fleet:
         doing = {camera.name: do(camera) for camera in cameras}
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = {
-                    name: group.create_task(outcome(doing_of_camera))
-                    for name, doing_of_camera in doing.items()
-                }
+                tasks = {name: group.create_task(outcome(work)) for name, work in doing.items()}
         finally:
-            for doing_of_camera in doing.values():
-                doing_of_camera.close()  # the cancelled task may never have begun
+            for work in doing.values():
+                work.close()  # the cancelled task may never have begun
         outcomes = {name: task.result() for name, task in tasks.items()}
         if all(isinstance(outcome, ConfigurationError) for outcome in outcomes.values()):
             raise next(iter(outcomes.values()))
@@ -773,7 +768,7 @@ class Fleet:
             return stream
 
         results = FleetResults[Any](subscribe)
-        self._results = [result for result in self._results if result[1]() is not None]
+        self._results = [entry for entry in self._results if entry[1]() is not None]
         self._results.append((pattern, weakref.ref(results)))
         names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
         if len(names) > MAX_CAMERAS_SUBSCRIBED and 2 * len(names) > len(self):

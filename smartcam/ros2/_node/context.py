@@ -100,7 +100,7 @@ class RosContext:
         if session is None:
             listening = _endpoints(listen)
             link = BusLink(listening, () if listening else _endpoints(connect))
-            session = ZenohSession(link, SETTINGS, bus_text="ROS 2")
+            session = ZenohSession(link, SETTINGS, bus_name="ROS 2")
         self.zenoh: ZenohSession = session
         self.graph: RosGraph = RosGraph(self.domain)
         self.zid: str = ""
