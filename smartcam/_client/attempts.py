@@ -96,10 +96,8 @@ class Try:
             error = error.__cause__
         if not isinstance(error, OSError):
             return False
-        error_numbers = (
-            {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
-        )
-        return not error_numbers.isdisjoint(numbers)
+        errnos = {error.errno} if error.errno else {int(n) for n in _ERRNO.findall(str(error))}
+        return not errnos.isdisjoint(numbers)
 
     def __str__(self) -> str:
         """One line for an error text."""

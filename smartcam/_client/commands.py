@@ -101,12 +101,12 @@ class Commands:
         await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
 
     async def _confirm(
-        self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, label: str
+        self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, awaited: str
     ) -> None:
         self.unconfirmed = True  # and it stays True if the wait is interrupted
         await self._requests.command(command, deadline)
         await self._status.refresh(deadline)
-        await self._status.until(predicate, deadline, label)
+        await self._status.until(predicate, deadline, awaited)
         self.unconfirmed = False
 
     async def catch_up(self, deadline: float) -> None:

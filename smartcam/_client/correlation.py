@@ -272,7 +272,7 @@ class Correlation:
         self._given_up: dict[int, Debt] = {}
         self._last_number: int | None = None  # number of the last trigger that had its results
         self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
-        self._newest_given: int | None = None
+        self._given_number: int | None = None
 
     @property
     def debt(self) -> Debt | None:
@@ -318,7 +318,7 @@ class Correlation:
         Args:
             highest: largest number that the field holds.
         """
-        given, self._newest_given = self._newest_given, None
+        given, self._given_number = self._given_number, None
         used = given is None or given in self._given_up or given == self._last_number
         if given is not None and given <= highest and not used:
             return given
@@ -328,14 +328,14 @@ class Correlation:
 
     def give_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
-        self._newest_given = number
+        self._given_number = number
 
     def send(self, pending: SentTrigger) -> None:
         """Note that a trigger is sent now."""
         self.pending, self.satisfied = pending, False
         self._last = pending.evidence
         if pending.number is None:
-            self._newest_given = None  # the trigger's run uses it
+            self._given_number = None  # the trigger's run uses it
 
     def leave(self) -> None:
         """Note that the trigger's caller no longer waits."""
@@ -415,7 +415,7 @@ class Correlation:
             self.doubted = False
             return False
         self.satisfied = False
-        self._newest_given = None  # the run of this trigger uses the number
+        self._given_number = None  # the run of this trigger uses the number
         return self._complete and previous is not None
 
     def judge_marked(self, is_ours: bool) -> Match:

@@ -43,13 +43,13 @@ class Times:
 
     def histogram(self) -> Histogram:
         """Return a snapshot of the counts."""
-        has_any = self._longest >= self._shortest
+        has_times = self._longest >= self._shortest
         return Histogram(
             HISTOGRAM_BOUNDS,
             tuple(self._counts),
             self._total,
-            self._shortest if has_any else None,
-            self._longest if has_any else None,
+            self._shortest if has_times else None,
+            self._longest if has_times else None,
         )
 
 

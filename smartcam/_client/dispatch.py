@@ -203,8 +203,8 @@ class Dispatch:
     def _only_streams(self) -> bool:
         """Return True if no task needs statuses, and containers go to streams in any case."""
         waits, listeners = self._waits, self._listeners
-        has_listeners = waits.answers or waits.statuses or listeners.hears_statuses
-        return not (has_listeners or listeners.sees_events) and self._results.only_streams
+        awaited = waits.answers or waits.statuses or listeners.hears_statuses
+        return not (awaited or listeners.sees_events) and self._results.only_streams
 
     def fail(self, error: SmartCamError) -> None:
         """End the session: every wait ends with an error, also one begun before the next session.

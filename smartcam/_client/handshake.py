@@ -379,9 +379,7 @@ async def establish(
         f"{settings.name}: no session with {address.url}: {why}",
         host=address.host,
         port=address.port,
-        attempts=tuple(
-            f"attempt {number}: {attempt_made}" for number, attempt_made in enumerate(tries, 1)
-        ),
+        attempts=tuple(f"attempt {number}: {tried}" for number, tried in enumerate(tries, 1)),
     ) from cause
 
 

@@ -115,18 +115,18 @@ class Interpretation:
         self._reader_of_all: _ApplicationReader | None = None
         self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
-            for application, interpreter in spec.items():
+            for application, each in spec.items():
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{shown(application)} is no id"
                     )
-                self._by_application[application] = _reader_for(
-                    resolve(interpreter, lenient=lenient), own
+                self._by_application[application] = _make_reader(
+                    resolve(each, lenient=lenient), own
                 )
         else:
             self._reader_of_all = (
-                _raw(own) if spec is None else _reader_for(resolve(spec, lenient=lenient), own)
+                _raw(own) if spec is None else _make_reader(resolve(spec, lenient=lenient), own)
             )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
@@ -199,15 +199,15 @@ class Interpretation:
                 value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        reader_of_application = self._reader_of_all or self._known_reader(container.application)
-        interpreter, simple = reader_of_application.interpreter, reader_of_application.simple
+        chosen = self._reader_of_all or self._known_reader(container.application)
+        interpreter, simple = chosen.interpreter, chosen.simple
         data = container.data
         if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
-        if simple is not None and not reader_of_application.sequenced:
+        if simple is not None and not chosen.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
-            if self._calibrations is not None and reader_of_application.calibrated:
+            if self._calibrations is not None and chosen.calibrated:
                 value = self._calibrations.apply(value, container.application)
             return value, None, context.empty_slots
         order = byte_order(endian)
@@ -216,9 +216,9 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
-        if self._calibrations is not None and reader_of_application.calibrated:
+        if self._calibrations is not None and chosen.calibrated:
             value = self._calibrations.apply(value, container.application)
-        sequence = run_sequence(interpreter, reader) if reader_of_application.sequenced else None
+        sequence = run_sequence(interpreter, reader) if chosen.sequenced else None
         return value, sequence, context.empty_slots
 
     def _context(
@@ -248,19 +248,14 @@ class Interpretation:
         None if the containers must be interpreted singly: the interpreter uses a Reader, a sequence
         number must be read, or one container does not fit.
         """
-        reader = self._reader_for(application)
-        if (
-            reader is None
-            or reader.simple is None
-            or reader.sequenced
-            or endian not in _BYTE_ORDERS
-        ):
+        known = self._reader_for(application)
+        if known is None or known.simple is None or known.sequenced or endian not in _BYTE_ORDERS:
             return None
         context = self._context(application, endian, camera, number, at)
         try:
-            values = reader.simple.read_all(payloads, context)
+            values = known.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None and reader.calibrated:
+            if self._calibrations is not None and known.calibrated:
                 # one by one, so that the bits of a value do not depend on its companions
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
@@ -283,17 +278,15 @@ class _Calibrations:
     """
 
     def __init__(self, given: Any, y_down: bool) -> None:
-        self._reader_of_all: Calibration | None = None
+        self._shared: Calibration | None = None
         self._by_application: dict[int, Calibration | None] | None = None
         if hasattr(given, "to_robot") or not hasattr(given, "items"):
-            self._reader_of_all = _calibration(given, y_down)
+            self._shared = _calibration(given, y_down)
             return
         self._by_application = {}
-        for application, calibration in given.items():
+        for application, each in given.items():
             number = check_application(application, "calibration: application")
-            self._by_application[number] = (
-                None if calibration is None else _calibration(calibration, y_down)
-            )
+            self._by_application[number] = None if each is None else _calibration(each, y_down)
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
         """Raise if the calibration can apply to no value of an interpreter.
@@ -305,7 +298,7 @@ class _Calibrations:
         Raises:
             ConfigurationError: the calibration applies to none; the text names the possible values.
         """
-        given, known = [self._reader_of_all], self._by_application
+        given, known = [self._shared], self._by_application
         of = "" if application is None else f" of application {application}"
         if known is not None:
             if application is not None and application not in known:
@@ -366,7 +359,7 @@ class _Calibrations:
     def _of(self, application: int) -> Calibration | None:
         known = self._by_application
         if known is None:
-            return self._reader_of_all
+            return self._shared
         if application not in known:
             raise WrongApplicationError(
                 f"a result of application {application} came; calibration knows {sorted(known)}",
@@ -462,7 +455,7 @@ class _ApplicationReader:
 @functools.cache
 def _raw(own: bool) -> _ApplicationReader:
     """Return the reader without a specification: plain bytes, the same reader for each client."""
-    return _reader_for(resolve(None), own)
+    return _make_reader(resolve(None), own)
 
 
 def _numbered(reader: _ApplicationReader) -> str | None:
@@ -470,7 +463,7 @@ def _numbered(reader: _ApplicationReader) -> str | None:
     return None if reader.numbering is None or layout is None else layout.text
 
 
-def _reader_for(interpreter: Interpreter, own: bool) -> _ApplicationReader:
+def _make_reader(interpreter: Interpreter, own: bool) -> _ApplicationReader:
     layout = interpreter.layout
     sequenced = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None

@@ -47,9 +47,8 @@ class KeepAlive:
 
     def ask(self, due: float) -> None:
         """Ask for a sign of life, which is awaited until ``due`` (loop time)."""
-        with contextlib.suppress(
-            SmartCamError
-        ):  # the link has ended: the receive task reports this
+        # if the link has ended, the receive task reports it
+        with contextlib.suppress(SmartCamError):
             self._requests.ask_for_life(due)
 
     def patience(self, usual: float) -> float:

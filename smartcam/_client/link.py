@@ -292,7 +292,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
-                with contextlib.suppress(OSError):  # the buffer was reset just now
+                with contextlib.suppress(OSError):  # the connection was reset just now
                     self._transport.write_eof()
             await self.wait_closed(timeout)
         finally:
@@ -579,7 +579,7 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
             frames += 1
         others = Chunk(at, events[frames:], chunk.frames - frames, chunk.delivery)
         return Chunk(at, events[:frames], frames, chunk.delivery), others
-    known_events: list[Event] = []
+    first_events: list[Event] = []
     left, events_left = frames, collections.deque(events)
     while left > 0 and events_left:
         event = events_left.popleft()
@@ -590,11 +590,11 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
             left -= len(event.data)
         else:
             left -= 1
-        known_events.append(event)
-    while known_events and events_left and type(known_events[-1]) is TriggerAnswer:
-        known_events.append(events_left.popleft())
+        first_events.append(event)
+    while first_events and events_left and type(first_events[-1]) is TriggerAnswer:
+        first_events.append(events_left.popleft())
     taken = frames - left
-    first = replace(chunk, events=known_events, frames=taken)
+    first = replace(chunk, events=first_events, frames=taken)
     return first, replace(chunk, events=list(events_left), frames=chunk.frames - taken)
 
 

@@ -222,14 +222,14 @@ def _drop_frames(error: SmartCamError) -> None:
     """
     chain: list[BaseException | None] = [error]
     while chain:
-        frame = chain.pop()
-        place = frame.__traceback__ if frame is not None else None
-        if frame is None or place is None:
+        exc = chain.pop()
+        place = exc.__traceback__ if exc is not None else None
+        if exc is None or place is None:
             continue
         while place.tb_next is not None:
             place = place.tb_next
-        if frame is not error:
+        if exc is not error:
             code = place.tb_frame.f_code
-            frame.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
-        frame.__traceback__ = None  # so that each error is visited once
-        chain += (frame.__cause__, frame.__context__)
+            exc.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
+        exc.__traceback__ = None  # so that each error is visited once
+        chain += (exc.__cause__, exc.__context__)

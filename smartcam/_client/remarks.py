@@ -58,12 +58,12 @@ class Remarks:
 
     def end(self) -> None:
         """Log the number of left-out lines at the session's end."""
-        for kind, remarks in self._kinds.items():
-            self._log_left_out(kind, logging.WARNING, remarks)
+        for kind, logged in self._kinds.items():
+            self._log_left_out(kind, logging.WARNING, logged)
         self._kinds.clear()
 
-    def _log_left_out(self, kind: str, level: int, remarks: _Logged) -> None:
-        left_out = remarks.count - MAX_REMARKS
+    def _log_left_out(self, kind: str, level: int, logged: _Logged) -> None:
+        left_out = logged.count - MAX_REMARKS
         if left_out > 0:
             text = "%s ! %d of the kind %r were not logged"
             logger.log(level, text, self._name, left_out, kind)

@@ -52,7 +52,7 @@ class Requests:
     _state: CameraState
     # seconds that an answer may take, however short the caller's deadline is
     patience: float
-    _switch_patience: float  # bound for the answer to a switch, too
+    _switch_patience: float  # seconds that the answer to a switch may take
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
@@ -111,8 +111,8 @@ class Requests:
         if answer is None or not self._connection.dialect.answers(type(message)):
             await self.send_unanswered(message, deadline)
             return
-        answer_message = await self.exchange(message, answer, deadline)
-        self.check(type(message), answer_message)
+        reply = await self.exchange(message, answer, deadline)
+        self.check(type(message), reply)
 
     def check(self, request: type[m.Message], answer: m.Message) -> None:
         """Raise the error for an answer's code, unless the code is a success.
@@ -144,12 +144,10 @@ class Requests:
         Raises:
             ResponseTimeoutError: the answer did not come, as for :meth:`exchange`.
         """
-        answer_message = await self.exchange(message, answer, deadline)
-        if not isinstance(answer_message, answer):
-            raise RemoteProtocolError(
-                f"{self.name}: {answer_message} came, {answer.__name__} was expected"
-            )
-        return answer_message
+        reply = await self.exchange(message, answer, deadline)
+        if not isinstance(reply, answer):
+            raise RemoteProtocolError(f"{self.name}: {reply} came, {answer.__name__} was expected")
+        return reply
 
     async def exchange(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
@@ -191,8 +189,8 @@ class Requests:
     def is_free(self, key: type[m.Message] | int) -> bool:
         """Return True if no answer of this kind is pending, and no request of it is in line."""
         waits = self._waits
-        is_waited_for = waits.answers or waits.fences_open
-        return not ((is_waited_for and waits.is_pending(key)) or self._locks[key].locked())
+        any_pending = waits.answers or waits.fences_open
+        return not ((any_pending and waits.is_pending(key)) or self._locks[key].locked())
 
     async def await_turn(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
@@ -345,10 +343,10 @@ class Requests:
                 answer.waiters.remove(waiter)
             if not answer.done():
                 raise TimeoutError
-        answer_message = answer.result()
-        if isinstance(answer_message, SmartCamError):
-            raise answer_message.with_traceback(None)
-        return answer_message
+        reply = answer.result()
+        if isinstance(reply, SmartCamError):
+            raise reply.with_traceback(None)
+        return reply
 
     def _wake_late(self) -> None:
         if self._late is not None:
@@ -357,9 +355,9 @@ class Requests:
     def _unsent(self, message: m.Message) -> ResponseTimeoutError:
         return self._timeout(message, "could not send", "in time: an earlier answer is owed")
 
-    def _timeout(self, message: m.Message, label: str, why: str) -> ResponseTimeoutError:
+    def _timeout(self, message: m.Message, failure: str, why: str) -> ResponseTimeoutError:
         dialect = self._connection.dialect
         return ResponseTimeoutError(
-            f"{self.name}: {label} {dialect.called(message)} {why}; status: {self._state.status}",
+            f"{self.name}: {failure} {dialect.called(message)} {why}; status: {self._state.status}",
             message_id=dialect.message_id(message),
         )

@@ -141,7 +141,7 @@ class Results:
         pending = self._pending
         if pending is None:
             return None
-        if pending.outcome.cancelled() and not pending.ended:  # the call's task was not woken yet
+        if pending.outcome.cancelled() and not pending.ended:  # the caller was not woken yet
             pending.ended = True
             self.correlation.give_up(pending)
         if not pending.ended:
@@ -271,7 +271,7 @@ class Results:
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
                 self.hand_on(container, None, fate, number, now, at)
-            elif not pending.ended:  # the call has ended if the container before could not be read
+            elif not pending.ended:  # it has ended if the one before could not be read
                 self.hand_on(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate
@@ -357,10 +357,8 @@ class Results:
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        requested = container.asked
-        match = (
-            correlation.judge(number) if requested is None else correlation.judge_marked(requested)
-        )
+        ours = container.asked
+        match = correlation.judge(number) if ours is None else correlation.judge_marked(ours)
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:

@@ -61,7 +61,7 @@ class StatusRequests:
         self,
         predicate: Callable[[Status], bool],
         deadline: float,
-        label: str,
+        awaited: str,
         *,
         insist: bool = True,
     ) -> Status:
@@ -70,7 +70,7 @@ class StatusRequests:
         Args:
             predicate: function that returns True for the status awaited.
             deadline: loop time.
-            label: description of the status awaited, for the error.
+            awaited: description of the status, for the error.
             insist: request the status again if a report of it may have been lost.
 
         Raises:
@@ -85,7 +85,7 @@ class StatusRequests:
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited {shown_time(waited)} for {label}; "
+                f"{self._connection.name}: waited {shown_time(waited)} for {awaited}; "
                 f"status: {self.last}",
                 waited=waited,
             ) from exc
@@ -159,7 +159,7 @@ class StatusRequests:
                 await self.pause(deadline, "the camera to tell its status")
             older = before = state.statuses_received  # earlier answers have come or are lost
 
-    async def pause(self, deadline: float, label: str) -> None:
+    async def pause(self, deadline: float, awaited: str) -> None:
         """Wait a moment before the camera is asked again.
 
         Raises:
@@ -168,7 +168,7 @@ class StatusRequests:
         now = asyncio.get_running_loop().time()
         if deadline - now <= BUSY_PAUSE:
             raise ResponseTimeoutError(
-                f"{self._connection.name}: waited until the time was over for {label}; "
+                f"{self._connection.name}: waited until the time was over for {awaited}; "
                 f"status: {self.last}"
             )
         with contextlib.suppress(TimeoutError):  # a loss ends the pause at once

@@ -396,9 +396,9 @@ class Triggers:
     ) -> list[m.Message]:
         """Return the messages of a trigger; its input is sent now if it is answered."""
         requests, features = self._requests, self._connection.features
-        has_evidence = features.fences and features.polled and features.shows_triggers
+        asks_status = features.fences and features.polled and features.shows_triggers
         words: list[m.Message] = [_QUERY] if features.fences else []
-        if has_evidence:
+        if asks_status:
             words.append(_GET_STATUS)
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
@@ -410,7 +410,7 @@ class Triggers:
             words.append(m.SetInput(data=input_data))
         words.append(_TRIGGER)
         if features.fences and features.shows_triggers:
-            words.append(_GET_STATUS if has_evidence else _QUERY)
+            words.append(_GET_STATUS if asks_status else _QUERY)
         return words
 
     def _end_reading(self, link: Link) -> None:
@@ -422,15 +422,13 @@ class Triggers:
         """End the trigger at once if the camera reports that it accepted none."""
 
         def on_answer(answer: asyncio.Future[Answer]) -> None:
-            answer_message = answer.result()
-            if isinstance(answer_message, SmartCamError) or pending.outcome.done():
+            reply = answer.result()
+            if isinstance(reply, SmartCamError) or pending.outcome.done():
                 return
             try:
-                self._requests.check(m.Trigger, answer_message)
+                self._requests.check(m.Trigger, reply)
             except (CommandRejectedError, UnsupportedError) as exc:
-                busy = isinstance(answer_message, m.Acknowledgement) and self._requests.is_busy(
-                    answer_message
-                )
+                busy = isinstance(reply, m.Acknowledgement) and self._requests.is_busy(reply)
                 if not self._connection.features.ordered:  # perhaps an earlier trigger's answer
                     self._correlation.give_up(pending)
                 pending.fail(CameraBusyError(str(exc)) if busy else exc)
@@ -574,8 +572,8 @@ def _what_is_missing(pending: PendingTrigger) -> str:
     """Return the part of an error text on the camera's missing messages about the trigger."""
     evidence, early = pending.evidence, ""
     if pending.early:
-        missing = "1 result" if pending.early == 1 else f"{pending.early} results"
-        early = f"; {missing} came before the camera had shown that it took the trigger"
+        results = "1 result" if pending.early == 1 else f"{pending.early} results"
+        early = f"; {results} came before the camera had shown that it took the trigger"
     if not evidence.reached:
         return f"; the camera has not shown that it took the trigger{early}{_HINT if early else ''}"
     if not evidence.proven:

@@ -386,7 +386,7 @@ class Client:
             at.satisfied,
             at._last_number,
             at._turn,
-            at._newest_given,
+            at._given_number,
         )
         given_up = tuple(at._given_up.items())
         numbered = self.results._numbering is not None
