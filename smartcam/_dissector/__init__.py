@@ -53,7 +53,7 @@ def lua_tables() -> dict[str, Any]:
         "STATUSES": [_name(member) for member in Status],
         "IDS": _ids(rows),
         "DIALECTS": [_dialect(dialect) for dialect in dialects.values()],
-        "KIN": [[protocol.name, *protocol.quirks] for group in first_tries for protocol in group],
+        "KIN": [[dialect.name, *dialect.quirks] for group in first_tries for dialect in group],
     }
 
 

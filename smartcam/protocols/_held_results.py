@@ -57,14 +57,14 @@ class HeldResults:
         self._unanswered: set[int] = set()  # numbers of questions without an answer
         self._named: int | None = None  # the application that the camera named last
         self._before_trigger = 0  # number of the question before the last trigger
-        self._numbers_seen: set[int] | None = None  # applications named since that question
+        self._applications_seen: set[int] | None = None  # applications named since that question
 
     def ask(self, *, trigger: bool = False) -> int:
         """Return the number of a new question, which may stand before a trigger."""
         self._last += 1
         self._unanswered.add(self._last)
         if trigger:
-            self._before_trigger, self._numbers_seen = self._last, set()
+            self._before_trigger, self._applications_seen = self._last, set()
         return self._last
 
     def add(self, messages: tuple[Event, ...], *, answers_trigger: bool) -> bool:
@@ -75,8 +75,8 @@ class HeldResults:
         """
         results = [message for message in messages if isinstance(message, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
-        if answers_trigger and self._numbers_seen is not None:
-            seen, self._numbers_seen = self._numbers_seen, None
+        if answers_trigger and self._applications_seen is not None:
+            seen, self._applications_seen = self._applications_seen, None
         if results:
             size = sum(len(result.data) for result in results)
             self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
@@ -109,7 +109,7 @@ class HeldResults:
         self._named = application
         self._unanswered.discard(question)
         held = [item for item in self._waiting if isinstance(item, _Held)]
-        for seen in (self._numbers_seen, *(item.seen for item in held)):
+        for seen in (self._applications_seen, *(item.seen for item in held)):
             if seen is not None:
                 seen.add(application)
         self._release()

@@ -99,14 +99,14 @@ class StatusBits:
         """Return the status for a word on the wire."""
         if not self.others:
             return as_status(word)
-        status, payload = int(self.always), word
+        status, remaining = int(self.always), word
         for bit, meaning in self.named.items():
             status |= meaning if word & bit else 0
-            payload &= ~bit
+            remaining &= ~bit
         for bit, meaning in self.without.items():
             status |= 0 if word & bit else meaning
-            payload &= ~bit
-        return Status(status | payload << self.others)
+            remaining &= ~bit
+        return Status(status | remaining << self.others)
 
     def write(self, status: Status) -> int:
         """Return the word on the wire; bits without a place there are left out."""
@@ -173,9 +173,9 @@ class Codec:
         # fills the slots of a frozen message, in half the time of its own constructor
         self._fill = [_filler(row.type, name) for name in self.names]
         self._omitted = [
-            (_filler(row.type, attribute.name), attribute.default)
-            for attribute in dataclasses.fields(row.type)
-            if attribute.name not in self.names
+            (_filler(row.type, slot.name), slot.default)
+            for slot in dataclasses.fields(row.type)
+            if slot.name not in self.names
         ]
 
     @property
@@ -251,9 +251,7 @@ class Codec:
     def like(self, message: Message) -> Callable[[bytes], Message]:
         """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
-        names = [
-            attribute.name for attribute in dataclasses.fields(kind) if attribute.name != data_name
-        ]
+        names = [slot.name for slot in dataclasses.fields(kind) if slot.name != data_name]
         others = [(_filler(kind, name), getattr(message, name)) for name in names]
         fill_data = _filler(kind, data_name)
 

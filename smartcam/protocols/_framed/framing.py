@@ -459,6 +459,6 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, pieces: list
 
 
 @functools.lru_cache(maxsize=64)
-def _cutter(count: int, head: int, tail: int) -> Read:
+def _cutter(count: int, head: int, body: int) -> Read:
     """Return a function that unpacks ``count`` frames into alternating headers and bodies."""
-    return struct.Struct(f"{head}s{tail}s" * count).unpack_from
+    return struct.Struct(f"{head}s{body}s" * count).unpack_from

@@ -232,17 +232,8 @@ class Machine:
     __slots__ = (
         *("_asks", "_begun", "_begun_at", "_bounded", "_burst_reader", "_burst_size", "_chunks"),
         *("_constant", "_deaf", "_decoders", "_deliveries", "_events", "_familiar", "_framer"),
-        *(
-            "_header_size",
-            "_may_come",
-            "_may_go",
-            "_narrows",
-            "_next_to_come",
-            "_next_to_go",
-            "_open",
-            "_outbox",
-            "_plain",
-        ),
+        *("_header_size", "_may_come", "_may_go", "_narrows", "_next_to_come", "_next_to_go"),
+        *("_open", "_outbox", "_plain"),
         *("_policy", "_result_head", "_result_id", "_results", "_says", "_sender"),
         *("_sent_data_key", "_sent_frames", "_state", "_status_id", "_status_size", "_statuses"),
         *("_takes_bursts", "_trace", "_unfinished", "_unknown_deliveries", "_volley", "counters"),
@@ -310,11 +301,11 @@ class Machine:
         Raises:
             LocalProtocolError: the dialect is not in :attr:`kin`.
         """
-        candidates = [dialect_ for dialect_ in self.kin if dialect_ is dialect]
-        if not candidates:
+        same = [kin for kin in self.kin if kin is dialect]
+        if not same:
             raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
-        self.kin = candidates
-        self._take_up(candidates[0])
+        self.kin = same
+        self._take_up(same[0])
 
     def _take_up(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
@@ -594,12 +585,12 @@ class Machine:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
-                result = self._find_result(buffer, start)
-                if result is None and self._open:
-                    result = self._find_answer(buffer, start)
-                if result is None:
+                match = self._find_result(buffer, start)
+                if match is None and self._open:
+                    match = self._find_answer(buffer, start)
+                if match is None:
                     break
-                message, end = result
+                message, end = match
             elif status_id in self._open:
                 self._close(status_id)
             events.append(message)
@@ -611,10 +602,8 @@ class Machine:
 
     def _note_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
         """Store a delivery that consisted of familiar frames only, each of them an event."""
-        framer, events = (
-            self._framer,
-            [event for event in self._events if isinstance(event, m.Message)],
-        )
+        framer = self._framer
+        events = [event for event in self._events if isinstance(event, m.Message)]
         results = [at for at, event in enumerate(events) if isinstance(event, m.ResultContainer)]
         self._unknown_deliveries -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
@@ -716,12 +705,12 @@ class Machine:
         header = self.dialect.header
         message_id, size = framer.unfinished() or (None, header.size)
         which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
-        shortage = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
+        progress = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
         other = framer.header_within(begun.searched)
         if other is not None:
-            text = f"{which} holds another header at byte {other}; {shortage}"
+            text = f"{which} holds another header at byte {other}; {progress}"
         elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
-            text = f"{which} does not become whole: {shortage}"
+            text = f"{which} does not become whole: {progress}"
         else:
             begun.searched = max(framer.buffered - header.size + 1, 0)
             return False

@@ -202,10 +202,10 @@ def _bitmap_size(data: bytearray) -> int:
     return size
 
 
-def _number(line: str, label: str) -> int:
+def _number(line: str, expected: str) -> int:
     text = line.strip()
     if not text.removeprefix("-").isdecimal() or not text.isascii() or len(text) > 12:
-        raise unexpected(line, label)
+        raise unexpected(line, expected)
     return int(text)
 
 

@@ -177,8 +177,8 @@ class InSightDialect(Dialect):
             return Spelled(None, "password", {"text": "***"}, b"")
         if frame.message_id == Piece.TEXT:
             return Spelled(None, "text", {"text": text}, frame.payload)
-        label = "command" if sender is m.Sender.CLIENT else "line"
-        return Spelled(None, label, {"text": text}, frame.payload + LINE_END)
+        kind = "command" if sender is m.Sender.CLIENT else "line"
+        return Spelled(None, kind, {"text": text}, frame.payload + LINE_END)
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
         """Return a command of the user, such as ``GVA001``; the payload follows it.
