@@ -434,13 +434,13 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
 
 def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
     """Return the interpreter's name and the layout of a text."""
-    head, colon, arguments = spec.partition(":")
+    head, colon, tail = spec.partition(":")
     name = head.strip()
     if not colon and "(" not in spec:
         return name, None
-    if colon and name in INTERPRETERS and not _is_type(arguments):
+    if colon and name in INTERPRETERS and not _is_type(tail):
         return name, Layout(spec, lenient=lenient, start=len(head) + 1)
-    _check_name(spec, name, arguments)
+    _check_name(spec, name, tail)
     return "record", Layout(spec, lenient=lenient)
 
 
@@ -450,20 +450,20 @@ SURE_SLIP = 0.8
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
 
-def _is_type(arguments: str) -> bool:
+def _is_type(tail: str) -> bool:
     """Return True if a field's type follows: ``table: int32`` is a field named ``table``."""
-    word = _FIRST_WORD.match(arguments)
+    word = _FIRST_WORD.match(tail)
     return word is not None and word[1] in TYPES and not word[2]
 
 
-def _check_name(spec: str, name: str, arguments: str) -> None:
+def _check_name(spec: str, name: str, tail: str) -> None:
     """Raise for a mistyped interpreter's name, if no layout text would begin with it."""
-    word = _FIRST_WORD.match(arguments)
+    word = _FIRST_WORD.match(tail)
     another_colon = word is not None and word[2] and word[1] not in TYPES
     if re.fullmatch(r"[\w.-]+", name) and (another_colon or not name.isidentifier()):
         _fail_name(spec, name)
     # "localization: (...)*" is a valid layout text with a named group, but surely a slip
-    if arguments.lstrip().startswith("(") and name != "records":
+    if tail.lstrip().startswith("(") and name != "records":
         known = [info.name for info in INTERPRETERS.available()]
         close = closest(name, known, least=SURE_SLIP)
         if close:

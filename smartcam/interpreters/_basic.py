@@ -44,7 +44,7 @@ class Strings50Interpreter(PlainInterpreter):
             return [raw.partition(b"\0")[0].decode() for (raw,) in _TEXT.iter_unpack(data)]
         except (struct.error, UnicodeDecodeError):
             pass
-        reader = Reader(data)  # the decoding error names the offset
+        reader = Reader(data)  # the reader's error names the offset
         return [reader.get_string(offset, WIDTH) for offset in reader.records(WIDTH)]
 
 

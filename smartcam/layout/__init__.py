@@ -220,9 +220,9 @@ class Layout:
         Raises:
             InterpretationError: a payload does not fit; the error is that of the first one.
         """
-        found = self.wire_rows(payloads, byte_order)
-        if found is not None:
-            rows, counts = found
+        unpacked = self.wire_rows(payloads, byte_order)
+        if unpacked is not None:
+            rows, counts = unpacked
             try:
                 records = self._codecs[byte_order][1].convert(rows)
             except (KeyError, UnicodeDecodeError):
@@ -481,57 +481,55 @@ class Layout:
 
     def _count(self, payload: Payload, head: RecordCodec, codec: RecordCodec) -> int:
         """Check the size of a payload, and return the number of records to read."""
-        available = len(payload)
-        count, remainder = divmod(available - head.size, codec.size)
+        size = len(payload)
+        count, remainder = divmod(size - head.size, codec.size)
         fixed, repeat = self._fixed, self._spec.repeat
-        if available < head.size:
-            raise self._misfit(head, available, 0, None)
+        if size < head.size:
+            raise self._misfit(head, size, 0, None)
         if remainder or (fixed is not None and fixed != count):
-            raise self._misfit(codec, available, head.size, fixed)
+            raise self._misfit(codec, size, head.size, fixed)
         if not isinstance(repeat, str) or repeat == "*":
             return count
         index = next(i for i, field in enumerate(head.fields) if field.name == repeat)
-        records_stated = int(head.read_field(payload, 0, index))
-        if not 0 <= records_stated <= count:
+        given = int(head.read_field(payload, 0, index))
+        if not 0 <= given <= count:
             more = f", as many records of {codec.size} bytes as the container holds"
-            raise misfit(
-                head.fields[index], head.offsets[index], f"0 to {count}", records_stated, more=more
-            )
-        return records_stated
+            raise misfit(head.fields[index], head.offsets[index], f"0 to {count}", given, more=more)
+        return given
 
     def _misfit(
-        self, codec: RecordCodec, actual: int, start: int, count: int | None
+        self, codec: RecordCodec, size: int, start: int, count: int | None
     ) -> InterpretationError:
         """Return the error for a payload of the wrong length: a truncated field or surplus bytes.
 
-        ``codec``: codec of the record (or the head) that does not fit. ``actual``: number of bytes
+        ``codec``: codec of the record (or the head) that does not fit. ``size``: number of bytes
         of the payload. ``start``: offset of the first record. ``count``: required number of
         records, or None for any.
         """
-        full = max(0, actual - start) // codec.size
+        full = max(0, size - start) // codec.size
         at = start + codec.size * (full if count is None else min(full, count))
         if count is not None and full >= count:
             hint = "; for several records write ( ... )*" if self._spec.repeat is None else ""
             expected = start + count * codec.size
             return InterpretationError(
-                f"container: expected {expected} bytes, got {actual}: "
-                f"{actual - expected} too many from offset {at}{hint}",
+                f"container: expected {expected} bytes, got {size}: "
+                f"{size - expected} too many from offset {at}{hint}",
                 offset=at,
                 expected=expected,
-                got=actual,
+                got=size,
             )
-        field, offset = codec.field_at(actual - at)
+        field, offset = codec.field_at(size - at)
         expected = at + codec.size if count is None else start + count * codec.size
         record = (
             "" if self._spec.repeat is None or codec.fields is self.head else f"record {full}: "
         )
         return InterpretationError(
             f"{record}{field.label} at offset {at + offset}: expected {field.size} bytes, "
-            f"got {actual - at - offset} (the container has {actual} bytes, expected {expected})",
+            f"got {size - at - offset} (the container has {size} bytes, expected {expected})",
             field=field.name,
             offset=at + offset,
             expected=expected,
-            got=actual,
+            got=size,
         )
 
     # -- building ----------------------------------------------------------------------------

@@ -414,10 +414,8 @@ def _expected(field: Field) -> str:
         return "True or False"
     if field.type == "string":
         return f"a text of at most {field.length} bytes in UTF-8, without a zero character"
-    expected = "a number in range" if not wire.is_integer else f"{wire.low} to {wire.high}"
-    return (
-        expected if field.unit is None else f"{expected} on the wire ({UNITS[field.unit].si} here)"
-    )
+    text = "a number in range" if not wire.is_integer else f"{wire.low} to {wire.high}"
+    return text if field.unit is None else f"{text} on the wire ({UNITS[field.unit].si} here)"
 
 
 def _shown(value: object) -> str:

@@ -348,17 +348,17 @@ class _Parser:
             )
         return name
 
-    def _field(self, label: str) -> Field:
-        name = self._name(label)
+    def _field(self, expected: str) -> Field:
+        name = self._name(expected)
         self._expect(":", f"':' and a type after {name!r}")
         type_, length = self._type()
         unit = self._unit(type_)
         return Field(name, type_, length, unit, self._sequence(type_, unit))
 
-    def _name(self, label: str) -> str:
+    def _name(self, expected: str) -> str:
         token = self._take()
         if token.kind != "name":
-            self._unexpected(label, token)
+            self._unexpected(expected, token)
         # normalized, as Python does with the names of attributes
         name = unicodedata.normalize("NFKC", token.text)
         if not token.text.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
@@ -411,11 +411,11 @@ class _Parser:
         self._has_sequence = True
         return True
 
-    def _number(self, token: _Lexeme, label: str) -> int:
+    def _number(self, token: _Lexeme, counted: str) -> int:
         digits = token.text.lstrip("0")
         # check the length first: int() refuses some thousand digits with an error of its own
         if token.kind != "number" or not 1 <= len(digits) <= 5 or int(digits) > MAX_COUNT:
-            self._unexpected(f"a number of {label} from 1 to {MAX_COUNT}", token)
+            self._unexpected(f"a number of {counted} from 1 to {MAX_COUNT}", token)
         return int(digits)
 
     def _expect_end(self, last: Field | None) -> None:

@@ -28,12 +28,12 @@ MAX_FILES_BESIDE = 1000
 """Largest number of files of a folder that are compared with a wrong file name."""
 
 
-def file_schema(kind: type[BaseModel], what: str) -> dict[str, Any]:
+def file_schema(kind: type[BaseModel], label: str) -> dict[str, Any]:
     """Return the JSON Schema of a kind of files, such as ``scenario``."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **kind.model_json_schema(),
-        "title": f"smartcam {what}",
+        "title": f"smartcam {label}",
     }
 
 
@@ -109,10 +109,10 @@ def _actual_text(item: ErrorDetails) -> str:
     """Return an addition to pydantic's error with the given value, if its text lacks it."""
     if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
-    received: object = item["input"]
-    if isinstance(received, dict):
+    given: object = item["input"]
+    if isinstance(given, dict):
         return " (got fields)"
-    return " (got a list)" if isinstance(received, list) else f" (got {shown(received)})"
+    return " (got a list)" if isinstance(given, list) else f" (got {shown(given)})"
 
 
 def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
@@ -135,13 +135,13 @@ def _schema(kind: type[BaseModel]) -> dict[str, Any]:
     return kind.model_json_schema()
 
 
-def _children(schema: Any, schema_part: Any, part: int | str) -> list[Any]:
-    kinds = [schema_part["items"]] if isinstance(part, int) and "items" in schema_part else []
-    if part in schema_part.get("properties", {}):
-        kinds = [schema_part["properties"][part]]
-    elif isinstance(schema_part.get("additionalProperties"), dict):
-        kinds = [schema_part["additionalProperties"]]
-    return [branch for kind in kinds for branch in _branches(schema, kind)]
+def _children(schema: Any, branch: Any, part: int | str) -> list[Any]:
+    kinds = [branch["items"]] if isinstance(part, int) and "items" in branch else []
+    if part in branch.get("properties", {}):
+        kinds = [branch["properties"][part]]
+    elif isinstance(branch.get("additionalProperties"), dict):
+        kinds = [branch["additionalProperties"]]
+    return [below for kind in kinds for below in _branches(schema, kind)]
 
 
 def _branches(schema: Any, node: Any) -> Iterator[Any]:
@@ -171,8 +171,8 @@ def _field(place: Sequence[int | str]) -> list[str]:
 def _line(node: Any, loc: Sequence[int | str]) -> int:
     """Return the line of the deepest node on the path to ``loc`` that is in the file."""
     for part in loc:
-        node_found = _child(node, part)  # pydantic's path also has the kinds of faults in it
-        node = node if node_found is None else node_found
+        child = _child(node, part)  # pydantic's path also has the kinds of faults in it
+        node = node if child is None else child
     return int(node.start_mark.line) + 1
 
 
