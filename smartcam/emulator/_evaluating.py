@@ -44,9 +44,9 @@ def applications_of(
     Raises:
         ConfigurationError: a field is unknown or wrong.
     """
-    fields = [{"id": entry} if isinstance(entry, int) else entry for entry in given]
+    entries = [{"id": entry} if isinstance(entry, int) else entry for entry in given]
     try:
-        return [kind(**{**(defaults or {}), **field}) for field in fields]
+        return [kind(**{**(defaults or {}), **fields}) for fields in entries]
     except TypeError as exc:
         raise ConfigurationError(f"applications: {exc}") from exc
 
@@ -84,10 +84,8 @@ class EvaluatingCamera(LineCamera):
     def __init_subclass__(cls, **given: Any) -> None:
         """Collect the methods that answer requests, in order."""
         super().__init_subclass__(**given)
-        own_forms = {
-            member.form: member for member in vars(cls).values() if hasattr(member, "form")
-        }
-        cls.requests = {**cls.requests, **own_forms}
+        methods = {method.form: method for method in vars(cls).values() if hasattr(method, "form")}
+        cls.requests = {**cls.requests, **methods}
 
     def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:
         """Set the parts of each application by its number.
@@ -106,7 +104,7 @@ class EvaluatingCamera(LineCamera):
         if not all(parts.values()):
             raise ConfigurationError("parts: at least one was expected")
         self.parts: dict[int, Iterator[Any]] = {
-            number: itertools.cycle(cycle_parts) for number, cycle_parts in parts.items()
+            number: itertools.cycle(sequence) for number, sequence in parts.items()
         }
         self._numbers_of_applications = [*parts]
         self._asking_client: LineClient | None = None  # asked for the running evaluation

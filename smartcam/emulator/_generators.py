@@ -136,13 +136,13 @@ def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dic
 
 def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
     """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
-    features = {seen.name: seen for seen in run.scene.measure()}
-    wanted: Sequence[str] = run.parameters.get("pieces", list(features))
+    observed = {seen.name: seen for seen in run.scene.measure()}
+    wanted: Sequence[str] = run.parameters.get("pieces", list(observed))
     names = {field.name for field in run.layout.fields}
     records = [
-        {key: value for key, value in record(features[name]).items() if key in names}
+        {key: value for key, value in record(observed[name]).items() if key in names}
         for name in wanted
-        if name in features
+        if name in observed
     ]
     if run.layout.repeat is None:
         return records[0] if records else zeros(run.layout.fields)

@@ -176,8 +176,8 @@ class Log(Sequence[LogEntry]):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
             weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
         else:  # size of the entry once it is read
-            _, _, _, message, fault, wire = entry
-            size = len(message.payload if isinstance(message, Frame) else message)
+            _, _, _, content, fault, wire = entry
+            size = len(content.payload if isinstance(content, Frame) else content)
             weight = _ENTRY_BYTES + _PER_BYTE * size
             if fault is not None or wire is not None:
                 weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
@@ -278,19 +278,19 @@ class TrafficLog:
         time: float,
         peer: str,
         sender: Sender,
-        message: Frame | bytes | RemoteProtocolError,
+        content: Frame | bytes | RemoteProtocolError,
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
         """Add a frame, bytes that make no frame, or the reason why they are ignored."""
-        if isinstance(message, RemoteProtocolError):
+        if isinstance(content, RemoteProtocolError):
             # keep only the text, since the error keeps its traceback alive
-            data, error = message.data.hex(" "), str(message)
+            data, error = content.data.hex(" "), str(content)
             self.entries.append(
                 LogEntry(time, _DIRECTIONS[sender], peer, None, None, data, error, fault)
             )
         else:
-            self.entries.append((time, peer, sender, message, fault, wire))
+            self.entries.append((time, peer, sender, content, fault, wire))
 
     async def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0

@@ -162,8 +162,8 @@ class InSightCommands:
     def _set_value(
         self, argument: str, kind: str, read: Callable[[str], int | float | str | None]
     ) -> bytes:
-        key, rest_of_line = self._target(argument)
-        value = read(rest_of_line)
+        key, text = self._target(argument)
+        value = read(text)
         if key is None or value is None:
             return _coded(StatusCode.INVALID_ARGUMENT)
         return _coded(self._device.request_value(key, kind, value))
@@ -173,8 +173,8 @@ class InSightCommands:
         cell = words.parse_wire_cell(argument)
         if cell is not None:
             return cell[0].wire, cell[1]
-        name, _, others = argument.partition(" ")
-        return self._named(name), others
+        name, _, text = argument.partition(" ")
+        return self._named(name), text
 
     def _named(self, name: str) -> str | None:
         """Return the key of a cell with a name, None if there is no such cell.

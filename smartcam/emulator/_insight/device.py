@@ -146,9 +146,9 @@ class InSightDevice:
         Raises:
             ConfigurationError: there is no such job.
         """
-        for job_ in self.jobs.values():
-            if job_.id == job if isinstance(job, int) else job_.is_called(job):
-                return job_
+        for each in self.jobs.values():
+            if each.id == job if isinstance(job, int) else each.is_called(job):
+                return each
         known = ", ".join(self.jobs) or "none"
         raise ConfigurationError(f"job {job!r} is not on the camera; there are: {known}")
 
@@ -209,12 +209,12 @@ class InSightDevice:
         Raises:
             ConfigurationError: there is no such job, or another one is being loaded.
         """
-        job_found = self.find(job)
+        next_job = self.find(job)
         if self._loading:
             raise ConfigurationError(f"job {job!r}: another one is being loaded")
         with self.around():
             self._break_run()
-            self.job = job_found
+            self.job = next_job
             self._begin_job()
 
     def set_blind(self, blind: bool) -> None:
@@ -252,7 +252,7 @@ class InSightDevice:
     def request_job(self, job: str | int, on_code: OnCode) -> None:
         """Load a job for a client (``LF``, ``SJ``); ``on_code`` gets the code when that is done."""
         try:
-            job_found = self.find(job)
+            next_job = self.find(job)
         except ConfigurationError:
             on_code(StatusCode.FAILED)
             return
@@ -263,11 +263,11 @@ class InSightDevice:
 
         def loaded() -> None:
             self._loading = False
-            self.job = job_found
+            self.job = next_job
             self._begin_job()
             on_code(StatusCode.DONE)
 
-        self.after(job_found.load_time, loaded)
+        self.after(next_job.load_time, loaded)
 
     def request_event(self, event: int, on_code: OnCode, *, at_image: bool) -> None:
         """Cause an event, 0 to 8, for a client; ``on_code`` gets the code.

@@ -28,7 +28,7 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
     if others:
         raise ConfigurationError(
             f"scenario {path}: one camera was expected, it has {1 + len(others)}: "
-            f"{', '.join(part.name for part in (first, *others))}; EmulatedFleet takes them all"
+            f"{', '.join(each.name for each in (first, *others))}; EmulatedFleet takes them all"
         )
     return first
 
@@ -56,9 +56,9 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
 
     def mistake(file: ScenarioFile) -> Mistake | None:
         for index, scenario in enumerate(each(file)):
-            mistake = scenario.mistake()
-            if mistake is not None:
-                place, text = mistake
+            problem = scenario.mistake()
+            if problem is not None:
+                place, text = problem
                 return file.place(index, place), text
         return None
 

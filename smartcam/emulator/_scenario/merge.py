@@ -37,13 +37,13 @@ def make_plan(
         ConfigurationError: an option is wrong, or not supported by the camera.
     """
     changes = {key: value for key, value in given.items() if value is not None}
-    for section, names in _KNOWN.items():
-        if section not in changes:
+    for option, names in _KNOWN.items():
+        if option not in changes:
             continue
-        word = changes[section] = check_text(changes[section], section, "emulator", most=100)
+        word = changes[option] = check_text(changes[option], option, "emulator", most=100)
         if word not in names:
             raise ConfigurationError(
-                f"emulator: {section} {word!r} is unknown; known are {', '.join(names)}"
+                f"emulator: {option} {word!r} is unknown; known are {', '.join(names)}"
                 f"{did_you_mean(word, names)}"
             )
     if scenario is None:

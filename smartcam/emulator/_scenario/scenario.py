@@ -175,13 +175,13 @@ class ScenarioFile(Scenario):
         if not self.cameras:
             return place
         camera = self.cameras[index]
-        name, *others = place
-        if name == "timeline" and isinstance(others[0], int):
-            cue_index = others[0] - len(self.timeline)
-            return place if cue_index < 0 else ("cameras", index, name, cue_index, *others[1:])
-        if name == "applications" and isinstance(others[0], int):
-            cue_index = others[0] - len(camera.applications)
-            return ("cameras", index, *place) if cue_index < 0 else (name, cue_index, *others[1:])
+        name, *inner = place
+        if name == "timeline" and isinstance(inner[0], int):
+            own = inner[0] - len(self.timeline)
+            return place if own < 0 else ("cameras", index, name, own, *inner[1:])
+        if name == "applications" and isinstance(inner[0], int):
+            own = inner[0] - len(camera.applications)
+            return ("cameras", index, *place) if own < 0 else (name, own, *inner[1:])
         return ("cameras", index, *place) if name in camera.model_fields_set else place
 
 

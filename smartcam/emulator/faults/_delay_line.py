@@ -124,14 +124,14 @@ class DelayLine(Generic[T]):
         """
         now = self._now
         gatherer = self._count(amount, now)
-        for message in sent:
-            self.size += message.size
-            if gatherer is not None and not message.delay:
-                gatherer.company.append(message)
-            elif self.ordered and not message.overtaken:
-                self._queue.append(_Waiting(message, now))
+        for transmission in sent:
+            self.size += transmission.size
+            if gatherer is not None and not transmission.delay:
+                gatherer.company.append(transmission)
+            elif self.ordered and not transmission.overtaken:
+                self._queue.append(_Waiting(transmission, now))
             else:
-                self._loose.append(_Waiting(message, now))
+                self._loose.append(_Waiting(transmission, now))
 
     def run(self) -> None:
         """Send all transmissions whose time has come."""
@@ -163,8 +163,8 @@ class DelayLine(Generic[T]):
         self._queue.clear()
         self._loose.clear()
         for waiting in left:
-            for message in (waiting.sent, *waiting.company):
-                self.lost(message)
+            for transmission in (waiting.sent, *waiting.company):
+                self.lost(transmission)
 
     @property
     def _now(self) -> int:
@@ -172,54 +172,44 @@ class DelayLine(Generic[T]):
 
     def _count(self, amount: int, now: int) -> _Waiting[T] | None:
         """Count new transmissions for waiting ones; return the transmission to join."""
-        waiting = [
-            waiting_message
-            for waiting_message in (*self._queue, *self._loose)
-            if waiting_message.missing > 0
-        ]
-        for waiting_message in waiting:
-            waiting_message.missing -= amount
-            if waiting_message.sent.behind and waiting_message.missing <= 0:
-                waiting_message.due = max(waiting_message.due, now)
-        together = [
-            waiting_message
-            for waiting_message in waiting
-            if not self.ordered and not waiting_message.sent.behind
-        ]
+        waiting = [entry for entry in (*self._queue, *self._loose) if entry.missing > 0]
+        for entry in waiting:
+            entry.missing -= amount
+            if entry.sent.behind and entry.missing <= 0:
+                entry.due = max(entry.due, now)
+        together = [entry for entry in waiting if not self.ordered and not entry.sent.behind]
         return together[0] if together else None
 
     def _run_loose(self) -> None:
         """Send transmissions that may be overtaken, and all without an order."""
         now = self._now
-        due = [waiting_message for waiting_message in self._loose if waiting_message.when <= now]
-        for waiting_message in sorted(
-            due, key=lambda waiting_message: (waiting_message.when, waiting_message.sent.behind)
-        ):
-            if waiting_message not in self._loose:  # closed meanwhile
+        due = [entry for entry in self._loose if entry.when <= now]
+        for entry in sorted(due, key=lambda entry: (entry.when, entry.sent.behind)):
+            if entry not in self._loose:  # closed meanwhile
                 return
             if self.ordered:
-                self._loose.remove(waiting_message)
-                self._queue.append(waiting_message)
+                self._loose.remove(entry)
+                self._queue.append(entry)
             else:
-                self._pass_datagrams(waiting_message)
+                self._pass_datagrams(entry)
 
-    def _pass_datagrams(self, waiting_message: _Waiting[T]) -> None:
+    def _pass_datagrams(self, entry: _Waiting[T]) -> None:
         """Send the due parts, one datagram each; joined parts are one datagram."""
-        sent = waiting_message.sent
+        sent = entry.sent
         if sent.gather is not None and not sent.behind:
-            self._loose.remove(waiting_message)
-            together = [sent, *waiting_message.company]
+            self._loose.remove(entry)
+            together = [sent, *entry.company]
             self._hand_over([self._next(each, whole=True) for each in together])
             for each in together:
                 self._finish(each)
             return
-        waiting_message.missing = 0
-        while waiting_message in self._loose and waiting_message.due <= self._now:
+        entry.missing = 0
+        while entry in self._loose and entry.due <= self._now:
             self._hand_over([self._next(sent)])
             if sent.parts:
-                waiting_message.pause(self._now, 0)
-            elif waiting_message in self._loose:
-                self._loose.remove(waiting_message)
+                entry.pause(self._now, 0)
+            elif entry in self._loose:
+                self._loose.remove(entry)
                 self._finish(sent)
 
     def _run_queue(self) -> None:
@@ -266,7 +256,7 @@ class DelayLine(Generic[T]):
     def _arm(self) -> None:
         """Set the timer for the next transmission."""
         waiting = [*list(self._queue)[:1], *self._loose]
-        when = min((waiting_message.when for waiting_message in waiting), default=None)
+        when = min((entry.when for entry in waiting), default=None)
         self._timer.set(None if self.stopped else when)
 
     def _tick(self) -> None:

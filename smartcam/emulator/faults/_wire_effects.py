@@ -99,9 +99,9 @@ class WireMessage(Transmission):
     passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
-    def of(cls, message: Frame | bytes, data: bytes) -> WireMessage:
+    def of(cls, content: Frame | bytes, data: bytes) -> WireMessage:
         """Return a message that passes unchanged."""
-        return cls([data], what=message, original=data)
+        return cls([data], what=content, original=data)
 
     @property
     def wire(self) -> bytes | None:
@@ -205,8 +205,8 @@ def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
     places = [number for number, message in enumerate(sent) if message.changeable]
     if not places:
         return sent
-    word = fault.inserted
-    data = dialect.encode(word) if word is not None else fault.data or b""
+    inserted = fault.inserted
+    data = dialect.encode(inserted) if inserted is not None else fault.data or b""
     new = cut_datagram(data, dialect)
     new.faults.append(fault.kind)
     new.changeable = fault.where == "instead"
@@ -247,10 +247,10 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
         if rebuild is not None:
             sent = rebuild(fault, sent, dialect)
             continue
-        for unit in sent:
-            if unit.changeable:
-                unit.faults.append(fault.kind)
-                _CHANGES[type(fault)](fault, unit)
+        for part in sent:
+            if part.changeable:
+                part.faults.append(fault.kind)
+                _CHANGES[type(fault)](fault, part)
     return sent
 
 
@@ -277,5 +277,5 @@ def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage
 def cut_datagram(data: bytes, dialect: WireCodec) -> WireMessage:
     """Return a datagram as a message, with its frame if it is exactly one."""
     messages = cut(data, dialect.framer(len(data)), dialect)
-    unchanged = [message.original for message in messages] == [data]
-    return messages[0] if unchanged else WireMessage.of(data, data)
+    is_one_frame = [message.original for message in messages] == [data]
+    return messages[0] if is_one_frame else WireMessage.of(data, data)
