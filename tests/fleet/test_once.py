@@ -243,7 +243,7 @@ def as_started_anew(plant: Plant) -> None:
     host.results, host.states = AgentLog(100, 1 << 20), AgentLog(100, 1 << 20)
     for program in [*agent._programs]:
         agent._forget(program)
-    agent._counts_of_removed.clear()
+    agent._last_calls.clear()
 
 
 async def test_start_of_an_agent_that_nobody_saw_is_told_to_who_calls() -> None:

@@ -227,7 +227,7 @@ class Agent:
         # by role: present programs, by their tokens; and programs that left, oldest first, with
         # their last call
         self._present = collections.defaultdict[str, set[str]](set)
-        self._counts_of_removed = collections.defaultdict[str, dict[str, int]](dict)
+        self._last_calls = collections.defaultdict[str, dict[str, int]](dict)
         self._of_role: collections.Counter[str] = collections.Counter()  # number of programs
         # running questions, by program
         self._questions: collections.Counter[str] = collections.Counter()
@@ -341,10 +341,10 @@ class Agent:
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         if frames_of is not None:
             self._frames[name] = frames_of
-        state = self._frames.get(name, NO_FRAMES)
-        reporter = state.reporter
+        source = self._frames.get(name, NO_FRAMES)
+        reporter = source.reporter
         frames = SharedFrames(
-            name, state.make, self._sender, self._encoder, state.url, reporter is not None
+            name, source.make, self._sender, self._encoder, source.url, reporter is not None
         )
         events = self._on_camera_event
         host = Host(
@@ -474,19 +474,19 @@ class Agent:
 
     def _on_program(self, key: str, present: bool) -> None:
         token = self._keys.tail(key, "presence/program")[-1]
-        name = ProgramName.of(token)
-        if not name.genuine:
+        program = ProgramName.of(token)
+        if not program.genuine:
             return
-        names_present, guest = self._present[name.role], self._programs.get(name.name)
+        tokens, guest = self._present[program.role], self._programs.get(program.name)
         if not present:
-            names_present.discard(token)
-        elif len(names_present) < MAX_PROGRAMS_PER_ROLE:
-            names_present.add(token)
-        if guest is None or guest.program != name:
+            tokens.discard(token)
+        elif len(tokens) < MAX_PROGRAMS_PER_ROLE:
+            tokens.add(token)
+        if guest is None or guest.program != program:
             return
         guest.present = present
         if not present:
-            self._forget(name.name)
+            self._forget(program.name)
 
     def _forget(self, program: str, *, going_back: bool = True) -> None:
         """End the calls and reservations of a lost program."""
@@ -495,7 +495,7 @@ class Agent:
             return
         role = guest.program.role
         self._of_role[role] -= 1
-        gone = self._counts_of_removed[role]
+        gone = self._last_calls[role]
         gone[program] = guest.last
         if len(gone) > MAX_PROGRAMS_PER_ROLE:
             del gone[next(iter(gone))]
@@ -509,23 +509,24 @@ class Agent:
             for camera, before in guest.entered.values():
                 camera.leave(before)
 
-    def _known_calls(self, name: ProgramName) -> Guest | None:
+    def _known_guest(self, program: ProgramName) -> Guest | None:
         """Return a known program; None also if another one uses its name."""
-        guest = self._programs.get(name.name)
-        return guest if guest is not None and guest.program == name else None
+        guest = self._programs.get(program.name)
+        return guest if guest is not None and guest.program == program else None
 
-    def _guest(self, name: ProgramName, call: int) -> Guest | None:
+    def _guest(self, program: ProgramName, call: int) -> Guest | None:
         """Return the program that sent a hello; None if the program has left since then."""
-        known, role = self._known_calls(name), name.role
-        left = self._counts_of_removed[role].get(name.name, 0)
+        known, role = self._known_guest(program), program.role
+        left = self._last_calls[role].get(program.name, 0)
         if known is None and call > left:
             if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
                 raise LocalProtocolError(
                     f"{self.name}: {MAX_PROGRAMS_PER_ROLE} programs of role {role} are here already"
                 )
-            present = name.token in self._present[role]
+            present = program.token in self._present[role]
             numbers = CallNumbers(left), CallNumbers(left)
-            known = self._programs[name.name] = Guest(name, self.next_program(), present, *numbers)
+            known = Guest(program, self.next_program(), present, *numbers)
+            self._programs[program.name] = known
             self._of_role[role] += 1
             if not present:
                 loop = asyncio.get_running_loop()
@@ -585,37 +586,29 @@ class Agent:
     def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
         fields, command = message.fields, role is None
         program, number = self._caller(str(fields["program"]), role), int(fields["call"])
+        name = program.name
         if "come" in fields:
-            self._sender.come(program.name, number, fields["come"])
+            self._sender.come(name, number, fields["come"])
             return
         if "cancel" in fields:
-            self._cancel(host, program.name, int(fields["cancel"]), command)
-            self._reply(program.name, number, {"answer": {}})
+            self._cancel(host, name, int(fields["cancel"]), command)
+            self._reply(name, number, {"answer": {}})
             return
         action, timeout = str(fields["do"]), fields.get("timeout", 1.0)
         deadline = fields.get("deadline")
         epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
-        guest = self._guest(program, number) if action == "hello" else self._known_calls(program)
+        guest = self._guest(program, number) if action == "hello" else self._known_guest(program)
         reservation = fields.get("reservation")
         if reservation is not None:
             reservation = int(reservation)
         left = self._admit(
-            host,
-            guest,
-            program.name,
-            number,
-            epoch,
-            action,
-            deadline,
-            timeout,
-            command,
-            reservation,
+            host, guest, name, number, epoch, action, deadline, timeout, command, reservation
         )
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
             blobs, entered = message.blobs, guest.entered
             call = ProgramCall(
-                host, program.name, owner, arguments, blobs, left, entered, None, reservation
+                host, name, owner, arguments, blobs, left, entered, None, reservation
             )
             self._start(action, call, guest, command)
 

@@ -78,9 +78,8 @@ class Claims:
         self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
         self._wanted: dict[str, CameraSettings] = {}
         self._others: dict[str, set[str]] = {}  # other agents with a camera of this agent
-        self._contested: dict[
-            str, float
-        ] = {}  # loop time until which another agent may take the camera
+        # loop time until which another agent may take the camera
+        self._contested: dict[str, float] = {}
         self._calm: dict[str, float] = {}  # loop time until which a takeover is excluded
         self._settling: set[str] = set()
         self._again: set[str] = set()
@@ -156,9 +155,8 @@ class Claims:
         self._watch = bus.watch(keys.camera("*", "**"), self._on_presence)
         if self._standby is None:
             await self._refuse()
-        await self.refuse_taken(
-            {n: camera for n, camera in cameras.items() if not self._others.get(n)}
-        )
+        others = self._others
+        await self.refuse_taken({n: wanted for n, wanted in cameras.items() if not others.get(n)})
         for name, settings in cameras.items():
             if self._others.get(name):
                 self._consider(name)
@@ -201,7 +199,7 @@ class Claims:
         """
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
-        ports = {camera.address.port for camera in cameras.values()}
+        ports = {settings.address.port for settings in cameras.values()}
         listed_cameras: list[tuple[str, str, Address]] = []
         for _, payload in answers:
             try:
@@ -211,7 +209,7 @@ class Claims:
                     listed_cameras.append((str(listed["camera"]), str(listed["agent"]), address))
             except (ValueError, TypeError, KeyError, SmartCamError) as exc:
                 logger.warning("! an agent's message about a camera cannot be read: %s", exc)
-        hosts = {camera.address.host for camera in cameras.values()}
+        hosts = {settings.address.host for settings in cameras.values()}
         hosts |= {address.host for _, _, address in listed_cameras}
         hosts |= {host.settings.address.host for host in self._agent.hosts.values()}
         addresses = await _places_of(hosts)
@@ -268,11 +266,11 @@ class Claims:
                 for agent in sorted({agent for _, agent in contested})
                 for answer in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
-            if all(standby_of.get(camera) for camera in contested):
+            if all(standby_of.get(claim) for claim in contested):
                 return
             silent = not contested & standby_of.keys()
             if not silent or loop.time() > patience:
-                name, agent = min(camera for camera in contested if not standby_of.get(camera))
+                name, agent = min(claim for claim in contested if not standby_of.get(claim))
                 more = f", and {len(contested) - 1} more cameras" if len(contested) > 1 else ""
                 says = ", which does not answer" if silent else ""
                 raise ConfigurationError(

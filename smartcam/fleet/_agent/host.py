@@ -328,13 +328,8 @@ class Host:
     def _not_granted(self, action: str, timeout: float) -> SmartCamError:
         """Return the error for a program whose wait for other programs timed out."""
         holder = self.gate.holder
-        holder_text = (
-            "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
-        )
-        text = (
-            f"{self.name}: {holder_text} did not let go within {timeout:.3g} s; "
-            f"{action} was not done"
-        )
+        cause = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
+        text = f"{self.name}: {cause} did not let go within {timeout:.3g} s; {action} was not done"
         return late(action, text)
 
     # ------------------------------------------------------------------ what the camera is

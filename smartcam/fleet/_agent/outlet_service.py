@@ -228,7 +228,7 @@ async def _ask(
             answers += await asyncio.to_thread(read, answer)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as exc:
             logger.warning("%s ! an agent's answer cannot be read: %r", key, exc)
-    return sorted(answers, key=lambda row: row[:2])
+    return sorted(answers, key=lambda reported: reported[:2])
 
 
 def _accounts(answer: bytes) -> list[ReportedOutlet]:

@@ -128,7 +128,7 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
         files.append(None if emulated is None else emulated.scenario)
         files.append(None if entry.frames is None else entry.frames.camera_info)
         files += _files_in(entry.software, folder)
-        return entry, planned.nth, [digest(file) for file in files]
+        return entry, planned.nth, [digest(path) for path in files]
 
     return LoadedFleet(file, plan, {name: mark(planned) for name, planned in plan.items()})
 

@@ -291,10 +291,8 @@ class FleetServer(Server):
             from smartcam.fleet._ros import RosFleet
         file, own_name = self.file, self.file.agent_name
         cameras = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        calibrations = {
-            name: camera.load_calibration(self.folder) for name, camera in cameras.items()
-        }
-        hand_eyes = {name: camera.load_hand_eye(self.folder) for name, camera in cameras.items()}
+        calibrations = {name: ros.load_calibration(self.folder) for name, ros in cameras.items()}
+        hand_eyes = {name: ros.load_hand_eye(self.folder) for name, ros in cameras.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -304,14 +302,8 @@ class FleetServer(Server):
             settings=self._settings,
             frames=self._ros_frames,
             controls=self._controls,
-            calibrations={
-                name: calibration
-                for name, calibration in calibrations.items()
-                if calibration is not None
-            },
-            hand_eyes={
-                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
-            },
+            calibrations={name: made for name, made in calibrations.items() if made is not None},
+            hand_eyes={name: made for name, made in hand_eyes.items() if made is not None},
             wanted=lambda agent, _camera: agent == own_name,
             desks=self.calibrations,
         )
@@ -557,8 +549,8 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
     # with roles each program needs a certificate of its own: the agent's own may not command
-    own_authority = scheme == "fleet+tls" and file.access == "any-certificate"
-    certificates = file.certificates if own_authority else None
+    usable = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if usable else None
     # a router of several agents may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

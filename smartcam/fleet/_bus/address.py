@@ -114,53 +114,53 @@ class FleetAddress(NamedTuple):
         """
         url = check_text(url, "fleet address", least=1)
         shown = masked(url)
-        name = f"fleet address {shown!r:.200}"
+        label = f"fleet address {shown!r:.200}"
         try:
             parts = urlsplit(url.strip())
             port = parts.port if parts.port is not None else DEFAULT_PORT
         except ValueError as exc:
             if shown != url:  # the error may quote the password
-                raise ConfigurationError(f"{name} is no URL") from None
-            raise ConfigurationError(f"{name}: {exc}") from exc
+                raise ConfigurationError(f"{label} is no URL") from None
+            raise ConfigurationError(f"{label}: {exc}") from exc
         if parts.scheme not in FLEET_SCHEMES:
             raise ConfigurationError(
-                f"{name}: expected fleet://HOST[:PORT][/CAMERA], got scheme {parts.scheme!r}"
+                f"{label}: expected fleet://HOST[:PORT][/CAMERA], got scheme {parts.scheme!r}"
                 f"{did_you_mean(parts.scheme, FLEET_SCHEMES)}"
             )
         if not parts.hostname:
             raise ConfigurationError(
-                f"{name} has no host: expected fleet://HOST[:PORT][/CAMERA] with the host of the "
+                f"{label} has no host: expected fleet://HOST[:PORT][/CAMERA] with the host of the "
                 "fleet's agent; on this computer it is localhost"
             )
         if not _HOST.fullmatch(parts.hostname):
-            raise ConfigurationError(f"{name}: {parts.hostname!r:.80} is no host")
+            raise ConfigurationError(f"{label}: {parts.hostname!r:.80} is no host")
         wrong = {"a user": "@" in parts.netloc, "a fragment": parts.fragment, "port 0": port == 0}
         for part, present in wrong.items():
             if present:
-                raise ConfigurationError(f"{name} has {part}, which means nothing")
+                raise ConfigurationError(f"{label} has {part}, which means nothing")
         query: dict[str, str] = {}
         for key, value in parse_qsl(parts.query, keep_blank_values=True):
             if key not in _PARAMETERS:
                 raise ConfigurationError(
-                    f"{name}: unknown {key!r}; known are {', '.join(map(repr, _PARAMETERS))}"
+                    f"{label}: unknown {key!r}; known are {', '.join(map(repr, _PARAMETERS))}"
                     f"{did_you_mean(key, _PARAMETERS)}"
                 )
             if key in query:
-                raise ConfigurationError(f"{name} names two {key}")
+                raise ConfigurationError(f"{label} names two {key}")
             query[key] = value
         camera = parts.path.strip("/")
         if camera:
-            check_name(camera, f"{name}: camera")
-        fleet = check_word(query["fleet"], f"{name}: fleet") if "fleet" in query else None
-        called = check_word(query["program"], f"{name}: program") if "program" in query else None
+            check_name(camera, f"{label}: camera")
+        fleet = check_word(query["fleet"], f"{label}: fleet") if "fleet" in query else None
+        called = check_word(query["program"], f"{label}: program") if "program" in query else None
         tls = parts.scheme == "fleet+tls"
         certificates = query.get("certificates") or (os.environ.get(CERTIFICATES) if tls else None)
         if tls and not certificates:
             raise ConfigurationError(
-                f"{name}: expected certificates: ?certificates=DIR, or the variable {CERTIFICATES}"
+                f"{label}: expected certificates: ?certificates=DIR, or the variable {CERTIFICATES}"
             )
         if "certificates" in query and not tls:
-            raise ConfigurationError(f"{name}: certificates are for fleet+tls://")
+            raise ConfigurationError(f"{label}: certificates are for fleet+tls://")
         return cls(parts.scheme, parts.hostname, port, fleet, camera, certificates, called)
 
     @property

@@ -228,21 +228,19 @@ class _ByPattern(Generic[P]):
         for same in (*self._exact.values(), self._wild):
             yield from tuple(same)
 
-    def __contains__(self, declared: P) -> bool:
-        return declared in self._wild or declared in self._exact.get(declared.pattern, ())
+    def __contains__(self, entry: P) -> bool:
+        return entry in self._wild or entry in self._exact.get(entry.pattern, ())
 
-    def add(self, declared: P) -> None:
-        same = (
-            self._wild if "*" in declared.pattern else self._exact.setdefault(declared.pattern, {})
-        )
-        same[declared] = None
+    def add(self, entry: P) -> None:
+        same = self._wild if "*" in entry.pattern else self._exact.setdefault(entry.pattern, {})
+        same[entry] = None
 
-    def remove(self, declared: P) -> None:
-        self._wild.pop(declared, None)
-        same = self._exact.get(declared.pattern, {})
-        same.pop(declared, None)
+    def remove(self, entry: P) -> None:
+        self._wild.pop(entry, None)
+        same = self._exact.get(entry.pattern, {})
+        same.pop(entry, None)
         if not same:
-            self._exact.pop(declared.pattern, None)
+            self._exact.pop(entry.pattern, None)
 
     def clear(self) -> None:
         self._exact.clear()
@@ -251,8 +249,8 @@ class _ByPattern(Generic[P]):
     def meeting(self, pattern: str) -> list[P]:
         """Return the entries whose patterns overlap with a pattern or a key."""
         if "*" in pattern:
-            return [declared for declared in self if meets(declared.pattern, pattern)]
-        wild = [declared for declared in self._wild if meets(declared.pattern, pattern)]
+            return [entry for entry in self if meets(entry.pattern, pattern)]
+        wild = [entry for entry in self._wild if meets(entry.pattern, pattern)]
         return [*self._exact.get(pattern, ()), *wild]
 
 
@@ -416,10 +414,10 @@ class MemoryEnd(Bus):
     def _report_presences(self, present: bool) -> None:
         """Report this end's presences to all ends, and theirs to this one."""
         for end in self._others():
-            for watcher in end.present_here:
+            for token in end.present_here:
                 if end is not self:
-                    for watch in self.watched.meeting(watcher.pattern):
-                        self._loop.call_soon(_call, watch, watcher.pattern, present)
+                    for watch in self.watched.meeting(token.pattern):
+                        self._loop.call_soon(_call, watch, token.pattern, present)
         for token in self.present_here:
             self._report_presence(token.pattern, present)
 

@@ -126,6 +126,7 @@ class ZenohEnd(ZenohSession, Bus):
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
+            # the rest of the time is for finding causes
             await super().open(timeout - min(DIAGNOSIS_TIMEOUT, timeout / 3))
         except ConnectFailedError as exc:
             if self._link.listen:
@@ -186,9 +187,9 @@ class ZenohEnd(ZenohSession, Bus):
             kind, _, place = endpoint.partition("/")
             host, _, port = place.rpartition(":")
             if kind == "tls":
-                refusal = await shake_hands(host.strip("[]"), int(port), folder, each)
-                if refusal.trouble:
-                    return refusal.trouble
+                handshake = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if handshake.trouble:
+                    return handshake.trouble
         return ""
 
     @property
@@ -281,7 +282,7 @@ class ZenohEnd(ZenohSession, Bus):
 
     def _hand_over(
         self,
-        method: str,
+        queue: str,
         session: Any,
         key: str,
         payload: bytes,
@@ -292,7 +293,7 @@ class ZenohEnd(ZenohSession, Bus):
         """Let a thread send a message, which waits for room; and later ones of the same way.
 
         Args:
-            method: key of messages that are sent in order.
+            queue: key of messages that are sent in order.
             session: the engine's session.
             key: key of the message.
             payload: the message.
@@ -308,7 +309,7 @@ class ZenohEnd(ZenohSession, Bus):
                 "%s ! %d bytes wait to be sent; further ones are dropped", key, self._sending
             )
             return
-        lane = hash(method) % SENDERS
+        lane = hash(queue) % SENDERS
         sender = self._senders.get(lane)
         if sender is None:
             sender = self._senders[lane] = ThreadPoolExecutor(1, "smartcam-fleet")
@@ -321,14 +322,14 @@ class ZenohEnd(ZenohSession, Bus):
                 with self._lock:
                     self._sending -= size
                     self._doubtful -= doubtful
-                    self._behind[method] -= 1
-                    if not self._behind[method]:
-                        del self._behind[method]
+                    self._behind[queue] -= 1
+                    if not self._behind[queue]:
+                        del self._behind[queue]
 
         with self._lock:
             self._sending += size
             self._doubtful += doubtful
-            self._behind[method] += 1
+            self._behind[queue] += 1
         sender.submit(send)
 
     def publisher(
@@ -435,17 +436,17 @@ class ZenohEnd(ZenohSession, Bus):
     def watch(self, pattern: str, on_presence: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
-        names_present: dict[str, None] = {}
+        keys_present: dict[str, None] = {}
 
         def note_presence(key: str, present: bool) -> None:
             if present:
-                names_present[key] = None
+                keys_present[key] = None
             else:
-                names_present.pop(key, None)
+                keys_present.pop(key, None)
             on_presence(key, present)
 
         def lost() -> None:  # a new session does not report ends that have gone meanwhile
-            for key in [*names_present]:
+            for key in [*keys_present]:
                 note_presence(key, False)
 
         def on_sample(sample: Any) -> None:

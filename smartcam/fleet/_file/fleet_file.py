@@ -81,16 +81,16 @@ def _endpoints(least_port: int) -> Any:
     def checked(given: object) -> list[str] | None:
         if given is None:
             return None
-        problems: list[str] = []
+        endpoints: list[str] = []
         for endpoint in cast("list[object]", given) if isinstance(given, list) else [given]:
             parts = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
             if parts is None or not least_port <= int(parts[3]) <= 0xFFFF:
                 raise ValueError(
-                    f"expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; "
+                    "expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; "
                     f"got {endpoint!r:.80}"
                 )
-            problems.append(parts[0])
-        return problems
+            endpoints.append(parts[0])
+        return endpoints
 
     return PlainValidator(checked)
 
@@ -313,8 +313,8 @@ class CameraEntry(Fields):
         Raises:
             ConfigurationError: an option is wrong.
         """
-        own_settings = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
-        options: dict[str, Any] = self.model_dump(exclude=own_settings)
+        not_options = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
+        options: dict[str, Any] = self.model_dump(exclude=not_options)
         reconnect = None if self.reconnect is None else self.reconnect.backoff()
         options["restore"] = restore if self.restore is None else self.restore
         return CameraSettings.make(
@@ -528,7 +528,7 @@ def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
         text = "an agent without cameras is a router for others: expected listen, which it lacks"
         yield ("cameras",), text
     if file.record is not None:
-        seeing = [name for name, camera in file.cameras.items() if camera.frames or camera.software]
+        seeing = [name for name, entry in file.cameras.items() if entry.frames or entry.software]
         yield from mistakes_of(file.record, folder, seeing)
     if file.outlets is not None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):

@@ -308,7 +308,7 @@ class SharedFrames:
             finally:
                 if self._viewers.get(key) is viewer:
                     viewer.mark_idle(lambda: self._leave(key, viewer))
-        self._send([picture.frame for picture in taken], order)
+        self._send([each.frame for each in taken], order)
         return {
             "came": asked_at,
             "stream": viewer.number,
@@ -323,14 +323,13 @@ class SharedFrames:
                 source = await self.source()
         if key in self._viewers:
             return self._viewers[key]
-        streams_of_program = sum(program == key[0] for program, _ in self._viewers)
+        of_program = sum(program == key[0] for program, _ in self._viewers)
         role = role_of(key[0])
         like = sum(role_of(program) == role for program, _ in self._viewers)
-        if like >= MAX_STREAMS_PER_ROLE or streams_of_program >= MAX_STREAMS_PER_PROGRAM:
+        if like >= MAX_STREAMS_PER_ROLE or of_program >= MAX_STREAMS_PER_PROGRAM:
             raise LocalProtocolError(
-                f"{self.name}: {like} streams of frames of role {role}, "
-                f"{streams_of_program} of them "
-                "this program's; no more are possible"
+                f"{self.name}: {like} streams of frames of role {role}, {of_program} of them this "
+                "program's; no more are possible"
             )
         number = next(self._numbers)
         viewer: FrameStream
@@ -363,9 +362,7 @@ class SharedFrames:
         video.viewers -= 1
         if video.viewers:
             return
-        for form in [
-            form for form, video_of_form in self._videos.items() if video_of_form is video
-        ]:
+        for form in [form for form, known in self._videos.items() if known is video]:
             del self._videos[form]
         ending = video.end()
         self._tasks.add(ending)
@@ -415,8 +412,7 @@ class SharedFrames:
         if not taken[-1].number:
             return {"frame": self._frame_fields(taken[-1].frame, taken[-1].took)}
         units = [
-            {**self._frame_fields(picture.frame, picture.took), "number": picture.number}
-            for picture in taken
+            {**self._frame_fields(each.frame, each.took), "number": each.number} for each in taken
         ]
         return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
 

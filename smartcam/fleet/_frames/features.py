@@ -31,7 +31,7 @@ def feature_fields(feature: Feature) -> dict[str, Any]:
     }
 
 
-def read_feature(data: object, caller: str) -> Feature:
+def read_feature(data: object, owner: str) -> Feature:
     """Return the feature in an agent's fields.
 
     Raises:
@@ -43,7 +43,7 @@ def read_feature(data: object, caller: str) -> Feature:
         if kind not in _KINDS or access not in _ACCESS:
             raise ValueError(f"kind {kind!r:.40}, access {access!r:.40}")
         if value is not None:
-            value = read_value(value, caller)
+            value = read_value(value, owner)
         read: dict[str, Any] = {"kind": kind, "access": access, "value": value}
         for name in ("minimum", "maximum", "step"):
             read[name] = None if fields[name] is None else _number(fields[name])
@@ -53,10 +53,10 @@ def read_feature(data: object, caller: str) -> Feature:
             read[name] = tuple(map(str, fields[name]))
         return Feature(**read)
     except (KeyError, TypeError, ValueError) as exc:
-        raise RemoteProtocolError(f"{caller}: the agent's feature is not valid: {exc!r}") from exc
+        raise RemoteProtocolError(f"{owner}: the agent's feature is not valid: {exc!r}") from exc
 
 
-def read_value(value: object, caller: str) -> FeatureValue:
+def read_value(value: object, owner: str) -> FeatureValue:
     """Return a value in an agent's reply.
 
     Raises:
@@ -65,7 +65,7 @@ def read_value(value: object, caller: str) -> FeatureValue:
     if isinstance(value, (bool, int, float, str)):
         return value
     raise RemoteProtocolError(
-        f"{caller}: the agent's value of a feature is not valid: {value!r:.80}"
+        f"{owner}: the agent's value of a feature is not valid: {value!r:.80}"
     )
 
 

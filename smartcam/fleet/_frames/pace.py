@@ -28,7 +28,7 @@ class FramePace:
         self._last: tuple[float, int] | None = None
         self._period = 0.0  # period of the source; 0: unknown
         self._due = -math.inf
-        self._least_interval = 0.0
+        self._min_interval = 0.0
 
     def window(
         self, now: float, arrived_at: float, min_interval: float = 0.0
@@ -43,10 +43,10 @@ class FramePace:
         if self._given_at is not None:
             self._transit_times = (self._transit_times[1], now - self._given_at)
             self._given_at = None
-        self._least_interval = min_interval
-        least = min(self._transit_times)
-        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * least), now
-        if 0 < self._period <= least:  # the link is busy for a period or more
+        self._min_interval = min_interval
+        transit = min(self._transit_times)
+        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * transit), now
+        if 0 < self._period <= transit:  # the link is busy for a period or more
             until = arrived_at + MAX_WAIT_PERIODS * self._period
         if min_interval and now < self._due:
             since = max(since, self._due - self._period / 2)
@@ -63,7 +63,7 @@ class FramePace:
         if self._last is not None and offered > self._last[1]:
             self._period = (arrived_at - self._last[0]) / (offered - self._last[1])
         self._last = arrived_at, offered
-        self._due = max(self._due, arrived_at - self._least_interval) + self._least_interval
+        self._due = max(self._due, arrived_at - self._min_interval) + self._min_interval
 
     def note_sent(self, now: float) -> None:
         """Note that the frame is sent now."""

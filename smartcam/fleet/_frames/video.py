@@ -122,12 +122,12 @@ class SharedVideo:
             await self._stirred.wait()
 
     def _following(self, have: int) -> list[VideoUnit]:
-        pictures_kept = self._units
-        if not pictures_kept or pictures_kept[-1].number == have:
+        kept = self._units
+        if not kept or kept[-1].number == have:
             return []
         fresh = asyncio.get_running_loop().time() - LATE_SECONDS
         units: list[VideoUnit] = []
-        for unit in reversed(pictures_kept):
+        for unit in reversed(kept):
             if unit.made < fresh and units:
                 break  # the reader is too late for all of these
             units.append(unit)

@@ -337,14 +337,12 @@ class Plain:
     async def _speaks_for_all(self, camera: str) -> bool:
         """Return True if no other agent has a camera and this agent is the first by its name."""
         keys, bus = self._keys, self._bus
-        having, agents_present = await asyncio.gather(
+        having, present = await asyncio.gather(
             bus.present(keys.camera("*", camera), PRESENCE_TIMEOUT),
             bus.present(keys.agent("*"), PRESENCE_TIMEOUT),
         )
         owners = {keys.tail(key, "presence/camera")[0] for key in having} - {self._agent.name}
-        agents = {keys.tail(key, "presence/agent")[0] for key in agents_present} | {
-            self._agent.name
-        }
+        agents = {keys.tail(key, "presence/agent")[0] for key in present} | {self._agent.name}
         return not owners and min(agents) == self._agent.name
 
     # ------------------------------------------------------------------ calls

@@ -243,20 +243,18 @@ def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
         arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
         blobs = [bytes.fromhex(arguments.pop(name)) for name in ("input",) if name in arguments]
         call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
-        fields, answer = await ACTIONS[do](call)
+        fields, attached = await ACTIONS[do](call)
         if "status" in fields:
             fields["status_names"] = Status(fields["status"]).names
-        return {**fields, "image": base64.b64encode(answer[0]).decode()} if answer else fields
+        return {**fields, "image": base64.b64encode(attached[0]).decode()} if attached else fields
 
     return service
 
 
 async def _results(work: Work) -> dict[str, Any]:
-    kept_results, most = work.host.results, work.request.most
-    first = (
-        max(1, kept_results.following - most) if work.request.first is None else work.request.first
-    )
-    part = kept_results.part(first, MAX_REPLY_BYTES)
+    log, most = work.host.results, work.request.most
+    first = max(1, log.following - most) if work.request.first is None else work.request.first
+    part = log.part(first, MAX_REPLY_BYTES)
     runs = map(decode_own_run, part.data)
     matching = (single for run in runs for single in singles(run) if single.number >= part.first)
     results = [work.topics.result(single) for single in itertools.islice(matching, most)]
@@ -290,12 +288,10 @@ def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict
             source=host.name,
         )
     fields = to_fields(frame, 0.0, took, 0)
-    own_fields = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
-    if "trigger" in own_fields:  # times of the event are by the agent's clock
-        own_fields["trigger"] = {
-            name: own_fields["trigger"][name] for name in ("number", "evidence")
-        }
-    return {"frame": {**own_fields, "data": base64.b64encode(frame.data).decode()}}
+    shown = {name: value for name, value in fields.items() if name not in {"captured", "lens"}}
+    if "trigger" in shown:  # times of the event are by the agent's clock
+        shown["trigger"] = {name: shown["trigger"][name] for name in ("number", "evidence")}
+    return {"frame": {**shown, "data": base64.b64encode(frame.data).decode()}}
 
 
 async def _unknown(work: Work) -> dict[str, Any]:

@@ -284,12 +284,12 @@ class CameraTopics:
         if out is None and self.status_out is None:
             return
         outs = [out, self.status_out]
-        subscribed = [topic for topic in outs if topic is not None and topic.has_subscribers]
+        subscribed = [out for out in outs if out is not None and out.has_subscribers]
         if subscribed:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})
-            for topic in subscribed:
-                topic.put(data)
+            for publisher in subscribed:
+                publisher.put(data)
 
     def on_status(self, status: Status) -> None:
         """Handle a status of the camera; publish its change as an event."""

@@ -117,9 +117,9 @@ def _of_process(client: Any) -> bytes:
 
 
 def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
-    rows = [numbers.agent]
+    values = [numbers.agent]
     family = core.InfoMetricFamily("smartcam_agent", "The agent of a fleet", labels=["agent"])
-    family.add_metric(rows, {"fleet": numbers.fleet, "version": _version()})
+    family.add_metric(values, {"fleet": numbers.fleet, "version": _version()})
     yield family
     gauges = [(name, text, numbers.gauges[key]) for name, key, text in _GAUGES]
     gauges += [
@@ -132,24 +132,24 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
     ]
     for name, text, value in gauges:
         family = core.GaugeMetricFamily(name, text, labels=["agent"])
-        family.add_metric(rows, value)
+        family.add_metric(values, value)
         yield family
     labels = ["agent", "state"]
     family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
     connected = sum(camera.connected for camera in numbers.cameras)
-    family.add_metric([*rows, "connected"], connected)
-    family.add_metric([*rows, "not_connected"], len(numbers.cameras) - connected)
+    family.add_metric([*values, "connected"], connected)
+    family.add_metric([*values, "not_connected"], len(numbers.cameras) - connected)
     yield family
     labels = ["agent", "outcome"]
     family = core.CounterMetricFamily("smartcam_reloads", "Readings of the file", labels=labels)
     for outcome, count in numbers.reloads.items():
-        family.add_metric([*rows, outcome], count)
+        family.add_metric([*values, outcome], count)
     yield family
     yield from _of_outlets(core, numbers)
     for key in SUMS:
         name, text = _SUMS[key]
         family = core.CounterMetricFamily(name, text, labels=["agent"])
-        family.add_metric(rows, numbers.totals.counts[key])
+        family.add_metric(values, numbers.totals.counts[key])
         yield family
     for name, text, histogram in (
         (
@@ -164,7 +164,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         ),
     ):
         family = core.HistogramMetricFamily(name, text, labels=["agent"])
-        family.add_metric(rows, cumulative(histogram), histogram.total)
+        family.add_metric(values, cumulative(histogram), histogram.total)
         yield family
 
 
@@ -189,13 +189,13 @@ def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
         "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]
     )
     for name, state in numbers.outlets.items():
-        rows, account = [numbers.agent, name], state.account
-        received.add_metric(rows, account.results)
-        delivered.add_metric(rows, account.delivered)
-        spooled.add_metric(rows, account.spooled)
-        well.add_metric(rows, float(not state.trouble))
+        values, account = [numbers.agent, name], state.account
+        received.add_metric(values, account.results)
+        delivered.add_metric(values, account.delivered)
+        spooled.add_metric(values, account.spooled)
+        well.add_metric(values, float(not state.trouble))
         for reason, count in account.dropped.items():
-            dropped.add_metric([*rows, reason], count)
+            dropped.add_metric([*values, reason], count)
     yield from (received, delivered, spooled, well, dropped)
 
 

@@ -81,9 +81,9 @@ class Totals:
         """Add the counts of cameras."""
         given = [*accounts]
         for name in SUMS:
-            self.counts[name] += sum(getattr(counts, name) for counts in given)
-        self.processing = _sum([self.processing, *(counts.processing for counts in given)])
-        self.round_trip = _sum([self.round_trip, *(counts.round_trip for counts in given)])
+            self.counts[name] += sum(getattr(account, name) for account in given)
+        self.processing = _sum([self.processing, *(account.processing for account in given)])
+        self.round_trip = _sum([self.round_trip, *(account.round_trip for account in given)])
 
 
 def _sum(histograms: list[Histogram]) -> Histogram:

@@ -278,23 +278,23 @@ class Caller:
     async def _choose(self, agents: list[str], met: Met | None) -> None:
         """Choose an agent, if possible with a session; it may replace the current one."""
         only_linked = met is not None
-        hellos: list[_HelloHeard] = []
+        replies: list[_HelloHeard] = []
         failed: SmartCamError | None = None
         for agent in agents:
             try:
-                hellos.append(await self._greet_agent(agent))
+                replies.append(await self._greet_agent(agent))
             except SmartCamError as error:
                 failed = error
                 continue
-            if hellos[-1].hello.get("connected") and not hellos[-1].hello.get("trying"):
+            if replies[-1].hello.get("connected") and not replies[-1].hello.get("trying"):
                 break  # a camera has one session
         if self.met is not met:
             return  # an agent appeared or disappeared
-        if not hellos:
+        if not replies:
             if failed is not None:
                 raise failed
             return
-        best = hellos[-1] if hellos[-1].hello.get("connected") else hellos[0]
+        best = replies[-1] if replies[-1].hello.get("connected") else replies[0]
         if only_linked and not best.hello.get("connected"):
             return
         if met is not None:
@@ -304,9 +304,9 @@ class Caller:
     async def _ask_anew(self, met: Met) -> None:
         """Ask the agent again, and take its state if it has a session now."""
         with contextlib.suppress(SmartCamError):
-            hello = await self._greet_agent(met.agent)
-            if self.met is met and not self.linked and hello.hello.get("connected"):
-                self._meet(hello)
+            reply = await self._greet_agent(met.agent)
+            if self.met is met and not self.linked and reply.hello.get("connected"):
+                self._meet(reply)
 
     async def _greet_agent(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
@@ -320,29 +320,25 @@ class Caller:
             raise RemoteProtocolError(f"the agent {agent} sent an invalid hello: {exc}") from exc
         return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
 
-    def _meet(self, hello: _HelloHeard) -> None:
-        self._ahead, self._measured = hello.clock - hello.at, hello.at
+    def _meet(self, reply: _HelloHeard) -> None:
+        self._ahead, self._measured = reply.clock - reply.at, reply.at
         self._most = math.inf
-        self.bound(hello.clock, hello.begun)
-        if hello.agent in self._agents:
-            self._epochs[hello.agent] = hello.epoch
+        self.bound(reply.clock, reply.begun)
+        if reply.agent in self._agents:
+            self._epochs[reply.agent] = reply.epoch
             if len(self._epochs) > MAX_AGENTS_REMEMBERED:
                 del self._epochs[next(iter(self._epochs))]
-            self.met = Met(hello.agent, hello.epoch, hello.hello)
+            self.met = Met(reply.agent, reply.epoch, reply.hello)
             self._removed = ""
             self.trouble = None
             self._on_met(self.met)
 
     def restarted(self, epoch: int) -> bool:
-        """Return True if an epoch is a newer start of the current agent."""
+        """Return True if an epoch belongs to a newer start of the current agent."""
         met = self.met
         if met is None or epoch <= met.epoch or len(self._agents) > 1:
             return False
-        return all(
-            known_epoch != epoch
-            for agent, known_epoch in self._epochs.items()
-            if agent != met.agent
-        )
+        return all(known != epoch for agent, known in self._epochs.items() if agent != met.agent)
 
     def unlink(self) -> None:
         """Note that the agent has no session, and look for an agent that has one."""
@@ -409,8 +405,8 @@ class Caller:
     def report_leases_lost(self) -> None:
         """Report that this program's reservations are lost, unless that was reported before."""
         unreported = [lease for lease in self.leases.values() if not lease.reported]
-        for call in unreported:
-            call.reported = True
+        for lease in unreported:
+            lease.reported = True
         if unreported:
             self._on_lease_lost()
 

@@ -41,15 +41,15 @@ class _BusPlace(Handle):
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
         self.key, self.call = key, call
         self._exchange = exchange
-        self.cover: Handle | None = None
+        self.handle: Handle | None = None
         self.closed = False
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
             self._exchange.drop(self)
-            if self.cover is not None:
-                self.cover.close()
+            if self.handle is not None:
+                self.handle.close()
 
 
 class Exchange(Bus):
@@ -99,9 +99,9 @@ class Exchange(Bus):
         for places in [*self._places.get(kind, {}).values()]:
             # a message that arrives twice now is taken once, by its number
             for place in places:
-                own_handle, place.cover = place.cover, None
-                if own_handle is not None:
-                    own_handle.close()
+                handle, place.handle = place.handle, None
+                if handle is not None:
+                    handle.close()
 
     def _uncover(self, kind: str) -> None:
         self._covers.pop(kind).close()
@@ -110,8 +110,8 @@ class Exchange(Bus):
 
     def _kind(self, key: str) -> str:
         tail = key.removeprefix(f"{self._keys().root}/")
-        first, _, tail_rest = tail.partition("/")
-        return f"{first}/{tail_rest.partition('/')[0]}" if first == "presence" else first
+        first, _, behind = tail.partition("/")
+        return f"{first}/{behind.partition('/')[0]}" if first == "presence" else first
 
     def _enter(
         self, key: str, call: Callable[..., None], declare: Callable[[], Handle]
@@ -120,7 +120,7 @@ class Exchange(Bus):
         place = _BusPlace(self, key, call)
         self._places.setdefault(kind, {}).setdefault(self._name(key), []).append(place)
         if kind not in self._covers:
-            place.cover = declare()
+            place.handle = declare()
         return place
 
     def _name(self, key: str) -> str:
@@ -215,7 +215,7 @@ class Exchange(Bus):
         if self._kind(pattern) != "presence/camera" or "*" in self._name(pattern):
             return self._bus.watch(pattern, on_presence)
         place = self._enter(pattern, on_presence, lambda: self._bus.watch(pattern, on_presence))
-        if place.cover is None:
+        if place.handle is None:
             for key in sorted(self._present.get(self._name(pattern), ())):
                 on_presence(key, True)
         return place

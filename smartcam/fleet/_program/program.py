@@ -153,13 +153,13 @@ class Program:
             pattern = keys_of.agent("*")
         while (left := deadline - loop.time()) > 0:
             keys = await self.bus.present(pattern, left)
-            agents = sorted({key.split("/")[1] for key in keys})
-            if len(agents) == 1:
-                return agents[0]
-            if agents:
+            fleets = sorted({key.split("/")[1] for key in keys})
+            if len(fleets) == 1:
+                return fleets[0]
+            if fleets:
                 raise ConfigurationError(
-                    f"{self._camera}: there are several fleets: {', '.join(agents)}; choose one: "
-                    f"?fleet={agents[0]}"
+                    f"{self._camera}: there are several fleets: {', '.join(fleets)}; choose one: "
+                    f"?fleet={fleets[0]}"
                 )
             await asyncio.sleep(min(AGENT_SEARCH_INTERVAL, left))
         thing, meant = "camera", ""

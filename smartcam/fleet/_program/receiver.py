@@ -81,7 +81,7 @@ class FleetListeners(Listeners):
 
     def unmarked(self) -> list[asyncio.Future[Result]]:
         """Return the waiters whose start is not known yet."""
-        return [result for result in self._next_results if result not in self._since]
+        return [wait for wait in self._next_results if wait not in self._since]
 
     def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
         """Note that a waiter for the next result needs one from ``clock`` on."""
@@ -89,13 +89,11 @@ class FleetListeners(Listeners):
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
         horizon = self.results.horizon
-        late = [
-            result for result in self._next_results if self._since.get(result, -math.inf) > horizon
-        ]
+        late = [wait for wait in self._next_results if self._since.get(wait, -math.inf) > horizon]
         taken = super()._take_next_results()
         if late:
             self._next_results.update(late)
-            taken = [result for result in taken if result not in late]
+            taken = [wait for wait in taken if wait not in late]
         return taken
 
     def miss(self, count: int, then: ResultRun | None) -> None:

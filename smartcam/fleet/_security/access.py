@@ -145,9 +145,9 @@ def access_control(domain: int | None = None) -> dict[str, Any]:
             "messages": [message],
             "flows": [flow],
             "permission": "allow",
-            "key_exprs": [*entry],
+            "key_exprs": [*patterns],
         }
-        for (role, message, flow), entry in keys.items()
+        for (role, message, flow), patterns in keys.items()
     }
     return {
         "enabled": True,

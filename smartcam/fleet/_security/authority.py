@@ -143,7 +143,7 @@ class _Authority:
                 "this command made, or an empty one"
             )
         if not has_authority:
-            cls._authority_in(place)
+            cls._create(place)
         try:
             made = x509.load_pem_x509_certificate((place / CA_FILE).read_bytes())
         except (OSError, ValueError) as exc:
@@ -153,7 +153,7 @@ class _Authority:
         return cls(folder, made, _key_in(place))
 
     @staticmethod
-    def _authority_in(place: Path) -> None:
+    def _create(place: Path) -> None:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
 
@@ -184,8 +184,8 @@ class _Authority:
         done = "kept"
         if role in LISTENING:
             had = [] if old is None else _hosts_of(old)
-            names = [*LOCAL_HOSTS, *(hosts or ([] if had else [socket.gethostname()]))]
-            hosts = [*dict.fromkeys([*had, *names])]
+            wanted = [*LOCAL_HOSTS, *(hosts or ([] if had else [socket.gethostname()]))]
+            hosts = [*dict.fromkeys([*had, *wanted])]
             stale = bool({*hosts} - {*had})
         else:
             hosts, stale = [], False

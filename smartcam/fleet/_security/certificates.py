@@ -115,9 +115,9 @@ class Identity(NamedTuple):
 
     @property
     def _endings(self) -> tuple[tuple[str, datetime], ...]:
-        agent_text = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
+        own_text = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
         authority_text = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
-        return (agent_text, self.ends), (authority_text, self.authority_ends)
+        return (own_text, self.ends), (authority_text, self.authority_ends)
 
 
 def ends_soon(certificate: str, ends: datetime | None) -> str:
@@ -231,11 +231,9 @@ async def shake_hands(
         async with asyncio.timeout(within):
             made = await loop.run_in_executor(None, context, folder)
             reader, writer = await asyncio.open_connection(host, port, ssl=made)
-            peer_certificate: Any = writer.get_extra_info("peercert") or {}
-            if "notAfter" in peer_certificate:
-                ends = datetime.fromtimestamp(
-                    ssl.cert_time_to_seconds(peer_certificate["notAfter"]), UTC
-                )
+            peer: Any = writer.get_extra_info("peercert") or {}
+            if "notAfter" in peer:
+                ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(peer["notAfter"]), UTC)
             await reader.read(1)  # an endpoint that refuses the certificate reports it now
     except TimeoutError:  # an endpoint that waits for data has accepted it
         return Handshake(SILENT if writer is None else "", ends)

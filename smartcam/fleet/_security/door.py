@@ -112,8 +112,8 @@ def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
     if shut:
         return [_DROP]
     steps: list[_Instruction] = []
-    for network in blocked:
-        address = ipaddress.ip_address(network)
+    for host in blocked:
+        address = ipaddress.ip_address(host)
         offset, words = (12, 1) if address.version == 4 else (8, 4)
         steps += [
             _Instruction(LOAD_BYTE, IP_HEADER),
