@@ -120,17 +120,17 @@ class RequestReader:
         Raises:
             NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
-        data, lines = self._unread + data, []
+        data, requests = self._unread + data, []
         at = _behind_blanks(data, 0)
         while (end := self._end(data, at)) > 0 and end - at <= MAX_LINE_BYTES:
             line = data[at:end].strip(_BLANKS)
             if line:
-                lines.append(self._read(line))
+                requests.append(self._read(line))
             at = _behind_blanks(data, end)
         self._unread = data[at:].lstrip(_BLANKS)
         if len(self._unread) > MAX_LINE_BYTES:
             raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
-        return lines
+        return requests
 
     def _end(self, data: bytes, at: int) -> int:
         """Return the place after the request that begins at ``at``; 0 if it is incomplete."""
@@ -190,10 +190,7 @@ class AnswerWriter:
 
     def _value(self, value: float | str) -> str:
         if isinstance(value, str):
-            return "".join(
-                " " if character == self._style.separator else character
-                for character in plain(value)
-            )
+            return "".join(" " if char == self._style.separator else char for char in plain(value))
         if not abs(value) < MAX_NUMBER:
             raise NotWritableError(f"{value} is no number that a controller reads")
         if isinstance(value, int):
@@ -243,4 +240,4 @@ class AnswerWriter:
 
 def plain(words: str) -> str:
     """Return a text on one line, of printable characters."""
-    return " ".join("".join(word if word.isprintable() else " " for word in words).split())
+    return " ".join("".join(char if char.isprintable() else " " for char in words).split())

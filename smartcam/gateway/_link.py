@@ -156,9 +156,8 @@ class RobotLink(asyncio.Protocol):
     def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
         self._account.requests += 1
         if self._task is not None:
-            self._account.abandoned += (
-                1  # without an answer, the robot would take the next one for it
-            )
+            # an answer now would be taken for the answer to another request
+            self._account.abandoned += 1
             return
         self._account.errors += 1
         self._write(answer, tag)

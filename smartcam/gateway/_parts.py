@@ -99,8 +99,8 @@ class Parts:
         """Factor for the convention's own angles; 1 for quaternions."""
         if "q1" in self._convention.numbers:
             return 1.0
-        factor = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
-        return self._angles / factor
+        per_radian = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
+        return self._angles / per_radian
 
     def _scaled(self, value: object, field: Field | None) -> float | str:
         quantity = UNITS[field.unit].quantity if field is not None and field.unit else ""
@@ -114,9 +114,9 @@ def _layouts(spec: object) -> dict[int | None, Layout]:
     """Return the layouts in ``interpret_as``, by application; None: for any application."""
     if spec is None:
         return {}
-    by_kind = spec if isinstance(spec, Mapping) else {None: spec}
+    by_application = spec if isinstance(spec, Mapping) else {None: spec}
     layouts: dict[int | None, Layout] = {}
-    for application, each in cast("Mapping[int | None, Any]", by_kind).items():
+    for application, each in cast("Mapping[int | None, Any]", by_application).items():
         interpreter = resolve(each)
         if isinstance(interpreter, Interpreter) and interpreter.layout is not None:
             layouts[application] = interpreter.layout

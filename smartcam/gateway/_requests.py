@@ -96,7 +96,7 @@ class RobotRequests:
         self._rows: list[Row] | None = None  # rows of the last result; None without one
         self._until = 0.0  # loop time until which the rows may be asked for
         self._last = RobotAnswer(AnswerCode.NONE, words="no request has failed")
-        self._has_given = False  # the answer being written has the first row
+        self._gives_row = False  # the answer being written has the first row
 
     # ------------------------------------------------------------------ a request
 
@@ -164,16 +164,16 @@ class RobotRequests:
             return RobotAnswer(AnswerCode.NO_RESULT, words=f"the result is older than {age:g} s")
         if not self._rows:
             return RobotAnswer(AnswerCode.NONE)
-        self._has_given = True
+        self._gives_row = True
         return RobotAnswer(AnswerCode.PART, len(self._rows) - 1, self._rows[0])
 
     def sent(self) -> None:
         """Count the part of the last answer as delivered; called when it was written."""
-        if self._has_given and self._rows:
+        if self._gives_row and self._rows:
             del self._rows[0]
             self._shared.account.waiting -= 1
             self._shared.account.delivered += 1
-        self._has_given = False
+        self._gives_row = False
 
     def failed(self, words: str) -> RobotAnswer:
         """Return the answer instead of one that cannot be written; the result is forgotten."""
@@ -183,7 +183,7 @@ class RobotRequests:
 
     def forget(self) -> None:
         """Forget the last result: a newer one is asked for, or the robot has disconnected."""
-        rows, self._rows, self._has_given = self._rows or [], None, False
+        rows, self._rows, self._gives_row = self._rows or [], None, False
         self._shared.account.waiting -= len(rows)
         self._shared.account.forgotten += len(rows)
 

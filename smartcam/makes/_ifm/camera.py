@@ -73,8 +73,8 @@ class IfmApplication:
         """Return a picture of an evaluation."""
         if isinstance(self.jpeg, bytes) and self.jpeg:
             size = re.search(rb"\xff[\xc0\xc2].{3}(..)(..)", self.jpeg, re.DOTALL)
-            sizes = size.groups() if size else (b"", b"")
-            height, width = (int.from_bytes(number, "big") for number in sizes)
+            sides = size.groups() if size else (b"", b"")
+            height, width = (int.from_bytes(side, "big") for side in sides)
             return ImageChunk(JPEG, width, height, count, time, self.jpeg)
         levels = np.add.outer(np.arange(48), np.arange(64) + count).astype(np.uint8)
         return ImageChunk(MONO8, 64, 48, count, time, levels.tobytes())
@@ -116,10 +116,8 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         **options: Any,
     ) -> None:
         made = applications_of(IfmApplication, applications, defaults)
-        self.set_up({application.id: application.parts for application in made}, active, 0)
-        self.applications: Mapping[int, IfmApplication] = {
-            application.id: application for application in made
-        }
+        self.set_up({each.id: each.parts for each in made}, active, 0)
+        self.applications: Mapping[int, IfmApplication] = {each.id: each for each in made}
         self.version: int = check_integer(version, "version", 1, 4)
         self.error = 0
         self.results: int = 0

@@ -47,18 +47,10 @@ class ImageChunk(NamedTuple):
     def encoded(self) -> bytes:
         """The chunk as a device sends it."""
         header_size = LEAST_HEADER_SIZE
-        seconds, nanoseconds = divmod(round(self.time * 1e9), 1_000_000_000)
+        seconds, nano = divmod(round(self.time * 1e9), 1_000_000_000)
         numbers = (
             *(self.type, header_size + len(self.data), header_size, VERSION, self.width),
-            *(
-                self.height,
-                0,
-                nanoseconds // 1000,
-                self.number,
-                0,
-                seconds & 0x7FFFFFFF,
-                nanoseconds,
-            ),
+            *(self.height, 0, nano // 1000, self.number, 0, seconds & 0x7FFFFFFF, nano),
         )
         return (HEADER.pack(*numbers) + b"{}").ljust(header_size, b"\0") + self.data
 
@@ -69,26 +61,24 @@ def read_chunks(data: bytes) -> list[ImageChunk]:
     Raises:
         FrameError: the chunks do not fit together.
     """
-    remaining = data[9:]
-    if not data[:9].isdigit() or int(data[:9]) != len(remaining):
+    body = data[9:]
+    if not data[:9].isdigit() or int(data[:9]) != len(body):
         raise FrameError(f"{data[:16]!r} begins no image of PCIC", data=data[:64])
     chunks: list[ImageChunk] = []
     at = 0
-    while at < len(remaining):
-        if len(remaining) - at < LEAST_HEADER_SIZE:
-            raise FrameError(
-                f"{len(remaining) - at} bytes are no image chunk", data=remaining[at : at + 64]
-            )
+    while at < len(body):
+        if len(body) - at < LEAST_HEADER_SIZE:
+            raise FrameError(f"{len(body) - at} bytes are no image chunk", data=body[at : at + 64])
         kind, size, header, _, width, height, _, _, count, _, seconds, nano = HEADER.unpack_from(
-            remaining, at
+            body, at
         )
-        if not LEAST_HEADER_SIZE <= header <= size <= len(remaining) - at:
+        if not LEAST_HEADER_SIZE <= header <= size <= len(body) - at:
             raise FrameError(
                 f"an image chunk of {size} bytes with a header of {header} came, "
-                f"{len(remaining) - at} are there",
-                data=remaining[at : at + 64],
+                f"{len(body) - at} are there",
+                data=body[at : at + 64],
             )
-        picture = remaining[at + header : at + size]
+        picture = body[at + header : at + size]
         chunks.append(ImageChunk(kind, width, height, count, seconds + nano / 1e9, picture))
         at += size
     return chunks

@@ -135,9 +135,9 @@ def _reply(answer: str) -> LineReply:
 
 def _connect(dialect: PcicDialect, message: m.Connect) -> Script:
     """Ask for the device's maker, switch its messages on, and upload the layout."""
-    greeting = yield "G?"
-    if not greeting.upper().startswith("IFM"):
-        raise FrameError(f"{greeting[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
+    maker = yield "G?"
+    if not maker.upper().startswith("IFM"):
+        raise FrameError(f"{maker[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
     code = CODES[(yield "p7" if dialect.tickets else "p0")]
     code = code or (yield from _upload(dialect))
     return m.ConnectAnswer(code=code, version=1)

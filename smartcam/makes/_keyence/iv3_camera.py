@@ -45,9 +45,9 @@ class EmulatedIv3(EvaluatingCamera):
         processing_time: float = 0.01,
         **options: Any,
     ) -> None:
-        cells = tuple(parts) or ((),)
+        given_parts = tuple(parts) or ((),)
         numbers = [check_integer(program, "programs", 0, LAST_PROGRAM) for program in programs]
-        self.set_up(dict.fromkeys(numbers, cells), active)
+        self.set_up(dict.fromkeys(numbers, given_parts), active)
         self.processing_time: float = check_seconds(processing_time, "processing_time")
         self.count: int = 0
         self.last: str = "RT,00000,NG"

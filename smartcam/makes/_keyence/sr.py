@@ -54,8 +54,8 @@ CODES = {
 
 
 def _code(line: str) -> int:
-    code_text = error_code(line)
-    return 0 if code_text is None else code_text or 100
+    code = error_code(line)
+    return 0 if code is None else code or 100
 
 
 def read_code(line: str) -> m.ResultContainer:
@@ -93,8 +93,8 @@ def _reply(line: str) -> LineReply:
 
 def _split(line: str) -> tuple[str, str]:
     """Return the command that a line answers; "" if the line is a code."""
-    first, _, others = line.partition(",")
-    return (asked_word(line, {}) if first in {"OK", "ER"} and others else ""), line
+    first, _, argument = line.partition(",")
+    return (asked_word(line, {}) if first in {"OK", "ER"} and argument else ""), line
 
 
 def _rows(bank: int | None) -> tuple[LineRow, ...]:
