@@ -155,7 +155,7 @@ class Places(Generic[G]):
                     crowd, taken = same, f"{len(same)} others of {peer} are open"
         if crowd:
             self.crowded_out += 1
-            evicted = next((occupant for occupant in crowd if not occupant.settled), None)
+            evicted = next((other for other in crowd if not other.settled), None)
             if evicted is None:
                 return f"{taken}, and each has {self._session_name}"
             self._send_away(evicted, f"{taken}, it was without {self._session_name} for longest")

@@ -284,7 +284,7 @@ class CameraTopics:
         if out is None and self.status_out is None:
             return
         outs = [out, self.status_out]
-        subscribed = [out for out in outs if out is not None and out.has_subscribers]
+        subscribed = [each for each in outs if each is not None and each.has_subscribers]
         if subscribed:
             at = datetime.now(UTC).isoformat()
             data = as_json({**self.state(), "number": number, "at": at})

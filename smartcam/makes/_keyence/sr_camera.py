@@ -123,6 +123,6 @@ class EmulatedSr(LineCamera):
     def tell_all(self) -> None:
         """Read a code and send it to all clients."""
         code = next(self.codes)
-        row = next(number for number, row in enumerate(LINES.rows, 1) if row.line == "code")
+        row = next(number for number, each in enumerate(LINES.rows, 1) if each.line == "code")
         for client in list(self._clients.values()):
             client.say_bytes(self.lines.data(NOTHING_READ if code is None else code), row=row)
