@@ -169,7 +169,7 @@ class Compare(Tool[CompareSettings]):
                 Drawing(
                     "polygon", tuple((float(x), float(y)) for x, y in view.region.corners), "region"
                 ),
-                *(self._drawn(label, motion, view) for label in large[:MAX_DRAWN_DIFFERENCES]),
+                *(self._drawn(row, motion, view) for row in large[:MAX_DRAWN_DIFFERENCES]),
             ],
         )
 
@@ -278,7 +278,7 @@ def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, f
     in bad light.
     """
     step = max(taught.size // MAX_LIGHT_PIXELS, 1) | 1  # an odd step samples all columns
-    x, y = (light.ravel()[::step].astype(np.float64) for light in (taught, seen))
+    x, y = (picture.ravel()[::step].astype(np.float64) for picture in (taught, seen))
     chosen = np.ones(x.shape, bool)
     gain, offset = 1.0, 0.0
     for _ in range(LIGHT_FIT_ROUNDS):

@@ -129,10 +129,10 @@ def _learn_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
 
 def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:
     texts = {
-        str(values["text"])
+        str(record["text"])
         for finding in seen.values()
-        for values in (finding.records or (finding.values,))
-        if values.get("text")
+        for record in (finding.records or (finding.values,))
+        if record.get("text")
     }
     if len(texts) != 1:
         return _Learned({}, f"{len(texts)} texts in {_pictures(len(seen))}: expect stays as it is.")
@@ -146,11 +146,11 @@ def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
 def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> _Learned:
     """Return the tolerance of measured values, in the form and unit of the old tolerance."""
     measured = {
-        name: picture.details for name, picture in seen.items() if _is_number(picture.details)
+        name: finding.details for name, finding in seen.items() if _is_number(finding.details)
     }
     left_out = {
-        name: picture.reason.partition(":")[0]
-        for name, picture in seen.items()
+        name: finding.reason.partition(":")[0]
+        for name, finding in seen.items()
         if name not in measured
     }
     before = settings.get("tolerance")
@@ -203,8 +203,8 @@ def _unwrapped(values: Array) -> Array:
         return values
     turns = np.array([math.remainder(angle - values[0], 360.0) for angle in values.tolist()])
     middle = math.remainder(float(values[0] + np.median(turns)), 360.0)
-    turns_near: Array = turns - np.median(turns) + middle
-    return turns_near
+    unwrapped: Array = turns - np.median(turns) + middle
+    return unwrapped
 
 
 def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:

@@ -310,7 +310,7 @@ class FrameInspector(Inspector):
         """Return the thread for tools, or a new thread if it is busy with a cancelled run."""
         thread = self._thread
         if thread is not None and thread.at_work:
-            self._hung_threads = [thread for thread in self._hung_threads if thread.at_work]
+            self._hung_threads = [hung for hung in self._hung_threads if hung.at_work]
             if len(self._hung_threads) < MAX_HUNG_THREADS:
                 self._hung_threads.append(thread)
                 thread.close()

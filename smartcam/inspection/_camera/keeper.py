@@ -109,10 +109,10 @@ class PictureKeeper:
             (self._folder / f"{stem}.png").write_bytes(png_of(judged, drawn=False))
             text = json.dumps(record, indent=1)
             (self._folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
-            pictures_kept = sorted(
+            pictures = sorted(
                 path for path in self._folder.iterdir() if self._own_names.fullmatch(path.name)
             )
-            for old in pictures_kept[: max(0, len(pictures_kept) - self._keep.most)]:
+            for old in pictures[: max(0, len(pictures) - self._keep.most)]:
                 old.unlink(missing_ok=True)
                 old.with_suffix(".json").unlink(missing_ok=True)
         except (OSError, ValueError, SmartCamError) as exc:

@@ -87,7 +87,7 @@ class JudgedResults(Observer):
         """Find the picture of a result."""
         count = result.number - self._before
         sent = self._pending.pop(count, None)
-        for older in [count_before for count_before in self._pending if count_before < count]:
+        for older in [key for key in self._pending if key < count]:
             del self._pending[older]  # their results were not awaited
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return

@@ -365,8 +365,8 @@ def _followed(
     best = scores.reshape(len(places), -1).argmax(axis=1)
     followed = []
     for number, which in enumerate(best.tolist()):
-        turn_index, offset = divmod(which, scores.shape[1])
-        row = number * len(ways) + turn_index
+        trial, offset = divmod(which, scores.shape[1])
+        row = number * len(ways) + trial
         x, y = at[row] + OFFSETS[offset]
         followed.append(
             RoughPlace(
@@ -401,7 +401,7 @@ def _scores(
     rows = np.rint(poses[1][:, None] * (sin * x + cos * y)).astype(np.int32) + at[:, 1:]
     ahead = (cos * u - sin * v).astype(np.float32)
     down = (sin * u + cos * v).astype(np.float32)
-    scores_found = np.empty((len(at), len(OFFSETS)), np.float32)
+    scores = np.empty((len(at), len(OFFSETS)), np.float32)
     flat = [np.pad(unit, ((0, 1), (0, 0))).ravel() for unit in units]  # nothing behind the last row
     nothing = height * width
     for number, (dx, dy) in enumerate(OFFSETS.tolist()):
@@ -410,8 +410,8 @@ def _scores(
         index = np.where(inside, row * width + column, nothing)
         agreed = flat[0].take(index) * ahead + flat[1].take(index) * down
         agreed = np.abs(agreed) if any_polarity else np.maximum(agreed, 0)
-        scores_found[:, number] = agreed.mean(axis=1)
-    return scores_found.astype(np.float64)
+        scores[:, number] = agreed.mean(axis=1)
+    return scores.astype(np.float64)
 
 
 def _best(

@@ -132,14 +132,12 @@ def segments_of(edges: EdgePoints) -> Segments:
         normal = normals[start]
         offsets = points[around] - points[start]
         alike = normals[around] @ normal >= math.cos(MAX_TURN)
-        own_places = around[
-            free[around] & alike & (np.abs(offsets @ normal) <= MAX_LINE_DISTANCE_PX)
-        ]
+        members = around[free[around] & alike & (np.abs(offsets @ normal) <= MAX_LINE_DISTANCE_PX)]
         free[start] = False
-        if len(own_places) < MIN_POINTS:
+        if len(members) < MIN_POINTS:
             continue
-        free[own_places] = False
-        rows.append(_segment(points[own_places], normals[own_places]))
+        free[members] = False
+        rows.append(_segment(points[members], normals[members]))
     if not rows:
         return _no_segments()
     middles, directions, bends, halves = (np.array(column) for column in zip(*rows, strict=True))

@@ -157,9 +157,9 @@ def locate(
         parts_found, bad = searched[area].find(model, search, end, allowed)
         parts += parts_found
         refused += bad
-    parts_kept = _apart(parts, search.overlap)
+    best = _apart(parts, search.overlap)
     refused.sort(key=lambda part: -part.score)
-    return Located(tuple(parts_kept), refused[0] if refused else None)
+    return Located(tuple(best), refused[0] if refused else None)
 
 
 def _area(
@@ -204,23 +204,19 @@ class _SearchedPicture:
         bad = [] if refused is None else [_unfitted(model, self._moved(refused), search, "")]
         parts: list[LocatedPart] = []
         for number, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
-            moved_part = self._moved(candidate)
+            place = self._moved(candidate)
             if time.monotonic() > end and number:
-                bad.append(
-                    _unfitted(model, moved_part, search, "there was no time left to look at it")
-                )
+                bad.append(_unfitted(model, place, search, "there was no time left to look at it"))
                 break
-            if _is_enough(parts, moved_part, search) or any(
-                _is_near(moved_part, other) for other in parts
-            ):
+            if _is_enough(parts, place, search) or any(_is_near(place, other) for other in parts):
                 continue
-            part = self._fitted(model, moved_part, search, allowed)
+            part = self._fitted(model, place, search, allowed)
             if part.refusal:
                 bad.append(part)
             else:
                 parts.append(part)
-        parts_kept = _apart(parts, search.overlap)[: search.most]
-        return [self._without_doubt(model, part, search) for part in parts_kept], bad
+        best = _apart(parts, search.overlap)[: search.most]
+        return [self._without_doubt(model, part, search) for part in best], bad
 
     def _moved(self, place: RoughPlace) -> RoughPlace:
         """Return a candidate in the whole picture's pixels."""
@@ -389,11 +385,11 @@ def _is_near(place: RoughPlace, other: LocatedPart) -> bool:
 
 def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
     """Return the best parts whose overlaps are at most as large as allowed."""
-    parts_kept: list[LocatedPart] = []
+    best: list[LocatedPart] = []
     for part in sorted(parts, key=lambda part: (-part.score, part.chi_square)):
-        if all(_covered(part.hull, other.hull) <= overlap for other in parts_kept):
-            parts_kept.append(part)
-    return parts_kept
+        if all(_covered(part.hull, other.hull) <= overlap for other in best):
+            best.append(part)
+    return best
 
 
 def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:

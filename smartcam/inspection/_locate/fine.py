@@ -296,11 +296,11 @@ Equations = tuple["Array", "Array", "Array"]
 
 
 def _solve(
-    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], deviations: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
     """Return the robust solution (7,) and its covariance (7, 7); None: too few edges.
 
-    ``residuals`` (4,): how far size, stretch, shear and growth are off their expected values, by
+    ``deviations`` (4,): how far size, stretch, shear and growth are off their expected values, by
     ``sigmas``.
     """
     rows, shifts, weights = equations
@@ -310,23 +310,23 @@ def _solve(
     a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
     robust = np.ones_like(w)
     for _ in range(4):
-        solved = _least_squares((a, y, w * robust), free, residuals, sigmas)
+        solved = _least_squares((a, y, w * robust), free, deviations, sigmas)
         if solved is None:
             return None
         scaled = (y - a @ solved[0]) * np.sqrt(w)
         spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
         robust = np.maximum(1 - (scaled / (MAX_DEVIATION_SIGMAS * 1.5 * spread)) ** 2, 0.0) ** 2
-    return _least_squares((a, y, w * robust), free, residuals, sigmas)
+    return _least_squares((a, y, w * robust), free, deviations, sigmas)
 
 
 def _least_squares(
-    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], deviations: Array, sigmas: Array
 ) -> tuple[Array, Array] | None:
     rows, values, weights = equations
     weighted = rows * weights[:, None]
     square, right = rows.T @ weighted, weighted.T @ values
     square[range(3, 7), range(3, 7)] += 1 / sigmas**2
-    right[3:] -= residuals / sigmas**2
+    right[3:] -= deviations / sigmas**2
     square, right = square[np.ix_(free, free)], right[free]
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
@@ -356,12 +356,12 @@ def _result(
     fit, blurs = steps = _steps(pixels, segments, shape, widened, None)
     rows, weights, noise, edges = _equations(steps, segments, shape.pose, use, MAX_STEPS)
     # an edge counts more the nearer it is to its place, and the better it fits a step
-    deviations = np.abs(fit.shifts) / (
+    distances = np.abs(fit.shifts) / (
         SCORED_DISTANCE_PX + MAX_DEVIATION_SIGMAS * np.minimum(_of_weights(weights), 1.0)
     )
-    seen = edges & (deviations <= 1)
+    seen = edges & (distances <= 1)
     lengths = segments.halves / segments.halves.sum()
-    score = float((lengths * (1 - deviations**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
+    score = float((lengths * (1 - distances**2) * (1 - _misfits(fit, use) ** 2))[seen].sum())
     wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     ground = None
     if score >= use.least_score:
@@ -404,7 +404,7 @@ def _result(
 
 
 def _settled(
-    equations: Equations, free: NDArray[np.bool_], residuals: Array, sigmas: Array
+    equations: Equations, free: NDArray[np.bool_], deviations: Array, sigmas: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], float] | None:
     """Return the last move (7,), the pose's covariance (4, 4), the used segments and chi-square.
 
@@ -424,7 +424,7 @@ def _settled(
         spread = max(math.sqrt(chi_square), 1.0)
     misfit = chi_square > 1 + 4 * math.sqrt(2 / freedom)  # the part differs from the taught one
     weighted = rows[used], shifts[used], weights[used]
-    solved = _changed(weighted, free, residuals, sigmas, max(chi_square, 1.0))
+    solved = _changed(weighted, free, deviations, sigmas, max(chi_square, 1.0))
     if solved is None:
         return None
     move, covariance = solved
@@ -434,7 +434,7 @@ def _settled(
 def _changed(
     equations: Equations,
     free: NDArray[np.bool_],
-    residuals: Array,
+    deviations: Array,
     sigmas: Array,
     chi_square: float,
 ) -> tuple[Array, Array] | None:
@@ -443,21 +443,21 @@ def _changed(
     A change is fitted only if it is significant; its size then bounds it in the second fit.
     """
     rows, shifts, weights = equations
-    solved = _least_squares(equations, free, residuals, sigmas)
+    solved = _least_squares(equations, free, deviations, sigmas)
     if solved is None:
         return None
     move, covariance = solved
     by_edges = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
-    beyond = (residuals + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
+    beyond = (deviations + move[3:]) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * by_edges
     none = (beyond <= 0) & np.isfinite(sigmas)
     known = np.minimum(np.sqrt(np.maximum(beyond, 1e-12)), sigmas)
     known = np.where(np.isfinite(sigmas), known, sigmas)
-    shifts = shifts + rows[:, 3:] @ np.where(none, residuals, 0.0)
+    shifts = shifts + rows[:, 3:] @ np.where(none, deviations, 0.0)
     freed = free.copy()
     freed[3:] &= ~none
-    solved = _least_squares((rows, shifts, weights), freed, residuals, known)
+    solved = _least_squares((rows, shifts, weights), freed, deviations, known)
     if solved is not None:
-        solved[0][3:][none] = -residuals[none]
+        solved[0][3:][none] = -deviations[none]
     return solved
 
 

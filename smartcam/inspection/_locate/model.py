@@ -284,9 +284,9 @@ class PartModel:
     @cached_property
     def coarse(self) -> CoarseModel:
         """The points for the coarse search."""
-        levels = [self.segments.selected(level) for level in self.levels]
+        chosen = [self.segments.selected(level) for level in self.levels]
         return CoarseModel(
-            tuple(level.middles for level in levels), tuple(level.normals for level in levels)
+            tuple(part.middles for part in chosen), tuple(part.normals for part in chosen)
         )
 
     def bands_at(self, scale: float) -> Bands:
@@ -318,9 +318,9 @@ class PartModel:
         mask = np.zeros(at.max(axis=0)[::-1] + 4, np.uint8)
         mask[at[:, 1], at[:, 0]] = 1
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        outlines, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        contours, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         outer = [
-            outline for outline, (_, _, _, parent) in zip(outlines, tree, strict=True) if parent < 0
+            outline for outline, (_, _, _, parent) in zip(contours, tree, strict=True) if parent < 0
         ]
         outer.sort(key=len, reverse=True)
         polygons = [
@@ -380,12 +380,12 @@ def _taught(
     _check_directions(segments)
     centre = image_edges.points.mean(axis=0)
     segments = _ordered(segments._replace(middles=segments.middles - centre))
-    symmetry, asymmetry = find_symmetry(segments, image_edges.points - centre, image_edges.normals)
-    segments, centre = segments._replace(middles=segments.middles - asymmetry), centre + asymmetry
-    asymmetry = _off_middle(
+    symmetry, shift = find_symmetry(segments, image_edges.points - centre, image_edges.normals)
+    segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
+    shift = _off_middle(
         segments, image_edges.points - centre, symmetry.fold, (levels, centre, noise)
     )
-    segments, centre = segments._replace(middles=segments.middles - asymmetry), centre + asymmetry
+    segments, centre = segments._replace(middles=segments.middles - shift), centre + shift
     return PartModel(
         name=name,
         segments=segments,

@@ -234,9 +234,7 @@ def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> floa
     millimetres = [(size[0] * MM[size[1]], size[1]) for size in sizes if size is not None]
     if not box:
         return MM["px"]
-    across, down = (
-        millimetre[0] / side for millimetre, side in zip(millimetres, box[2:], strict=True)
-    )
+    across, down = (length[0] / side for length, side in zip(millimetres, box[2:], strict=True))
     if not (across > 0 and abs(down / across - 1) < 1e-3):
         raise TeachingError(
             TeachingTrouble.UNIT,

@@ -85,12 +85,10 @@ class Segments(NamedTuple):
 
     def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the coordinates of points (P, 2) in their segments: across and along the edge."""
-        offsets = points - self.middles[owners]
+        x, y = (points - self.middles[owners]).T
         nx, ny = self.normals[owners].T
-        along = nx * offsets[:, 1] - ny * offsets[:, 0]
-        return nx * offsets[:, 0] + ny * offsets[:, 1] - 0.5 * self.bends[
-            owners
-        ] * along * along, along
+        along = nx * y - ny * x
+        return nx * x + ny * y - 0.5 * self.bends[owners] * along * along, along
 
 
 class Bands(NamedTuple):
@@ -128,9 +126,9 @@ def make_bands(segments: Segments, others: Array, reach: float = BAND_PX) -> Ban
     owners_in_band = labels[rows, columns].astype(np.intp)
     across, along = segments.places(np.column_stack([columns, rows]) + low, owners_in_band)
     within = (np.abs(across) <= reach) & (np.abs(along) <= segments.halves[owners_in_band] + 0.5)
-    numbers = np.full(labels.shape, -1, np.int16)
-    numbers[rows[within], columns[within]] = owners_in_band[within]
-    return Bands(numbers, (int(low[0]), int(low[1])))
+    band_labels = np.full(labels.shape, -1, np.int16)
+    band_labels[rows[within], columns[within]] = owners_in_band[within]
+    return Bands(band_labels, (int(low[0]), int(low[1])))
 
 
 class BandPixels(NamedTuple):
@@ -154,11 +152,11 @@ def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
     high = np.minimum(np.ceil(box.max(axis=0)).astype(int) + 1, levels.shape[::-1])
     if (high <= low).any():
         return BandPixels(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp))
-    axes = matrix.copy()
-    axes[:, 2] += matrix[:, :2] @ bands.corner - low
+    to_crop = matrix.copy()
+    to_crop[:, 2] += matrix[:, :2] @ bands.corner - low
     labels = cv2.warpAffine(
         bands.labels,
-        axes,
+        to_crop,
         tuple(map(int, high - low)),
         flags=cv2.INTER_NEAREST,
         borderMode=cv2.BORDER_CONSTANT,

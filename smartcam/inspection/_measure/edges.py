@@ -267,10 +267,7 @@ def _of_strip(
         kind = {"any": "", "rising": " from dark to light", "falling": " from light to dark"}
         text = f"no edge{kind[settings.polarity]} of {settings.contrast:g} grey levels"
         return StripEdges((), NotMeasuredError(NoValueReason.NO_EDGE, text))
-    edges = tuple(
-        JudgedEdge(judged_edge.edge, _trouble(judged_edge, settings, noise))
-        for judged_edge in judged
-    )
+    edges = tuple(JudgedEdge(step.edge, _trouble(step, settings, noise)) for step in judged)
     return StripEdges(edges, too_many=too_many)
 
 
@@ -300,9 +297,7 @@ def _candidates(
     for row in slopes:
         least = max(MIN_EDGE_SIGMAS * floor, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max()))
         peaks = [(at, side) for side in (row, -row) for at in _peaks(side, least)]
-        strongest = sorted(
-            peaks, key=lambda place_and_levels: -place_and_levels[1][place_and_levels[0]]
-        )[:MAX_EDGES]
+        strongest = sorted(peaks, key=lambda peak: -peak[1][peak[0]])[:MAX_EDGES]
         candidates.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
         counts.append(len(peaks))
     return candidates, counts
@@ -365,13 +360,13 @@ class _FittedStep(NamedTuple):
     settled: bool
 
 
-def _groups(candidates: list[Array], half: float, centres: Array, reach: Array) -> list[_EdgeGroup]:
-    """Return the groups of edges; ``centres`` and ``reach`` (N,), pixels, of each strip."""
+def _groups(candidates: list[Array], half: float, gaps: Array, reach: Array) -> list[_EdgeGroup]:
+    """Return the groups of edges; ``gaps`` and ``reach`` (N,), pixels, of each strip."""
     groups = []
     for owner, places in enumerate(candidates):
         if not len(places):
             continue
-        parts = np.split(places, np.flatnonzero(np.diff(places) >= centres[owner]) + 1)
+        parts = np.split(places, np.flatnonzero(np.diff(places) >= gaps[owner]) + 1)
         between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(parts)]
         for part, before, after in zip(parts, [-half, *between], [*between, half], strict=True):
             low = max(float(part[0] - reach[owner]), before)
@@ -391,16 +386,16 @@ def _steps(
 ) -> list[_FittedStep]:
     """Return steps fitted in two passes: the first finds the blur, which sets the reach."""
     number, half = len(candidates), strips.length / 2
-    centres, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
+    gaps, reach = np.full(number, MAX_GROUP_GAP_PX), np.full(number, FIRST_FIT_REACH_PX)
     blurs = np.ones(number)
-    groups = _groups(candidates, half, centres, reach)
-    for group in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
-        if group.settled:
-            seen = _seen_blur(min(group.edge.blur, settings.most_blur))
-            centres[group.owner] = max(centres[group.owner], MAX_GROUP_GAP_BLURS * seen)
-            reach[group.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
-            blurs[group.owner] = group.edge.blur
-    groups = _groups(candidates, half, centres, reach)
+    groups = _groups(candidates, half, gaps, reach)
+    for step in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
+        if step.settled:
+            seen = _seen_blur(min(step.edge.blur, settings.most_blur))
+            gaps[step.owner] = max(gaps[step.owner], MAX_GROUP_GAP_BLURS * seen)
+            reach[step.owner] = FIT_REACH_BLURS * seen + FIT_REACH_PX
+            blurs[step.owner] = step.edge.blur
+    groups = _groups(candidates, half, gaps, reach)
     return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
 
 

@@ -214,13 +214,9 @@ def _distances(values: Array, edges: Edges) -> Array:
     lines = np.isnan(third)
     normal = np.stack([np.cos(first), np.sin(first)], axis=-1)
     offsets = points[None] - np.stack([first, second], axis=-1)
-    distances_of_points = np.hypot(offsets[..., 0], offsets[..., 1])
-    across = np.where(
-        lines[..., None], normal, offsets / np.maximum(distances_of_points, 1e-12)[..., None]
-    )
-    beside = np.where(
-        lines, (normal * points[None]).sum(axis=-1) - second, distances_of_points - third
-    )
+    radii = np.hypot(offsets[..., 0], offsets[..., 1])
+    across = np.where(lines[..., None], normal, offsets / np.maximum(radii, 1e-12)[..., None])
+    beside = np.where(lines, (normal * points[None]).sum(axis=-1) - second, radii - third)
     seen = np.abs((across * normals[None]).sum(axis=-1))
     distances: Array = beside / np.maximum(seen, 0.1)
     return distances

@@ -128,10 +128,10 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
     origin = np.zeros(3) if robot else middle
     flips_v = calibration.kind == "plane" and calibration.y_down
 
-    def mapped(sheet: Any) -> Callable[[Array], Array]:
+    def mapped(variant: Any) -> Callable[[Array], Array]:
         def points(pixels: Array) -> Array:
             seen = pixels * [1.0, -1.0] if flips_v else pixels
-            flat: Array = MM * (sheet.transform(seen) - origin) @ axes
+            flat: Array = MM * (variant.transform(seen) - origin) @ axes
             return flat
 
         return points

@@ -183,13 +183,13 @@ def _normal_equations(pixels: StripPixels, values: Array) -> tuple[Array, Array,
     columns[:, steps : steps + 2] = 0.0
     model = values[:, [-1]] + np.zeros_like(pixels.along)
     for k in range(steps):
-        misfit = pixels.along - values[:, [k]] - tilt * pixels.beside
-        part, slope, by_blur = share(cosine * misfit, blur, sides)
+        away = pixels.along - values[:, [k]] - tilt * pixels.beside
+        part, slope, by_blur = share(cosine * away, blur, sides)
         height = values[:, [steps + 2 + k]]
         columns[:, k] = -height * cosine * slope
         # d = cosine (along - place - tilt beside) with cosine = (1 + tilt^2)^-1/2
         columns[:, steps] += (
-            height * slope * cosine * (-pixels.beside - cosine * cosine * tilt * misfit)
+            height * slope * cosine * (-pixels.beside - cosine * cosine * tilt * away)
         )
         columns[:, steps + 1] += height * by_blur
         columns[:, steps + 2 + k] = part

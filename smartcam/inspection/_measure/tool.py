@@ -227,15 +227,14 @@ class _EdgeFinder:
     def line(self, search: LineSearch) -> tuple[FoundShape, ShapeFit[Line]]:
         """Return the edges of a line, and the line in the picture's pixels."""
         ends, scale = self.at(search.along), self.reference.scale
-        across = (
-            (ends[1] - ends[0])[::-1] * [-1.0, 1.0] / math.dist(*ends) * search.search / 2 * scale
-        )
+        length = math.dist(*ends)
+        across = (ends[1] - ends[0])[::-1] * [-1.0, 1.0] / length * search.search / 2 * scale
         self._regions.append(np.array([*(ends - across), *(ends[::-1] + across)]))
         found_line = find_line(
             self._image,
             *ends,
             search=search.search * scale,
-            width=_width_of(search, math.dist(*ends), scale),
+            width=_width_of(search, length, scale),
             count=search.strips,
             settings=self._settings(search),
             which=search.which,
@@ -342,9 +341,9 @@ def _edge(look: _EdgeFinder, search: Across) -> _MeasuredValue:
 
     def place(plane: Plane) -> Value:
         point = point_of(edge, plane)
-        sight_line = point.at - plane.points(start[None])[0]
-        length = max(math.hypot(*sight_line), 1e-12)
-        return Value(length, math.sqrt(float(sight_line @ point.covariance @ sight_line)) / length)
+        offset = point.at - plane.points(start[None])[0]
+        length = max(math.hypot(*offset), 1e-12)
+        return Value(length, math.sqrt(float(offset @ point.covariance @ offset)) / length)
 
     x, y = edge.pixel.tolist()
     pose = _pose(edge.pixel, edge.strip.directions[0])

@@ -154,15 +154,11 @@ def _joint(first: FoundPoint, second: FoundPoint) -> tuple[Array, Array]:
     values = np.array([parameter for edge in edges for parameter in (edge.place, edge.tilt)])
     covariance = np.zeros((4, 4))
     together = edges[0].unit_covariance is edges[1].unit_covariance
-    for i, first_edge in enumerate(edges):
+    for i, edge in enumerate(edges):
         for j, other in enumerate(edges):
             if i == j or together:
-                rows, columns = [first_edge.number, -1], [other.number, -1]
-                part = (
-                    first_edge.unit_covariance[np.ix_(rows, columns)]
-                    * first_edge.noise
-                    * other.noise
-                )
+                rows, columns = [edge.number, -1], [other.number, -1]
+                part = edge.unit_covariance[np.ix_(rows, columns)] * edge.noise * other.noise
                 covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = part
     return values, covariance
 

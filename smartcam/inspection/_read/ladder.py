@@ -102,12 +102,12 @@ def read_again(
             continue
         smaller: list[ReadCode] | None = None
         for code in _by_rung(rung, search):
-            if not counts(code) or any(_is_same(code, known) for known in codes):
+            if not counts(code) or any(_is_same(code, other) for other in codes):
                 continue
-            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, known) for known in waiting):
+            if code.kind in CONFIRMED_KINDS and not any(_is_same(code, other) for other in waiting):
                 if smaller is None:
                     smaller = _by_rung(rung, search, CONFIRMING_SCALE)
-                if not any(_is_same(code, known) for known in smaller):
+                if not any(_is_same(code, other) for other in smaller):
                     waiting.append(code)
                     continue
             codes.append(code)
