@@ -66,8 +66,8 @@ def as_points(values: ArrayLike, columns: int, label: str) -> Array:
 
 def as_vector(values: ArrayLike, length: int, label: str) -> Array:
     """Return ``values`` as float64 of shape (``length``,); raise SHAPE or NOT_FINITE."""
-    listed: Any = [values]
-    vector: Array = as_points(listed, length, label)[0]
+    rows: Any = [values]
+    vector: Array = as_points(rows, length, label)[0]
     return vector
 
 

@@ -80,7 +80,7 @@ class AsList:
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         items = handler.generate_schema(get_args(kind)[0])
         schema = core_schema.list_schema(items, min_length=self.least)
-        return _made_of(schema, read=lambda fields, _: tuple(fields), write=list)
+        return _made_of(schema, read=lambda values, _: tuple(values), write=list)
 
 
 class AsMapping:
@@ -94,7 +94,7 @@ class AsMapping:
         }
         return _made_of(
             core_schema.typed_dict_schema(fields, extra_behavior="forbid"),
-            read=lambda fields, _: kind(**fields),
+            read=lambda values, _: kind(**values),
             write=lambda value: value._asdict(),
         )
 
@@ -104,7 +104,7 @@ def _made_of(
 ) -> CoreSchema:
     """Return the schema of values that are made of parts with forms of their own."""
     return core_schema.with_info_after_validator_function(
-        lambda fields, info: read(fields, info.context),
+        lambda values, info: read(values, info.context),
         parts,
         serialization=core_schema.wrap_serializer_function_ser_schema(
             lambda value, plain: plain(write(value)), schema=parts
@@ -169,8 +169,8 @@ class Stored:
             others = {key: value(instance) for key, (_, value) in cls._others.items()}
             return others | {key: getattr(instance, name) for key, name in names.items()}
 
-        def read(fields: dict[str, Any], context: Context) -> Stored:
-            return cls._read({names.get(key, key): field for key, field in fields.items()}, context)
+        def read(values: dict[str, Any], context: Context) -> Stored:
+            return cls._read({names.get(key, key): part for key, part in values.items()}, context)
 
         fields = {key: field(key) for key in types}
         parts = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
@@ -301,9 +301,7 @@ def _lists(values: Array) -> Any:
     """Return an array as nested lists, None for NaN."""
     if not np.isnan(values).any():
         return values.tolist()
-    return (
-        [_lists(value) for value in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
-    )
+    return [_lists(row) for row in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
 
 
 Vector2 = Annotated[Array, Form(Pair, as_array, _tolist)]
@@ -353,7 +351,7 @@ def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
     """Return the form of a transform without the names of its frames, which ``frames`` gives."""
     return Form(
         Annotated[_Motion, AsMapping()],
-        read=lambda fields, context: Transform(*frames(context), *fields),
+        read=lambda values, context: Transform(*frames(context), *values),
         write=motion_to_data,
     )
 
