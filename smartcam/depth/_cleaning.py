@@ -125,11 +125,11 @@ class SpatialFilter:
         """Smooth along the first axis, forwards and backwards, in place."""
         step, size = np.empty_like(lines[0]), np.empty_like(lines[0])
         is_near = np.empty(lines.shape[1], bool)
-        weight_of_new, delta = np.float32(1 - self.alpha), np.float32(self.delta)
+        weight_before, delta = np.float32(1 - self.alpha), np.float32(self.delta)
         for line, before in _forth_and_back(len(lines)):
             np.subtract(lines[line], lines[before], out=step)
             np.less(np.abs(step, out=size), delta, out=is_near)
-            np.multiply(step, weight_of_new, out=step)
+            np.multiply(step, weight_before, out=step)
             np.subtract(lines[line], step, out=lines[line], where=is_near)
 
 

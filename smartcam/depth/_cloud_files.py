@@ -157,17 +157,13 @@ def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
         valid = valid & np.isfinite(column)
     points = np.empty((int(valid.sum()), 3), np.float32)
     for place, column in enumerate(coordinates):
-        columns_in_metres = column[valid] if metre == 1.0 else column[valid] * metre
+        values = column[valid] if metre == 1.0 else column[valid] * metre
         with np.errstate(over="ignore"):
-            points[:, place] = columns_in_metres
-        if (
-            columns_in_metres.dtype == np.float64
-            and columns_in_metres.size
-            and _loses(columns_in_metres, points[:, place])
-        ):
+            points[:, place] = values
+        if values.dtype == np.float64 and values.size and _loses(values, points[:, place]):
             raise BadTableError(
                 "coordinates that float32 keeps to a millimetre",
-                f"{'xyz'[place]} up to {np.abs(columns_in_metres).max():g} m: move the origin",
+                f"{'xyz'[place]} up to {np.abs(values).max():g} m: move the origin",
             )
     try:
         sigma = _sigma(columns, valid)
@@ -186,11 +182,7 @@ def _colours(
     columns: Mapping[str, NDArray[Any]], valid: NDArray[np.bool_]
 ) -> NDArray[np.uint8] | None:
     names = next(
-        (
-            names_of_form
-            for names_of_form in COLOUR_NAMES
-            if all(name in columns for name in names_of_form)
-        ),
+        (form for form in COLOUR_NAMES if all(name in columns for name in form)),
         None,
     )
     if names is None:

@@ -275,7 +275,7 @@ def _region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> Colou
     turned = 0.5 * math.atan2(2 * float(np.mean(x * y)), float(np.mean(x * x) - np.mean(y * y)))
     hull = cv2.convexHull(points.astype(np.int32))
     around = cv2.minAreaRect(hull)
-    (width, height), angle = (offset + 1 for offset in around[1]), around[2]  # from rim to rim
+    (width, height), angle = (side + 1 for side in around[1]), around[2]  # from rim to rim
     mask = np.zeros(labels.shape, bool)
     mask[box] = pixels
     return ColourRegion(

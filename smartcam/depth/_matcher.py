@@ -224,8 +224,8 @@ class StereoMatcher:
             apart = _disagreement(sixteenths, self._reverse(left, right), invalid)
             sixteenths[~(apart <= self._left_right * SUBPIXELS)] = invalid
         column = np.arange(left.shape[1])
-        left_column = column - np.round(sixteenths / SUBPIXELS)
-        sixteenths[(left_column < 0) | (left_column >= left.shape[1])] = invalid
+        right_column = column - np.round(sixteenths / SUBPIXELS)
+        sixteenths[(right_column < 0) | (right_column >= left.shape[1])] = invalid
         size = int(self.parameters["speckle_window_size"])
         if size:
             reach = int(self.parameters["speckle_range"]) * SUBPIXELS
@@ -266,9 +266,7 @@ def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
             )
         if known[name].check(value) is None:
             raise _wrong(f"{algorithm}: {name}", str(known[name]), value)
-    merged: dict[str, Value] = {name: setting.default for name, setting in known.items()} | dict(
-        given
-    )
+    merged: dict[str, Value] = {name: spec.default for name, spec in known.items()} | dict(given)
     if algorithm == "sgbm":
         area = int(merged["block_size"]) ** 2
         merged["P1"] = merged["P1"] or 8 * area

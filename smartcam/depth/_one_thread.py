@@ -39,7 +39,7 @@ class OneThread:
         if self._pool is None:
             raise LocalProtocolError(f"{self._name}: closed")
         self._running = asyncio.get_running_loop().run_in_executor(self._pool, work)
-        self._running.add_done_callback(_retrieved)
+        self._running.add_done_callback(_retrieve_error)
         return await asyncio.shield(self._running)
 
     async def close(self) -> None:
@@ -53,6 +53,6 @@ class OneThread:
             await self.idle()
 
 
-def _retrieved(done: asyncio.Future[Any]) -> None:
+def _retrieve_error(done: asyncio.Future[Any]) -> None:
     if not done.cancelled():
         done.exception()  # mark the error as retrieved: the caller may be cancelled

@@ -56,22 +56,24 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
         OSError: one of the files cannot be read.
     """
     given = [(parse_camera_info(_text(path)), path) for path in (left, right)]
-    (left_info, _), (two, _) = given
-    shift = float(two.projection[0, 3] / two.projection[0, 0])
+    (first_info, _), (second_info, _) = given
+    shift = float(second_info.projection[0, 3] / second_info.projection[0, 0])
     if not shift < 0:
         raise CalibrationError(
             f"{right}: expected the camera_info of the right camera of a pair, with a "
             f"projection_matrix whose fourth column begins with minus focal length times baseline, "
-            f"got {two.projection[0, 3]:g}",
+            f"got {second_info.projection[0, 3]:g}",
             code=Code.SWAPPED_SIDES,
-            got=float(two.projection[0, 3]),
+            got=float(second_info.projection[0, 3]),
         )
     # p_rectified = R1 p_left; the right rectified frame is shifted, so p_right = R2^T (R1 p_left +
     # shift)
     first, second = (_rotation(info.rectification, path) for info, path in given)
     transform = Transform("right", "left", second.T @ first, second.T @ np.array([shift, 0, 0]))
     return CameraChain(
-        cameras=(left_info.camera, two.camera), transforms=(transform,), names=("left", "right")
+        cameras=(first_info.camera, second_info.camera),
+        transforms=(transform,),
+        names=("left", "right"),
     )
 
 

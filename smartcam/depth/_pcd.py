@@ -104,7 +104,7 @@ def _header(data: bytes) -> _PcdHeader:
         if number_type is None:
             raise BadTableError("I or U of 1, 2, 4 or 8, or F of 4 or 8 bytes", shown(kind + size))
         types.append(number_type)
-    width, height, points = (_single_line(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
+    width, height, points = (_single_count(lines, name) for name in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
         raise BadTableError("WIDTH times HEIGHT POINTS", f"{width}, {height} and {points}")
     if lines["DATA"] not in [[reader] for reader in READERS]:
@@ -115,7 +115,7 @@ def _header(data: bytes) -> _PcdHeader:
     return _PcdHeader(names, types, many, points, lines["DATA"][0], place)
 
 
-def _single_line(lines: Mapping[str, list[str]], name: str) -> int:
+def _single_count(lines: Mapping[str, list[str]], name: str) -> int:
     words = lines.get(name, [])
     if len(words) != 1:
         raise BadTableError(f"{name} and a number", shown(" ".join(words)))

@@ -135,10 +135,10 @@ def _equal(levels: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return levels as greys from 1 to 255, with equally many pixels of each grey."""
     _, place, counts = np.unique(levels, return_inverse=True, return_counts=True)
     upto = np.cumsum(counts)
-    distinct = upto[-1] - upto[0]
-    if not distinct:
+    span = upto[-1] - upto[0]
+    if not span:
         return np.full(levels.shape, 255, np.uint8)
-    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / distinct).astype(np.uint8)
+    greys: NDArray[np.uint8] = np.rint(1 + 254 * (upto - upto[0]) / span).astype(np.uint8)
     return greys[place.reshape(levels.shape)]
 
 

@@ -175,8 +175,8 @@ def _aligned(
 ) -> tuple[Transform, bool]:
     """Return the pose, and whether the iteration converged; both clouds are centred first."""
     gicp = load("small_gicp")
-    centre, goal = points.mean(axis=0), goals.mean(axis=0)
-    clouds = [gicp.PointCloud(points - centre), gicp.PointCloud(goals - goal)]
+    centre, goal_centre = points.mean(axis=0), goals.mean(axis=0)
+    clouds = [gicp.PointCloud(points - centre), gicp.PointCloud(goals - goal_centre)]
     for cloud in clouds:
         gicp.estimate_normals_covariances(cloud, None, NEIGHBOURS)
     tree = gicp.KdTree(clouds[1])
@@ -196,9 +196,9 @@ def _aligned(
 
     motion = np.eye(4)
     motion[:3, :3] = begin.rotation
-    motion[:3, 3] = begin.rotation @ centre + begin.translation - goal
-    transform = stepped(motion, MAX_STEPS)
-    motion, ended = np.asarray(transform.T_target_source, np.float64), bool(transform.converged)
+    motion[:3, 3] = begin.rotation @ centre + begin.translation - goal_centre
+    result = stepped(motion, MAX_STEPS)
+    motion, ended = np.asarray(result.T_target_source, np.float64), bool(result.converged)
     if np.isfinite(motion).all() and not ended:
         before = motion
         motion = np.asarray(stepped(before, FURTHER_STEPS).T_target_source, np.float64)
@@ -209,7 +209,7 @@ def _aligned(
     # The product of many small turns is not exactly a rotation.
     left, _, right = np.linalg.svd(motion[:3, :3])
     rotation = left @ right
-    translation = motion[:3, 3] - rotation @ centre + goal
+    translation = motion[:3, 3] - rotation @ centre + goal_centre
     return Transform(begin.target, begin.source, rotation, translation), ended
 
 

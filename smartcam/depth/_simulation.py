@@ -262,23 +262,23 @@ class _TableRays:
         if 0 in shape:
             return
         c, s = np.float32(math.cos(block.angle)), np.float32(math.sin(block.angle))
-        from_camera = np.subtract(self._camera, (block.x, block.y, block.z))
+        to_camera = np.subtract(self._camera, (block.x, block.y, block.z))
         # AXES: right is -y of the robot, down is -x, ahead is -z
         begin = (
-            c * from_camera[0] + s * from_camera[1],
-            c * from_camera[1] - s * from_camera[0],
-            from_camera[2] - block.size[2] / 2,
+            c * to_camera[0] + s * to_camera[1],
+            c * to_camera[1] - s * to_camera[0],
+            to_camera[2] - block.size[2] / 2,
         )
         ways = (-c * down - s * across, s * down - c * across, np.full((1, 1), -1.0, np.float32))
         nearest, farthest = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
         side = np.zeros(shape, np.int8)
         for axis, (start, direction, size) in enumerate(zip(begin, ways, block.size, strict=True)):
             direction = np.where(np.abs(direction) < 1e-9, np.float32(1e-9), direction)
-            entry, other = ((sign * size / 2 - start) / direction for sign in (-1, 1))
-            enters = np.minimum(entry, other).astype(np.float32)
+            first_face, other = ((sign * size / 2 - start) / direction for sign in (-1, 1))
+            enters = np.minimum(first_face, other).astype(np.float32)
             side[np.broadcast_to(enters, shape) > nearest] = axis
             nearest = np.maximum(nearest, enters)
-            farthest = np.minimum(farthest, np.maximum(entry, other).astype(np.float32))
+            farthest = np.minimum(farthest, np.maximum(first_face, other).astype(np.float32))
         hit = (nearest < farthest) & (nearest < self.depth[box])
         self.depth[box][hit] = nearest[hit]
         along = begin[0] + nearest * ways[0]

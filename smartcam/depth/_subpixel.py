@@ -129,13 +129,13 @@ class _WindowSums:
     def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
         """Return the sums of values times powers of the distance from the window's middle."""
         if not (across or down):
-            averaged = self._cv2.boxFilter(
+            summed = self._cv2.boxFilter(
                 values, -1, self._side, normalize=False, borderType=self._border
             )
         else:
             x, y = self._ramp**across, self._ramp**down
-            averaged = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
-        return np.asarray(averaged, dtype=np.float32)
+            summed = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
+        return np.asarray(summed, dtype=np.float32)
 
 
 class _DisparityPlane(NamedTuple):
@@ -225,8 +225,8 @@ def _fitted(
     n = np.maximum(sums(mask), 1)
     sg, sr, mean = sums(g), sums(level), sums(level * level)
     sy, gy, ry = (
-        sums(rest_) + plane.across * sums(g_, 1) + plane.down * sums(g_, 0, 1)
-        for rest_, g_ in ((constant, g), (constant * g, gg), (constant * level, rg))
+        sums(constant_) + plane.across * sums(g_, 1) + plane.down * sums(g_, 0, 1)
+        for constant_, g_ in ((constant, g), (constant * g, gg), (constant * level, rg))
     )
     gy -= sg * sy / n
     ry -= sr * sy / n
@@ -273,10 +273,10 @@ def _sampled(picture: Field, columns: Field) -> tuple[Field, Field]:
     factors = {node: t - np.float32(node) for node in range(-2, 4)}
     value = np.zeros_like(t)
     for node, pixel in zip(factors, pixels, strict=True):
-        others = [factor for factor in factors if factor != node]
-        weight = pixel * np.float32(1 / np.prod([node - index for index in others]))
-        for index in others:
-            weight *= factors[index]
+        others = [other for other in factors if other != node]
+        weight = pixel * np.float32(1 / np.prod([node - other for other in others]))
+        for other in others:
+            weight *= factors[other]
         value += weight
     # central differences as in the left picture, with linear interpolation
     slope = (1 - t) * (pixels[3] - pixels[1]) / 2 + t * (pixels[4] - pixels[2]) / 2
