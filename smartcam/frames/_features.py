@@ -326,8 +326,8 @@ def checked_value(value: object) -> FeatureValue:
 
 
 @contextlib.asynccontextmanager
-async def _within(timeout: object, label: str) -> AsyncIterator[None]:
-    """Limit the time of a block; raise FrameTimeoutError that names ``label`` was awaited."""
+async def _within(timeout: object, awaited: str) -> AsyncIterator[None]:
+    """Limit the time of a block; raise FrameTimeoutError that names ``awaited``."""
     seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
     try:
         async with asyncio.timeout(seconds):
@@ -335,4 +335,4 @@ async def _within(timeout: object, label: str) -> AsyncIterator[None]:
     except FrameSourceError:
         raise
     except TimeoutError as exc:
-        raise FrameTimeoutError(f"expected {label} within {seconds:g} s, got no answer") from exc
+        raise FrameTimeoutError(f"expected {awaited} within {seconds:g} s, got no answer") from exc

@@ -66,8 +66,8 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
         schemes = [info.name for info in FRAMES.available()]
     else:
         schemes = [check_text(scheme, "scheme", "discover", most=100)]
-    kinds = dict.fromkeys(_driver(scheme, scheme) for scheme in schemes)
-    return [camera for kind in kinds for camera in await kind.discover()]
+    kinds = dict.fromkeys(_driver(name, name) for name in schemes)
+    return [source for kind in kinds for source in await kind.discover()]
 
 
 def _is_recording(address: FrameAddress) -> bool:
@@ -85,6 +85,6 @@ def _driver(scheme: str, url: str) -> type[FrameDriver]:
         known = [info.name for info in FRAMES.available()]
         raise ConfigurationError(
             f"frame source {url!r}: unknown scheme {scheme!r}; known are "
-            f"{', '.join(f'{scheme}://' for scheme in known)}{did_you_mean(scheme, known)}"
+            f"{', '.join(f'{name}://' for name in known)}{did_you_mean(scheme, known)}"
         )
     return cast("type[FrameDriver]", FRAMES.load(scheme))

@@ -118,11 +118,11 @@ class FrameReader:
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")
-        description = f"a frame of the last {max_age:g} s"
+        expected = f"a frame of the last {max_age:g} s"
         held = self._next or self._last
         if held is not None and held.age <= max_age:
             return self._taken(held)
-        return await self._first(description, timeout, lambda frame: frame.age <= max_age)
+        return await self._first(expected, timeout, lambda frame: frame.age <= max_age)
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the first frame, from the waiting one on, whose exposure began after a moment.
@@ -146,8 +146,8 @@ class FrameReader:
         for held in (self._last, self._next):
             if held is not None and held.began >= moment:
                 return self._taken(held)
-        description = "a frame exposed after the given moment"
-        return await self._first(description, timeout, lambda frame: frame.began >= moment)
+        expected = "a frame exposed after the given moment"
+        return await self._first(expected, timeout, lambda frame: frame.began >= moment)
 
     async def fresh(self, since: float, until: float) -> None:
         """Wait until the next frame is newer than a moment, or until a deadline.
@@ -188,14 +188,14 @@ class FrameReader:
         return f": {waits}, and nothing triggered it" if waits else ""
 
     async def _first(
-        self, label: str, timeout: float | None, wanted: Callable[[Frame], bool]
+        self, expected: str, timeout: float | None, wanted: Callable[[Frame], bool]
     ) -> Frame:
         """Return the first wanted frame."""
         end = self._deadline(timeout)
-        while (frame := await self._take(end, label)) is not None:
+        while (frame := await self._take(end, expected)) is not None:
             if wanted(frame):
                 return frame
-        text = f"{self._name}: expected {label}, the source ended"
+        text = f"{self._name}: expected {expected}, the source ended"
         raise FrameSourceError(text, source=self._name)
 
     @property
@@ -208,12 +208,12 @@ class FrameReader:
             return None
         return asyncio.get_running_loop().time() + timeout
 
-    async def _take(self, end: float | None, label: str) -> Frame | None:
+    async def _take(self, end: float | None, expected: str) -> Frame | None:
         """Return the next frame; None at the end of the source."""
         while self._next is None and not self._ended:
             if not await self._woken(end):
                 raise FrameTimeoutError(
-                    f"{self._name}: expected {label}, got none in time{self._waits()}",
+                    f"{self._name}: expected {expected}, got none in time{self._waits()}",
                     source=self._name,
                 )
         if self._next is not None:

@@ -413,7 +413,7 @@ class FrameSource(FrameSink):
     # called by the driver
 
     def trigger_failed(self, error: SmartCamError) -> None:
-        """Fail the pending trigger, whose picture was lost."""
+        """Fail the pending trigger, whose picture will not come."""
         self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:

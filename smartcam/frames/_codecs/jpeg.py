@@ -124,10 +124,10 @@ def _check_restarts(data: bytes | bytearray | memoryview, label: str, warning: E
     Raises:
         FrameFormatError: the markers are not in sequence, or the end marker is missing.
     """
-    remaining = bytes(data)
-    scan = remaining.rfind(b"\xff\xda")
-    marks = [number[0] - 0xD0 for number in _RESTART.findall(remaining, max(scan, 0))]
-    if scan < 0 or b"\xff\xd9" not in remaining[scan:]:
+    octets = bytes(data)
+    scan = octets.rfind(b"\xff\xda")
+    marks = [mark[0] - 0xD0 for mark in _RESTART.findall(octets, max(scan, 0))]
+    if scan < 0 or b"\xff\xd9" not in octets[scan:]:
         raise _wrong(label, data, warning)
     if marks != [place % 8 for place in range(len(marks))]:
         raise _wrong(label, data, ValueError(f"a restart mark is missing; {warning}"))

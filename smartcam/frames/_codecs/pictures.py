@@ -97,9 +97,7 @@ def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
     if matrix == "601":
         y, chroma = _wideners()
         tables = (y, chroma, chroma)
-        ready = [
-            looked_up(*table_and_plane) for table_and_plane in zip(tables, planes, strict=True)
-        ]
+        ready = [looked_up(table, plane) for table, plane in zip(tables, planes, strict=True)]
     else:
         ready = [np.ascontiguousarray(plane) for plane in planes]
     data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*ready, quality)

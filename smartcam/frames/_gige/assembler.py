@@ -204,9 +204,7 @@ class Assembler:
 
     def _deadline(self, block: Block) -> float:
         if block.missing_since < math.inf:
-            return max(
-                block.missing_since + REORDER_GRACE, block.resend_requested_at + RESEND_INTERVAL
-            )
+            return max(block.missing_since + REORDER_GRACE, block.requested_at + RESEND_INTERVAL)
         if block.highest or block.trailer is not None:
             return block.progress + SILENCE_TIMEOUT
         return block.progress + LEADER_TIMEOUT
@@ -237,7 +235,7 @@ class Assembler:
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
         # while other packets come, the next request is delayed
         block.tries += past
-        block.resend_requested_at = now
+        block.requested_at = now
         wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
 
     # packets
@@ -311,10 +309,10 @@ class Assembler:
 
     def _open(self, number: int, extended: bool, now: float) -> Block:
         """Open a block, and earlier blocks of which no packet came."""
-        for older in self._blocks.values():
-            if older.number < number and not older.over:
-                older.over = True
-                older.missing_since = min(older.missing_since, now)
+        for opened in self._blocks.values():
+            if opened.number < number and not opened.over:
+                opened.over = True
+                opened.missing_since = min(opened.missing_since, now)
         for missing in range(max(self._newest + 1, number - MAX_OPEN_BLOCKS + 1), number):
             self._make(missing, extended, now).over = True
             self._blocks[missing].missing_since = now
@@ -351,7 +349,7 @@ class Assembler:
                 block.dead = True
                 self._settle()
             return
-        if packet < len(block.packets_received) and block.packets_received[packet]:
+        if packet < len(block.received) and block.received[packet]:
             self.counts.doubled += 1
             return
         if not self._fits(block, header, payload):

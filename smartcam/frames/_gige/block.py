@@ -92,10 +92,10 @@ class Block:
         "number",
         "over",
         "packets",
-        "packets_received",
-        "payloads_received",
+        "payloads",
         "progress",
-        "resend_requested_at",
+        "received",
+        "requested_at",
         "short",
         "trailer",
         "trailer_content",
@@ -118,8 +118,8 @@ class Block:
         self.full = datagram - self.header
         self.packets = -(-most // self.full)
         self.buffer: memoryview | None = None
-        self.packets_received = bytearray(self.packets + 2)
-        self.payloads_received = self.highest = 0
+        self.received = bytearray(self.packets + 2)
+        self.payloads = self.highest = 0
         self.expected = PAYLOAD_KIND | 1  # second word of the next packet's header
         self.leader: Leader | None = None
         self.implied = implied
@@ -130,7 +130,7 @@ class Block:
         self.arrived: float | None = None
         self.progress = now
         self.missing_since = math.inf  # time from which packets are known to be missing
-        self.resend_requested_at, self.tries = -math.inf, 0
+        self.requested_at, self.tries = -math.inf, 0
         self.over = False  # whether the camera has sent later blocks, or is silent
         self.complete = self.dead = False
 
@@ -149,8 +149,8 @@ class Block:
             return False
         begin = (packet - 1) * self.full
         buffer[begin : begin + self.full] = data
-        self.packets_received[packet] = 1
-        self.payloads_received += 1
+        self.received[packet] = 1
+        self.payloads += 1
         self.highest = packet
         self.expected += 1
         self.progress = now
@@ -174,7 +174,7 @@ class Block:
             self.buffer = np.empty(self.packets * self.full, np.uint8).data
         begin = (packet - 1) * self.full
         self.buffer[begin : begin + size] = data
-        self.payloads_received += 1
+        self.payloads += 1
         return True
 
     def take_leader(self, payload: bytes) -> None:
@@ -205,14 +205,14 @@ class Block:
 
     def mark(self, packet: int) -> None:
         """Mark a packet as received."""
-        self.packets_received[packet] = 1
+        self.received[packet] = 1
         if packet == self.expected & PACKET_ID_BITS or (packet == 0 and self.highest == 0):
-            following = self.packets_received.find(0, packet + 1 if packet else 1)
+            following = self.received.find(0, packet + 1 if packet else 1)
             self.expected = PAYLOAD_KIND | (max(0, following))
         self.complete = (
             self.trailer is not None
             and self.leader is not None
-            and self.payloads_received == self.trailer - 1
+            and self.payloads == self.trailer - 1
         )
 
     def holes(self, most: int) -> list[tuple[int, int]]:
@@ -223,12 +223,12 @@ class Block:
         elif self.over:
             end = self._expected_packets() + 1
         holes: list[tuple[int, int]] = []
-        first = self.packets_received.find(0, 0, end + 1)
+        first = self.received.find(0, 0, end + 1)
         while first >= 0 and len(holes) < most:
-            past = self.packets_received.find(1, first, end + 1)
+            past = self.received.find(1, first, end + 1)
             last = end if past < 0 else past - 1
             holes.append((first, last))
-            first = self.packets_received.find(0, last + 1, end + 1)
+            first = self.received.find(0, last + 1, end + 1)
         return holes
 
     def _expected_packets(self) -> int:
@@ -246,20 +246,20 @@ class Block:
             return None
         rows = min(trailer_content.rows or leader.height, leader.height)
         need = picture_bytes(leader, rows)
-        trailer_place = (self.trailer - 1) * self.full
-        if self.trailer > 1 and self.packets_received[self.trailer - 1]:
-            trailer_place += self.last_size - self.full
-        trailer_place = min(trailer_place, trailer_content.length or trailer_place)
+        available = (self.trailer - 1) * self.full
+        if self.trailer > 1 and self.received[self.trailer - 1]:
+            available += self.last_size - self.full
+        available = min(available, trailer_content.length or available)
         if not rows or not leader.width or self.buffer is None:
             return None
-        if need > trailer_place and leader.payload_type != PayloadType.CHUNK:
+        if need > available and leader.payload_type != PayloadType.CHUNK:
             # for chunk data the size is from the features: a wrong size is reported, not counted as
             # lost
             return None
         stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x
-        data = self.buffer[: min(need, trailer_place)]
+        data = self.buffer[: min(need, available)]
         arrived = self.arrived if self.arrived is not None else 0.0
-        payload = self.buffer[:trailer_place] if leader.has_chunks else None
+        payload = self.buffer[:available] if leader.has_chunks else None
         return WholePicture(
             self.number, lost, leader, rows, stride, data, arrived, payload, self.block_id
         )

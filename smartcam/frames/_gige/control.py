@@ -121,8 +121,8 @@ class ControlChannel(asyncio.DatagramProtocol):
 
     async def write_register(self, address: int, value: int) -> None:
         """Write a register; errors as in :meth:`read_register`."""
-        operation = f"{address:#06x} = {value:#x}"
-        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, operation)
+        subject = f"{address:#06x} = {value:#x}"
+        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, subject)
 
     async def read(self, address: int, length: int) -> bytes:
         """Return bytes of the camera's memory; errors as in :meth:`read_register`."""
@@ -163,14 +163,16 @@ class ControlChannel(asyncio.DatagramProtocol):
             )
             self._transport.sendto(data)
 
-    async def request(self, command: GvcpCommand, payload: bytes, least: int, label: str) -> bytes:
+    async def request(
+        self, command: GvcpCommand, payload: bytes, least: int, subject: str
+    ) -> bytes:
         """Send a request and return the payload of the answer.
 
         Args:
             command: command of the request.
             payload: payload of the request.
             least: least number of bytes of the answer's payload.
-            label: subject of the request, for errors.
+            subject: subject of the request, for errors.
 
         Raises:
             FrameSourceError: the camera refuses, its answer is too short, or the channel is closed.
@@ -184,19 +186,19 @@ class ControlChannel(asyncio.DatagramProtocol):
             try:
                 self._expected = request_id
                 for _ in range(MAX_ATTEMPTS):
-                    ack = await self._send_once(datagram, command, label)
+                    ack = await self._send_once(datagram, command, subject)
                     if ack is not None:
-                        return self._checked_payload(ack, command, least, label)
+                        return self._checked_payload(ack, command, least, subject)
             finally:
                 self._expected = 0
                 self._drop_answers()
         raise FrameTimeoutError(
-            f"{self.source}: no answer to {command.name} {label} in "
+            f"{self.source}: no answer to {command.name} {subject} in "
             f"{MAX_ATTEMPTS} x {ANSWER_TIMEOUT:g} s",
             source=self.source,
         )
 
-    async def _send_once(self, datagram: bytes, command: GvcpCommand, label: str) -> Ack | None:
+    async def _send_once(self, datagram: bytes, command: GvcpCommand, subject: str) -> Ack | None:
         """Send a request; return its answer, or None if none comes in time."""
         if self._transport is None or self._transport.is_closing():
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
@@ -209,7 +211,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                     ack = await self._answers.get()
                     if isinstance(ack, OSError):
                         raise FrameSourceError(
-                            f"{self.source}: {command.name} {label}: nothing listens there that "
+                            f"{self.source}: {command.name} {subject}: nothing listens there that "
                             f"speaks GVCP: {ack}",
                             source=self.source,
                         ) from ack
@@ -220,18 +222,18 @@ class ControlChannel(asyncio.DatagramProtocol):
         except TimeoutError:
             return None
 
-    def _checked_payload(self, ack: Ack, command: GvcpCommand, least: int, label: str) -> bytes:
+    def _checked_payload(self, ack: Ack, command: GvcpCommand, least: int, subject: str) -> bytes:
         if ack.status != GvcpStatus.SUCCESS:
             raise RequestRefusedError(
-                f"{self.source}: {command.name} {label}: the camera answers "
+                f"{self.source}: {command.name} {subject}: the camera answers "
                 f"{status_text(ack.status)}",
                 source=self.source,
                 status=ack.status,
             )
         if ack.command != command + 1 or len(ack.payload) < least:
             raise FrameSourceError(
-                f"{self.source}: {command.name} {label}: expected an answer {command + 1:#06x} of "
-                f"{least} bytes, got {ack.command:#06x} of {len(ack.payload)}",
+                f"{self.source}: {command.name} {subject}: expected an answer {command + 1:#06x} "
+                f"of {least} bytes, got {ack.command:#06x} of {len(ack.payload)}",
                 source=self.source,
             )
         return ack.payload

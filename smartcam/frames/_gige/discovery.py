@@ -107,13 +107,13 @@ async def find(
     try:
         for place in places:
             with contextlib.suppress(OSError):  # an interface that is just going down
-                transport, asking = await loop.create_datagram_endpoint(
+                transport, search = await loop.create_datagram_endpoint(
                     functools.partial(_NetworkSearch, place),
                     local_addr=(place.address, 0),
                     allow_broadcast=True,
                 )
                 transports.append(transport)
-                searches.append(asking)
+                searches.append(search)
                 flags = ACK_REQUIRED | BROADCAST_ACK
                 for target in place.targets:
                     transport.sendto(

@@ -210,7 +210,7 @@ class EventChannel(asyncio.DatagramProtocol):
         async with self._lock:
             if watcher in self._watchers:
                 self._watchers.remove(watcher)
-            watched = {name for watcher in self._watchers for name in watcher.names}
+            watched = {name for other in self._watchers for name in other.names}
             if self._session.lost is None and self._transport is not None:
                 for name in watcher.names:
                     if name not in watched:

@@ -595,12 +595,12 @@ class GenicamFeatures:
             modes = _access(node)
             readable = readable and "WO" not in modes
             writable = writable and "RO" not in modes and node.kind not in _KNIVES
-            access = None
+            target = None
             if node.kind in (*_HOLDERS, *_CONVERTERS):
-                access = await self._target(node, depth)
-            if access is None:
+                target = await self._target(node, depth)
+            if target is None:
                 break
-            node = access
+            node = target
             if not await self._is_available(node, depth):
                 return ""
             writable = writable and not await self._condition(node, "pIsLocked", False, depth)
@@ -612,22 +612,20 @@ class GenicamFeatures:
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
-            unit_text = await self._noted(self._target(node, depth), problems)
-            if unit_text is None:
+            target = await self._noted(self._target(node, depth), problems)
+            if target is None:
                 return ""
-            node = unit_text
+            node = target
         return ""
 
     def _selected_by(self, name: str) -> tuple[str, ...]:
         """Return the features that select the instance of a feature."""
         if self._selectors is None:
-            names_by_selector: dict[str, list[str]] = {}
+            selectors: dict[str, list[str]] = {}
             for node in self._nodes.values():
                 for child in node.all("pSelected"):
-                    names_by_selector.setdefault(child.text, []).append(node.name)
-            self._selectors = {
-                selected: tuple(names) for selected, names in names_by_selector.items()
-            }
+                    selectors.setdefault(child.text, []).append(node.name)
+            self._selectors = {selected: tuple(names) for selected, names in selectors.items()}
         return self._selectors.get(name, ())
 
     # registers

@@ -82,7 +82,7 @@ async def force_address(
     interfaces = networks() if places is None else places
     cameras = await find(interfaces, port=port)
     camera = _of_mac(cameras, wanted)
-    taken = [camera for camera in cameras if camera.info.address == str(interface.ip)]
+    taken = [other for other in cameras if other.info.address == str(interface.ip)]
     if taken and taken[0].info.mac != wanted:
         raise ConfigurationError(
             f"address: {interface.ip} is the address of {taken[0].info.label} "
@@ -131,12 +131,12 @@ def _interface(address: str) -> ipaddress.IPv4Interface:
     return interface
 
 
-def _ip(text: str, label: str) -> ipaddress.IPv4Address:
-    given = check_text(text, label, "force_address", most=100)
+def _ip(text: str, name: str) -> ipaddress.IPv4Address:
+    given = check_text(text, name, "force_address", most=100)
     try:
         return ipaddress.IPv4Address(given.strip())
     except ValueError as exc:
-        raise ConfigurationError(f"{label}: expected an IPv4 address, got {given[:60]!r}") from exc
+        raise ConfigurationError(f"{name}: expected an IPv4 address, got {given[:60]!r}") from exc
 
 
 def _of_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:

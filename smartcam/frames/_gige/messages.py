@@ -143,13 +143,13 @@ class MessageFeatures(GenicamFeatures):
         """Return the number of the message with a feature's value."""
         waiting, seen = [name], set[str]()
         while waiting and len(seen) < MAX_REFERENCES:
-            waiting_node = waiting.pop()
-            node = self._nodes.get(waiting_node)
-            if node is None or waiting_node in seen:
+            reference = waiting.pop()
+            node = self._nodes.get(reference)
+            if node is None or reference in seen:
                 continue
-            seen.add(waiting_node)
-            if waiting_node in self._ports:
-                return self._ports[waiting_node]
+            seen.add(reference)
+            if reference in self._ports:
+                return self._ports[reference]
             waiting += [child.text for child in node.all(*_LEADS_TO_VALUE)]
         return None
 

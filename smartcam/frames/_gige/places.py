@@ -44,14 +44,14 @@ def wanted(address: FrameAddress) -> WantedStream:
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
     packet_size = given.get("packet_size", "auto")
-    rate = 0.0
+    size = 0.0
     if packet_size != "auto":
-        rate = address.number("packet_size", packet_size, *PACKET_SIZES)
+        size = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
         given,
         address.size(given["size"]) if "size" in given else None,
         address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
-        int(rate) & ~3,
+        int(size) & ~3,
         resend == "on",
         given.get("trigger"),
     )

@@ -137,7 +137,7 @@ async def _set_format(session: GigESession, name: str) -> None:
     for entry, number in entries.items():
         known = _format_of_code(number)
         names = [entry] if known is None else [entry, known.name, known.fourcc]
-        if name.upper() in (name.upper() for name in names):
+        if name.upper() in (spelling.upper() for spelling in names):
             await session.features.set("PixelFormat", entry)
             return
     raise FrameFormatError(
@@ -250,13 +250,13 @@ async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> fl
 # the stream channel
 
 
-async def connect(session: GigESession, where: StreamSocket, packet_size: int) -> int:
+async def connect(session: GigESession, where: StreamSocket, wanted: int) -> int:
     """Direct the camera's stream channel to a socket.
 
     Args:
         session: the camera.
         where: socket that receives the packets.
-        packet_size: number of bytes of a packet; 0: the largest that passes a test.
+        wanted: number of bytes of a packet; 0: the largest that passes a test.
 
     Returns:
         Number of bytes of an IP packet of the stream.
@@ -268,11 +268,7 @@ async def connect(session: GigESession, where: StreamSocket, packet_size: int) -
     address = int(ipaddress.IPv4Address(control.local_address))
     await control.write_register(Register.STREAM_DESTINATION, address)
     await control.write_register(Register.STREAM_PORT, where.port)
-    chosen = (
-        _requested_packet_size(session, packet_size)
-        if packet_size
-        else _largest_tested(session, where)
-    )
+    chosen = _requested_packet_size(session, wanted) if wanted else _largest_tested(session, where)
     size = await chosen
     if not size > IP_UDP_BYTES + EXTENDED_HEADER_BYTES:
         raise FrameSourceError(

@@ -110,7 +110,7 @@ async def set_trigger(features: GenicamFeatures, source: str) -> None:
         await features.set("TriggerMode", "Off")
         return
     sources = await features.entries("TriggerSource")
-    meant = {source.lower(): source for source in sources}.get(source.lower(), source)
+    meant = {known.lower(): known for known in sources}.get(source.lower(), source)
     # some cameras have a source only while the trigger is switched on
     await features.set("TriggerMode", "On")
     await features.set("TriggerSource", meant)

@@ -35,9 +35,9 @@ def opencv() -> Any:
 def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
     """Return the table's value for each sample, from a table of 256 values."""
     cv2 = opencv()
-    converted: NDArray[Any]
-    converted = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
-    return converted
+    values: NDArray[Any]
+    values = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
+    return values
 
 
 def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
@@ -94,8 +94,6 @@ def planes_to_rgb(
         merged = cv2.merge([y[band], *(part[: height - band.start, :width] for part in parts)])
         if spare:  # bits above the depth have no meaning
             cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
-        converted = cv2.transform(merged, weights)
-        colours[band] = (
-            cv2.threshold(converted, most, 0, cv2.THRESH_TRUNC)[1] if spare else converted
-        )
+        rgb = cv2.transform(merged, weights)
+        colours[band] = cv2.threshold(rgb, most, 0, cv2.THRESH_TRUNC)[1] if spare else rgb
     return colours

@@ -137,7 +137,7 @@ class RateControl:
         self._quality, self._fps = float(quality[0]), float(fps[1])
         self._rise = MAX_FIRST_RISE_PER_SECOND
         self._why: str = ""
-        self._reported_fps = self._fps
+        self._logged_fps = self._fps
         self._went: float | None = None
         # frame rate of the source, frames per second; 0: unknown
         self._comes = 0.0
@@ -231,7 +231,7 @@ class RateControl:
             elif self._quality >= best:
                 why = "the best quality"
         self._why = why
-        self._notify()
+        self._log_change()
 
     def _wanted(self) -> tuple[float, float, str]:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
@@ -249,7 +249,7 @@ class RateControl:
         size, _, name = min(limits)
         if size >= smallest:
             return size, most, name
-        fps = min(fps for time, fps, _ in limits if time < smallest)
+        fps = min(fps for limit, fps, _ in limits if limit < smallest)
         if fps < fewest:
             return size, fewest, f"{name}: no frame may be smaller, nor fewer"
         return size, min(most, fps), f"{name}, at the lowest quality"
@@ -257,13 +257,11 @@ class RateControl:
     def _bytes(self, quality: float) -> float:
         return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
 
-    def _notify(self) -> None:
-        back = self._fps == self._rates[1] != self._reported_fps
-        if (
-            back
-            or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._reported_fps < LOGGED_CHANGE_FACTOR
-        ):
-            self._reported_fps = self._fps
+    def _log_change(self) -> None:
+        back = self._fps == self._rates[1] != self._logged_fps
+        change = self._fps / self._logged_fps
+        if back or not 1 / LOGGED_CHANGE_FACTOR < change < LOGGED_CHANGE_FACTOR:
+            self._logged_fps = self._fps
             logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
 
 

@@ -96,9 +96,9 @@ class DeviceControl:
         text = value.strip()
         if self.kind == "boolean" and text.lower() in SWITCHES:
             return SWITCHES[text.lower()]
-        for entry, label in self.menu.items():
+        for number, label in self.menu.items():
             if simple(label) == simple(text) and not text.isdigit():
-                return entry
+                return number
         try:
             return int(text, 0)
         except ValueError:

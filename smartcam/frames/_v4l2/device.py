@@ -239,12 +239,9 @@ class CaptureDevice:
 
     def _check(self) -> None:
         """Check that the device captures pictures in a supported way."""
-        capability = self.capability
-        does = (
-            capability.device_caps
-            if capability.capabilities & abi.CAP_DEVICE_CAPS
-            else capability.capabilities
-        )
+        has = self.capability
+        by_device = has.capabilities & abi.CAP_DEVICE_CAPS
+        does = has.device_caps if by_device else has.capabilities
         if does & abi.CAP_VIDEO_CAPTURE and does & abi.CAP_STREAMING:
             return
         kind = next(

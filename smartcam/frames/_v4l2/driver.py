@@ -165,7 +165,7 @@ class V4L2Driver(FrameDriver):
         if watched is not None:
             asyncio.get_running_loop().remove_reader(watched)
 
-    async def _do(self, job: Callable[[], Value], label: str) -> Value:
+    async def _do(self, job: Callable[[], Value], action: str) -> Value:
         """Run a job in the thread, in the order of the calls.
 
         Cancellation: the job runs nevertheless, and the next :meth:`stop` cleans up.
@@ -177,7 +177,7 @@ class V4L2Driver(FrameDriver):
         finished, _ = await asyncio.wait([done], timeout=DEVICE_TIMEOUT)
         if not finished:
             raise FrameSourceError(
-                f"{self.name}: the device did not {label} within {DEVICE_TIMEOUT:g} s",
+                f"{self.name}: the device did not {action} within {DEVICE_TIMEOUT:g} s",
                 source=self.name,
             )
         return done.result()

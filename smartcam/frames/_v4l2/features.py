@@ -78,8 +78,8 @@ class ControlFeature:
     def __init__(self, control: DeviceControl) -> None:
         self.control = control
         known = SFNC.get(control.number)
-        self._sfnc_feature = known or SfncFeature(control.name)
-        entries = dict(self._sfnc_feature.entries)
+        self._sfnc = known or SfncFeature(control.name)
+        entries = dict(self._sfnc.entries)
         if self.name == "ExposureAuto" and 0 not in control.menu:
             entries[APERTURE_PRIORITY] = entries.pop(0)
         values = control.menu or entries
@@ -88,7 +88,7 @@ class ControlFeature:
     @property
     def name(self) -> str:
         """Name of the feature."""
-        return self._sfnc_feature.name
+        return self._sfnc.name
 
     @property
     def spellings(self) -> set[str]:
@@ -103,9 +103,7 @@ class ControlFeature:
             return self._entries.get(number, str(number))
         if self.control.kind == "boolean":
             return bool(number)
-        return (
-            number if self._sfnc_feature.factor == 1 else float(number * self._sfnc_feature.factor)
-        )
+        return number if self._sfnc.factor == 1 else float(number * self._sfnc.factor)
 
     def number(self, value: FeatureValue) -> int | None:
         """Return the control's number for a value; None: the device has no such value."""
@@ -113,12 +111,12 @@ class ControlFeature:
             wanted = spelled(str(value))
             names = self._entries.items()
             return next((number for number, name in names if spelled(name) == wanted), None)
-        if isinstance(value, float) and self._sfnc_feature.factor == 1:
+        if isinstance(value, float) and self._sfnc.factor == 1:
             return self.control.number_of(int(value)) if value.is_integer() else None
-        if not isinstance(value, float) and self._sfnc_feature.factor == 1:
+        if not isinstance(value, float) and self._sfnc.factor == 1:
             return self.control.number_of(value)
         try:
-            number = round(float(value) / self._sfnc_feature.factor)
+            number = round(float(value) / self._sfnc.factor)
         except (ValueError, OverflowError):
             return None
         inside = self.control.least <= number <= self.control.most
@@ -134,7 +132,7 @@ class ControlFeature:
         elif control.flags & abi.CTRL_WRITE_ONLY or control.kind == "button":
             access = "wo"
         kind: FeatureKind = "enumeration" if self._entries else _KINDS[control.kind]
-        factor = self._sfnc_feature.factor
+        factor = self._sfnc.factor
         if factor != 1:
             kind = "float"
         ranged = kind in ("integer", "float") and control.kind != "bitmask"
@@ -146,7 +144,7 @@ class ControlFeature:
             minimum=control.least * factor if ranged else None,
             maximum=control.most * factor if ranged else None,
             step=max(1, control.step) * factor if ranged else None,
-            unit=self._sfnc_feature.unit,
+            unit=self._sfnc.unit,
             entries=tuple(self._entries.values()),
             description=f"V4L2 control {control.name}",
         )

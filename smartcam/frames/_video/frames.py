@@ -203,10 +203,10 @@ def _with_supported_subsampling(video: Any, deep: int, *, alpha: bool) -> Any:
 
 def _chroma(video: Any) -> tuple[float, float]:
     """Return the ratios of the sizes of U and V to Y, measured on a large picture."""
-    kind, one_unit = video.format, 1 << 10
+    kind, side = video.format, 1 << 10
     return (
-        video.width * kind.chroma_width(one_unit) / one_unit,
-        video.height * kind.chroma_height(one_unit) / one_unit,
+        video.width * kind.chroma_width(side) / side,
+        video.height * kind.chroma_height(side) / side,
     )
 
 
@@ -235,9 +235,7 @@ def converted(video: Any, name: str) -> Any:
     kind, width = video.format, video.width
     wide = -(-width // RIGHT_WIDTH) * RIGHT_WIDTH
     padded = (
-        wide != width
-        and not kind.has_palette
-        and max(component.bits for component in kind.components) > 8
+        wide != width and not kind.has_palette and max(part.bits for part in kind.components) > 8
     )
     try:
         made = (_resized(video, wide) if padded else video).reformat(format=name)
@@ -335,10 +333,10 @@ def to_video(frame: Frame, before: Any = None) -> Any:
     video = _filled(frame, name)
     if name in ("yuv420p", "nv12"):
         return video
-    properties, space = colour_properties(frame.format)
-    to = LIMITED if name in ("rgb24", "bgr24") else properties
+    range_, space = colour_properties(frame.format)
+    to = LIMITED if name in ("rgb24", "bgr24") else range_
     made = video.reformat(
-        format="yuv420p", src_color_range=_RANGES[properties], dst_color_range=_RANGES[to]
+        format="yuv420p", src_color_range=_RANGES[range_], dst_color_range=_RANGES[to]
     )
     made.color_range, made.colorspace = to, space
     return made

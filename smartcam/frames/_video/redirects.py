@@ -60,7 +60,7 @@ def follow_redirects(
     end = time.monotonic() + timeout
     for _ in range(MAX_REDIRECTS):
         try:
-            answer = _first_answer(urlsplit(url), end, tls)
+            answer = _ask(urlsplit(url), end, tls)
         except TimeoutError:
             text = f"{name}: expected an answer, got none within {timeout:g} s"
             raise FrameSourceError(text, source=name) from None
@@ -117,7 +117,7 @@ def _place(parts: SplitResult) -> tuple[str, str, int]:
     return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
 
 
-def _first_answer(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
+def _ask(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
     """Send FFmpeg's first requests; return the first redirect, or the last answer.
 
     Raises:

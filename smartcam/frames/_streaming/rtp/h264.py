@@ -36,15 +36,15 @@ def units(access_unit: bytes) -> list[bytes]:
     place = data.find(b"\0\0\1")
     if place < 0 or data[:place].strip(b"\0"):
         raise _wrong("a start code first", data)
-    units_ready = []
+    nal_units = []
     while place >= 0:
         after = data.find(b"\0\0\1", place + 3)
         unit = data[place + 3 : after if after >= 0 else len(data)].rstrip(b"\0")
         if not unit or unit[0] & 0x80 or not 1 <= unit[0] & 0x1F < STAP_A:
             raise _wrong("units of kinds 1 to 23", unit)
-        units_ready.append(unit)
+        nal_units.append(unit)
         place = after
-    return units_ready
+    return nal_units
 
 
 def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
@@ -126,11 +126,11 @@ class H264Packetizer:
         self.octets_made += sum(map(len, payloads))
         return made
 
-    def _groups(self, units_ready: list[bytes]) -> Iterator[list[bytes]]:
+    def _groups(self, nal_units: list[bytes]) -> Iterator[list[bytes]]:
         """Yield groups of units for one packet: parameter sets and messages, as far as they fit."""
         group: list[bytes] = []
-        for unit in units_ready:
-            fits = 1 + sum(2 + len(unit_) for unit_ in (*group, unit)) <= self._mtu
+        for unit in nal_units:
+            fits = 1 + sum(2 + len(member) for member in (*group, unit)) <= self._mtu
             if group and (unit[0] & 0x1F in SLICES or not fits):
                 yield group
                 group = []

@@ -96,11 +96,11 @@ class JpegUnit(OpenUnit):
         if payload[4] in RESTARTS:
             restart, place = payload[place : place + 2], place + 4
         if not self._next:
-            tables = self._tables(payload, place)
-            if tables is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
+            read = self._tables(payload, place)
+            if read is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
                 return False
-            place, tables_found = tables
-            self.parts.append(self._head(payload, tables_found, restart))
+            place, tables = read
+            self.parts.append(self._head(payload, tables, restart))
         piece = payload[place:]
         self._next += len(piece)
         self.parts.append(piece)
@@ -119,12 +119,12 @@ class JpegUnit(OpenUnit):
         if not length:
             known = self._of.tables.get(quality)
             return None if known is None else (place, known)
-        table_values = cut(payload[place : place + length], wide)
-        if len(table_values) < 1 or place + length > len(payload):
+        tables = cut(payload[place : place + length], wide)
+        if len(tables) < 1 or place + length > len(payload):
             return None
         if quality < 255 and len(self._of.tables) < MAX_QUANTIZATION_TABLES:
-            self._of.tables[quality] = table_values
-        return place + length, table_values
+            self._of.tables[quality] = tables
+        return place + length, tables
 
     def _head(self, payload: bytes, tables: tuple[bytes, ...], restart: bytes) -> bytes:
         width, height = payload[6] * 8, payload[7] * 8

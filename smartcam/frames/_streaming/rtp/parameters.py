@@ -191,8 +191,7 @@ def _lines(
     yield f"a=fmtp:{payload_type} {'; '.join(parameters)}"
 
 
-def _wrong(codec: str, expected: str, actual: bytes) -> FrameFormatError:
+def _wrong(codec: str, expected: str, data: bytes) -> FrameFormatError:
     return FrameFormatError(
-        f"{codec}: expected {expected}, got {len(actual)} bytes that begin with "
-        f"{actual[:8].hex(' ')}"
+        f"{codec}: expected {expected}, got {len(data)} bytes that begin with {data[:8].hex(' ')}"
     )

@@ -314,15 +314,15 @@ class StreamReceiver:
         return self._depacketizer.tail() is not None
 
     def _ask(self, missing: list[int], now: float) -> None:
-        asked_at = self._requested_at
+        requested = self._requested_at
         due = [
             number
             for number in missing
-            if now - asked_at.get(number, float("-inf")) >= RESEND_INTERVAL
+            if now - requested.get(number, float("-inf")) >= RESEND_INTERVAL
         ]
         if due and self._reception is not None:
             self._requested_at = {
-                number: asked_at.get(number, now) for number in missing
+                number: requested.get(number, now) for number in missing
             } | dict.fromkeys(due, now)
             self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 

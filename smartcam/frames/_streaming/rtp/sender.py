@@ -207,8 +207,8 @@ class RtpSender:
             await self._codecs.__aenter__()
             link.pair.read(None, partial(self._reported, link))
             self._tasks = [
-                asyncio.create_task(work, name=f"{label} to {to}")
-                for work, label in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
+                asyncio.create_task(work, name=f"{protocol} to {to}")
+                for work, protocol in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
             ]
         except BaseException:
             self._link = None

@@ -279,11 +279,11 @@ class RtspConversation:
     def _none_of(
         self, tracks: tuple[VideoTrack, ...], others: tuple[str, ...], answer: ServerAnswer
     ) -> FrameFormatError:
-        actual = [
+        offered = [
             f"{'encrypted ' * track.secure}{track.encoding or track.payload_type}"
             for track in tracks
         ]
-        shown = ", ".join((*actual, *others)) or f"{len(answer.body)} bytes without a stream"
+        shown = ", ".join((*offered, *others)) or f"{len(answer.body)} bytes without a stream"
         kind = FrameFormatError
         if any(track.encoding and not track.secure for track in tracks):
             kind = OtherEncodingError

@@ -116,8 +116,8 @@ def _encoding(number: int, lines: list[str]) -> str:
 
 def _attribute(lines: list[str], name: str) -> str:
     begins = f"a={name}:"
-    value_line = next((line for line in lines if line.lower().startswith(begins)), begins)
-    return value_line[len(begins) :].strip()
+    line = next((line for line in lines if line.lower().startswith(begins)), begins)
+    return line[len(begins) :].strip()
 
 
 def _of_type(lines: list[str], name: str, number: int) -> str:

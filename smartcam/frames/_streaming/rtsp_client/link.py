@@ -99,8 +99,8 @@ class RtspLink(asyncio.Protocol):
         """End the link with a reason for :attr:`on_end`."""
         self._end(why)
 
-    def _of_socket(self, label: str) -> Any:
-        value = None if self._transport is None else self._transport.get_extra_info(label)
+    def _of_socket(self, name: str) -> Any:
+        value = None if self._transport is None else self._transport.get_extra_info(name)
         if not value:
             raise self._error(self.ended or "the connection is lost")
         return value
@@ -115,7 +115,7 @@ class RtspLink(asyncio.Protocol):
         """
         async with self._turn:
             for refusals in range(1, MAX_REFUSALS + 1):
-                answer = await self._request_bytes(method, url, headers or {}, body)
+                answer = await self._ask_once(method, url, headers or {}, body)
                 if answer.status != 401:
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
@@ -133,7 +133,7 @@ class RtspLink(asyncio.Protocol):
             cure = "wrong user or password"
         return self._error(f"{method}: 401 Unauthorized: {cure}")
 
-    async def _request_bytes(
+    async def _ask_once(
         self, method: str, url: str, headers: dict[str, str], body: bytes
     ) -> ServerAnswer:
         self._cseq += 1

@@ -57,8 +57,8 @@ class RtspParameters(DeviceFeatures):
         answer = await self._answered(READ, name, f"{name}\r\n")
         body = answer.body.decode(errors="replace")
         for line in body.splitlines():
-            given_name, colon, value = line.partition(":")
-            if colon and given_name.strip().lower() == name.lower():
+            key, colon, value = line.partition(":")
+            if colon and key.strip().lower() == name.lower():
                 return value.strip()
         actual = (
             f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
@@ -103,8 +103,8 @@ class RtspParameters(DeviceFeatures):
         }.get(answer.status, "it refuses that")
         raise self._wrong(name, f"{why}: {status}")
 
-    def _cannot(self, label: str) -> NoReturn:
-        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {label}")
+    def _cannot(self, action: str) -> NoReturn:
+        raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {action}")
 
     def _wrong(self, name: str, text: str) -> FrameFeatureError:
         shown = name[:MAX_SHOWN_CHARACTERS]
