@@ -57,15 +57,15 @@ class Normal(NamedTuple):
     mixed: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
-    def nothing(cls, shared: int, poses: int, extra: int) -> Normal:
+    def nothing(cls, shared: int, poses: int, per_pose: int) -> Normal:
         """Return the equations of no residuals."""
         return cls(
             0.0,
             np.zeros((shared, shared)),
             np.zeros(shared),
-            np.zeros((poses, extra, extra)),
-            np.zeros((poses, extra)),
-            np.zeros((poses, extra, shared)),
+            np.zeros((poses, per_pose, per_pose)),
+            np.zeros((poses, per_pose)),
+            np.zeros((poses, per_pose, shared)),
         )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:

@@ -422,16 +422,18 @@ class Chain:
         return solved
 
 
-def check_frames(localizations: Sequence[Localization], frame: str | None, label: str = "") -> None:
+def check_frames(
+    localizations: Sequence[Localization], frame: str | None, prefix: str = ""
+) -> None:
     """Raise WRONG_FRAME if a localization is in another frame than ``frame``; None allows any.
 
-    ``label`` begins the message.
+    ``prefix`` begins the message.
     """
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
         others = ", ".join(sorted(frames - {frame}))
         raise Code.WRONG_FRAME.refusal(
-            f"{label}expected poses in the frame {frame!r}, got some in {others!r}", frame, others
+            f"{prefix}expected poses in the frame {frame!r}, got some in {others!r}", frame, others
         )
 
 

@@ -105,7 +105,7 @@ class TargetView(storage.Stored):
         # Source: Hotelling, Relations Between Two Sets of Variates (1936).
         flat, seen = self.object_points[:, :2], self.points
         both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
-        spread = math.prod(float(np.linalg.det(rotation.T @ rotation)) for rotation in both)
+        spread = math.prod(float(np.linalg.det(points.T @ points)) for points in both)
         turn = float(np.linalg.det(both[0].T @ both[1]))
         return turn / math.sqrt(spread) if spread > 0 else math.nan
 
@@ -177,12 +177,12 @@ def as_covariances(values: Any, count: int, label: str) -> Array:
     )
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
-        value = covariances[wrong[0]].tolist()
+        matrix = covariances[wrong[0]].tolist()
         raise Code.NO_COVARIANCE.refusal(
-            f"{label}: expected symmetric matrices of no negative variance, got {value} in row "
+            f"{label}: expected symmetric matrices of no negative variance, got {matrix} in row "
             f"{wrong[0]}",
             "covariances",
-            value,
+            matrix,
         )
     return covariances
 

@@ -66,12 +66,12 @@ class Pieces(NamedTuple):
         chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= MAX_PART_OF_IMAGE * self.dark.size)
         chosen &= areas >= MIN_RECTANGLE_SHARE * wide * high
         chosen[0] = False
-        chosen_places = np.flatnonzero(chosen)
-        if len(chosen_places) > most:
-            chosen_places = chosen_places[np.argsort(areas[chosen_places])[-most:]]
+        picked = np.flatnonzero(chosen)
+        if len(picked) > most:
+            picked = picked[np.argsort(areas[picked])[-most:]]
         number = np.full(len(areas), -1, dtype=np.int32)
-        number[chosen_places] = np.arange(len(chosen_places))
-        pieces = self._selected(chosen_places)
+        number[picked] = np.arange(len(picked))
+        pieces = self._selected(picked)
         good = _filled(self, number, pieces)
         return Spots(pieces.points[good], pieces.areas[good])
 
@@ -83,8 +83,8 @@ class Pieces(NamedTuple):
         chosen[0] = False
         return self._selected(np.flatnonzero(chosen))
 
-    def _selected(self, places: NDArray[np.intp]) -> Spots:
-        middles, areas = self.middles[places], self.boxes[places, 4]
+    def _selected(self, which: NDArray[np.intp]) -> Spots:
+        middles, areas = self.middles[which], self.boxes[which, 4]
         return Spots(middles.astype(np.float64), areas.astype(np.float64))
 
 

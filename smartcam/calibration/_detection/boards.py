@@ -149,8 +149,8 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
         seen = find_saddles(reduced(image.bytes, times))
         largest: Lattice = {}
         grids = lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS)
-        for candidate_grid in grids:
-            largest = max(largest, candidate_grid, key=len)
+        for grid in grids:
+            largest = max(largest, grid, key=len)
             if len(largest) >= count:
                 break
         if largest:
@@ -171,19 +171,19 @@ def completed(image: GreyImage, board: Board) -> Board | None:
     sign = float(parity(sampled) @ signs)
     if abs(sign) < MIN_FITTED_SHARE * len(sampled):
         return None
-    places = board.places
+    recent = board.places
     for _ in range(MAX_ROUNDS):
         missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
         # a new corner beside an empty place may predict that place better
-        beside = np.abs(missing[:, None] - places).max(axis=2).min(axis=1, initial=2) <= 1
+        beside = np.abs(missing[:, None] - recent).max(axis=2).min(axis=1, initial=2) <= 1
         missing = missing[beside]
         points, signs = _fitted(image, board, missing)
         right = parity(missing) * signs * sign > 0
         if not right.any():
             break
-        places = missing[right]
+        recent = missing[right]
         board = Board(
-            np.concatenate([board.points, points[right]]), np.concatenate([board.places, places])
+            np.concatenate([board.points, points[right]]), np.concatenate([board.places, recent])
         ).trimmed()
     return board
 

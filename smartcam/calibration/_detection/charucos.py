@@ -259,12 +259,10 @@ def _between(
     detector = cv2.aruco.CharucoDetector(board, given)
     quads = [quad[None].astype(np.float32) for quad in markers.quads]
     numbers = markers.ids.astype(np.int32)[:, None]
-    corners, charuco_corners, *_ = detector.detectBoard(
-        bytes_, markerCorners=quads, markerIds=numbers
-    )
-    if charuco_corners is None or not len(charuco_corners):
+    corners, seen_ids, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
+    if seen_ids is None or not len(seen_ids):
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
-    ids = np.asarray(charuco_corners, dtype=np.intp).ravel()
+    ids = np.asarray(seen_ids, dtype=np.intp).ravel()
     points = np.array(corners, dtype=np.float64).reshape(-1, 2)
     at = np.asarray(board.getChessboardCorners(), dtype=np.float64)[ids, :2]
     flat = _map(board)[markers.ids]

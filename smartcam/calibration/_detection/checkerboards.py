@@ -296,7 +296,7 @@ def _number_part(
     the board that meet at the dot. So a place inside the board, or on another object, is not taken
     for its corner.
     """
-    numbers = []
+    numbered = []
     for arrangement in ways:
         if not arrangement.proper or _blackness(part, corners, arrangement) <= 0:
             continue
@@ -308,8 +308,8 @@ def _number_part(
             and light - shades.area >= MIN_ORIGIN_CONTRAST
             and light > middle
         ):
-            numbers.append((arrangement, light - shades.area))
-    return numbers[0] if len(numbers) == 1 else None
+            numbered.append((arrangement, light - shades.area))
+    return numbered[0] if len(numbered) == 1 else None
 
 
 def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:

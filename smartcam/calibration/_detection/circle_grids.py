@@ -298,13 +298,13 @@ def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
     """Return an error that reports the dots seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:
-        seen_grid = "saw more than these in rows and columns, as of a larger grid"
+        text = "saw more than these in rows and columns, as of a larger grid"
     else:
-        seen_grid = f"saw {seen.spots} dark spots and no such grid among them"
+        text = f"saw {seen.spots} dark spots and no such grid among them"
         if seen.largest:
-            seen_grid += f", at most {seen.largest} in rows and columns"
+            text += f", at most {seen.largest} in rows and columns"
     return Code.TARGET_NOT_FOUND.refusal(
-        f"circles: expected {target.columns} x {target.rows} dots, {seen_grid}",
+        f"circles: expected {target.columns} x {target.rows} dots, {text}",
         count,
         seen.largest or seen.spots,
     )

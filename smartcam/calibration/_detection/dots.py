@@ -84,8 +84,8 @@ class GridMap:
         self._scale = np.abs(flat - self._middle).max()
         self._bend = np.zeros((10, 2))
         if len(flat) >= MIN_DOTS_FOR_LENS and homography is not None:
-            distances = pixels - apply_homography(homography, flat)
-            self._bend[:] = np.linalg.lstsq(self._powers(flat), distances, rcond=None)[0]
+            deviations = pixels - apply_homography(homography, flat)
+            self._bend[:] = np.linalg.lstsq(self._powers(flat), deviations, rcond=None)[0]
 
     def _powers(self, flat: Array) -> Array:
         x, y = ((flat - self._middle) / self._scale).T
@@ -181,8 +181,8 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
     by_x, by_y = a * across + b * down, b * across + d * down
     steep = 1 / np.maximum(np.sqrt(by_x * by_x + by_y * by_y), np.float32(1e-6))
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
-    inward = (radius - 1) * steep * scale
-    shape, slope = edge(inward)
+    outward = (radius - 1) * steep * scale
+    shape, slope = edge(outward)
     slope = slope * weights
     rise = slope * steep
     product = shape * weights
@@ -192,7 +192,7 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
         rise * across * x,
         rise * (across * y + down * x),
         rise * down * y,
-        slope * inward,
+        slope * outward,
         product,
         weights,
     )

@@ -175,15 +175,15 @@ class _Grown:
                 for side, fits in enumerate(sides):
                     column, row = _AROUND[side]
                     neighbour = (place[0] + column, place[1] + row)
-                    free = next((fit for fit in fits if fit not in taken), None)
+                    free = next((near for near in fits if near not in taken), None)
                     if free is None or neighbour in places:
                         continue
                     places[neighbour] = free
                     taken.add(free)
                     step = steps.copy()
                     step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
-                    is_free = bool(self._alike(np.array(free), np.array(like)))
-                    reached.append((neighbour, free, step, free if is_free else like))
+                    is_alike = bool(self._alike(np.array(free), np.array(like)))
+                    reached.append((neighbour, free, step, free if is_alike else like))
         return places
 
     def complete(self, places: Lattice, most: int) -> None:

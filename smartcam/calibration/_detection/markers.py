@@ -113,7 +113,7 @@ def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = 
     given = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
     if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
-        window = sorted(WINDOWS_PX, key=lambda place: len(lengths[place]))[len(WINDOWS_PX) // 2]
+        window = sorted(WINDOWS_PX, key=lambda side: len(lengths[side]))[len(WINDOWS_PX) // 2]
         given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
         if len(longest) > MAX_OUTLINES:
@@ -213,7 +213,7 @@ def _slopes(quads: Array, flat: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
     around = flat - flat.mean(axis=1, keepdims=True)
     seen = quads - quads.mean(axis=1, keepdims=True)
-    squares = (around**2).sum(axis=(1, 2)) / 2  # offsets of a square's corners, equal along x and y
+    squares = (around**2).sum(axis=(1, 2)) / 2  # sums over the corners, equal along x and y
     slopes: Array = seen.transpose(0, 2, 1) @ around / squares[:, None, None]
     return slopes
 

@@ -112,8 +112,8 @@ def _steps_to_saddles(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Arr
 
 def _comes_twice(levels: Array) -> NDArray[np.bool_]:
     """Return True for each circle (N, 16) with two like halves, each of a dark and a light part."""
-    levels_here, opposite = levels[:, :8], levels[:, 8:]
-    common, apart = (levels_here + opposite) / 2, (levels_here - opposite) / 2
+    first, opposite = levels[:, :8], levels[:, 8:]
+    common, apart = (first + opposite) / 2, (first - opposite) / 2
     middle = (common.max(axis=1) + common.min(axis=1)) / 2
     light = common > middle[:, None]
     changes = (light != np.roll(light, 1, axis=1)).sum(axis=1)

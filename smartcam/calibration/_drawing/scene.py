@@ -129,13 +129,13 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         [
             *(board.corners for board in scene.boards),
             *(np.atleast_2d(camera.pose.translation) for camera in scene.cameras),
-            *(np.atleast_2d(axis.pose.translation) for axis in scene.axes),
+            *(np.atleast_2d(axes.pose.translation) for axes in scene.axes),
         ]
     )
     extent = float(np.ptp(places, axis=0).max()) or 1.0
     length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
     shapes = [_frustum(camera, length) for camera in scene.cameras]
-    ends = [axis.pose.apply(ARROW * extent * np.eye(3)) for axis in scene.axes]
+    ends = [axes.pose.apply(ARROW * extent * np.eye(3)) for axes in scene.axes]
     sight = _ViewerProjection(scene, np.concatenate([places, *shapes, *ends]))
     items = [
         _Drawn(

@@ -229,7 +229,7 @@ def calibrate_hand_eye(
         robot=robot,
         seen=seen,
         poses=poses,
-        given=_checked_views(ordered),
+        given=_given_points(ordered),
         sigmas=_positive(robot_sigmas),
         lens=None if lens_calibration is None else lens_calibration.covariance,
     )
@@ -384,7 +384,7 @@ def _numbered_alike(
     ]
 
 
-def _checked_views(views: Sequence[TargetView]) -> Any:
+def _given_points(views: Sequence[TargetView]) -> Any:
     counts = np.array([len(view.ids) for view in views])
     return np.arange(counts.max())[None] < counts[:, None]
 
@@ -396,7 +396,7 @@ def _observations(
     residuals = np.concatenate([view.residuals for view in located])
     noise = np.concatenate([view.covariance for view in views])
     more = excess(residuals, noise, residuals.size - 6 * len(views))
-    given = _checked_views(views)
+    given = _given_points(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))
     for index, view in enumerate(views):

@@ -284,7 +284,7 @@ def bends(points: Array, given: Mask) -> Array:
     x, y = np.moveaxis((points[..., :2] - seen.mean(axis=0)) / np.ptp(seen, axis=0), 2, 0)
     known = [np.ones_like(x), x, y]
     for bend in (x * x, x * y, y * y):
-        before = np.stack([bend[given] for bend in known], axis=1)
+        before = np.stack([column[given] for column in known], axis=1)
         unexplained = bend[given] - before @ np.linalg.lstsq(before, bend[given], rcond=None)[0]
         if np.linalg.norm(unexplained) > MIN_OWN_SHARE_OF_BEND * np.linalg.norm(bend[given]):
             known.append(bend)
@@ -366,9 +366,9 @@ def sums(
     # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
     # it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J v.
     inner[:, :, :3] = inner[:, :, :3] @ right_jacobian(at.corrections[:, :3])
-    corrections = slopes[:, :, :6] @ inner
-    before = residuals[..., None] - corrections @ at.corrections[..., None]
-    rows = np.concatenate([corrections, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
+    by_pose = slopes[:, :, :6] @ inner
+    before = residuals[..., None] - by_pose @ at.corrections[..., None]
+    rows = np.concatenate([by_pose, slopes[:, :, :6] @ outer, slopes[:, :, 6:], before], axis=2)
     # Of residuals r = J w + e only the part in the columns of J depends on the pose: Q^T r, J = Q
     # R.
     if poses_only:
@@ -400,14 +400,14 @@ def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float
 def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
     """Return the equations of a step; ``X``, ``Z`` and the other parameters are shared."""
     cost, matrix, right = _by_view(robot, seen, at)
-    correction, motion = slice(0, 6 if at.noise else 0), slice(6, None)
+    correction, shared = slice(0, 6 if at.noise else 0), slice(6, None)
     return Normal(
         cost,
-        matrix[:, motion, motion].sum(axis=0),
-        right[:, motion].sum(axis=0),
+        matrix[:, shared, shared].sum(axis=0),
+        right[:, shared].sum(axis=0),
         matrix[:, correction, correction],
         right[:, correction],
-        matrix[:, correction, motion],
+        matrix[:, correction, shared],
     )
 
 
@@ -466,13 +466,13 @@ def without_each(robot: RobotPoses, seen: Observations, solution: Solution) -> S
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 5.2.
     spread = seen if solution.noise is None else seen.spread(solution.noise.shared)
     _, matrix, right = _by_view(robot, spread, solution)
-    correction, motion = slice(0, 6 if solution.noise else 0), slice(6, None)
-    mixed = np.swapaxes(matrix[:, correction, motion], 1, 2)
-    both = np.concatenate([matrix[:, correction, motion], right[:, correction, None]], axis=2)
+    correction, shared = slice(0, 6 if solution.noise else 0), slice(6, None)
+    mixed = np.swapaxes(matrix[:, correction, shared], 1, 2)
+    both = np.concatenate([matrix[:, correction, shared], right[:, correction, None]], axis=2)
     solved = mixed @ np.linalg.solve(matrix[:, correction, correction], both)
     matrices, rights = (
-        matrix[:, motion, motion] - solved[..., :-1],
-        right[:, motion] - solved[..., -1],
+        matrix[:, shared, shared] - solved[..., :-1],
+        right[:, shared] - solved[..., -1],
     )
     left, rights = matrices.sum(axis=0) - matrices, rights.sum(axis=0) - rights
     steps = np.stack([solve_scaled(*system) for system in zip(left, rights, strict=True)])
@@ -493,9 +493,9 @@ def pull(robot: RobotPoses, seen: Observations, at: Solution, numbers: tuple[int
     change[: seen.extra] = at.change
     spread = freed if at.noise is None else freed.spread(at.noise.shared)
     corrections = at.corrections if at.corrections.size else none
-    point = dataclasses.replace(at, change=change, corrections=corrections)
-    normal, fitted = _normal(robot, spread, point).reduced()[0], 12 + seen.extra
-    slopes: Array = -solve_scaled(normal[:fitted, :fitted], normal[:fitted, fitted:])[:12]
+    begin = dataclasses.replace(at, change=change, corrections=corrections)
+    matrix, fitted = _normal(robot, spread, begin).reduced()[0], 12 + seen.extra
+    slopes: Array = -solve_scaled(matrix[:fitted, :fitted], matrix[:fitted, fitted:])[:12]
     return slopes
 
 

@@ -139,12 +139,7 @@ class Problem:
         points = np.reshape(scales, (-1, 1, 1)) * self.seen.points
         if each and any(self.seen.free):
             one_each = zip(change, self.seen.pixels, strict=True)
-            rays = np.stack(
-                [
-                    self.seen.camera(change_and_seen).directions(seen)
-                    for change_and_seen, seen in one_each
-                ]
-            )
+            rays = np.stack([self.seen.camera(step).directions(seen) for step, seen in one_each])
         else:
             camera = self.seen.camera(change[0] if each else change)
             rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(
@@ -235,15 +230,13 @@ class Candidate:
         # K). Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
         # Number of Observations is Large (1943).
         mixed = information[:12, 12:]
-        information_of_extra = information[12:, 12:] - mixed.T @ solve_scaled(
-            information[:12, :12], mixed
-        )
+        reduced = information[12:, 12:] - mixed.T @ solve_scaled(information[:12, :12], mixed)
         if beside:
-            across = information_of_extra[:count, count:]
-            information_of_extra = information_of_extra[:count, :count] - across @ solve_scaled(
-                information_of_extra[count:, count:], across.T
+            across = reduced[:count, count:]
+            reduced = reduced[:count, :count] - across @ solve_scaled(
+                reduced[count:, count:], across.T
             )
-        squares = float(change[:count] @ information_of_extra @ change[:count])
+        squares = float(change[:count] @ reduced @ change[:count])
         if not math.isfinite(squares):
             return 1.0
         # half of the equations each determine one of the robot's two sigmas
@@ -319,9 +312,8 @@ def _robots(
 ) -> list[Candidate]:
     """Return candidates that correct the robot's poses, one for each choice of free values."""
     tried: list[Candidate] = []
-    elsewhere = (
-        _begin_of_another_size(problem) if any(0 in freed for freed in free.values()) else None
-    )
+    any_size = any(0 in numbers for numbers in free.values())
+    elsewhere = _begin_of_another_size(problem) if any_size else None
     for besides, numbers in free.items():
         freed = _freed(problem, numbers)
         start = tried[0].solution if tried and tried[0].besides == NOTHING else begin
@@ -396,11 +388,11 @@ def _begin(problem: Problem) -> Solution | None:
     """Return the closed form that fits best."""
     ranked = []
     for number, name in enumerate(LINEAR):
-        candidate = _closed(problem, name, exactly=False)
-        if candidate is not None:
-            errors = np.concatenate(problem.errors(candidate))
-            ranked.append((float(np.median(errors)), number, candidate))
-    ranked = [cost_and_start for cost_and_start in ranked if math.isfinite(cost_and_start[0])]
+        solution = _closed(problem, name, exactly=False)
+        if solution is not None:
+            errors = np.concatenate(problem.errors(solution))
+            ranked.append((float(np.median(errors)), number, solution))
+    ranked = [entry for entry in ranked if math.isfinite(entry[0])]
     return min(ranked)[2] if ranked else None
 
 
@@ -444,12 +436,9 @@ def _by_closed_form(problem: Problem, name: str, solution: Solution) -> Candidat
         other = _closed(problem.taken(numbers[part != fold]), name)
         if other is None:
             return candidate
-        others = [
-            other if part[i] == fold else other_solution for i, other_solution in enumerate(others)
-        ]
+        others = [other if part[i] == fold else before for i, before in enumerate(others)]
     candidate.others = Solution(
-        Rigid.stacked(solution_left.camera for solution_left in others),
-        Rigid.stacked(solution_left.target for solution_left in others),
+        Rigid.stacked(left.camera for left in others), Rigid.stacked(left.target for left in others)
     )
     candidate.off = problem.off(candidate.others)
     return candidate

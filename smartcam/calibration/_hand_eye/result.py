@@ -105,14 +105,11 @@ class HandEyeCalibration(storage.SavedCalibration):
     _others: ClassVar[storage.Others] = {
         "frames": (
             FRAMES,
-            lambda calibration: (
-                calibration.robot_poses[0].target,
-                calibration.robot_poses[0].source,
-            ),
+            lambda result: (result.robot_poses[0].target, result.robot_poses[0].source),
         ),
         "target": (
             storage.StoredTarget | None,
-            lambda calibration: calibration.views[0].target if calibration.views else None,
+            lambda result: result.views[0].target if result.views else None,
         ),
     }
     _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
@@ -151,8 +148,8 @@ class HandEyeCalibration(storage.SavedCalibration):
                 called, f"views: expected {count}, and their target", len(self.views)
             )
         if self.covariance.shape != (12, 12):
-            size = len(self.covariance)
-            raise storage.refused(called, "covariance: expected 12 rows of 12", size)
+            rows = len(self.covariance)
+            raise storage.refused(called, "covariance: expected 12 rows of 12", rows)
 
     @property
     def target(self) -> Target | None:
@@ -313,8 +310,8 @@ class HandEyeCalibration(storage.SavedCalibration):
         between = robot_pose.inverse() if in_hand else robot_pose
         seen = self.camera_pose.inverse() @ between @ self.target_pose
         if isinstance(view, Transform):
-            distances = seen.translation - self.target_scale * view.translation
-            return np.array([float(np.linalg.norm(distances))])
+            offset = seen.translation - self.target_scale * view.translation
+            return np.array([float(np.linalg.norm(offset))])
         lens = self._lens("point_errors")
         check_view(view, lens.size)
         if self.views and view.target != self.views[0].target:
@@ -323,12 +320,13 @@ class HandEyeCalibration(storage.SavedCalibration):
                 self.views[0].target,
                 view.target,
             )
-        errors_of_views = [
-            point_errors(lens, seen.rigid, turned.points, self.target_scale * turned.object_points)
-            for turned in (view, *([half_turned(view)] if view.target.half_turn_symmetric else []))
+        ways = (view, half_turned(view)) if view.target.half_turn_symmetric else (view,)
+        both = [
+            point_errors(lens, seen.rigid, shown.points, self.target_scale * shown.object_points)
+            for shown in ways
         ]
-        errors = min(errors_of_views, key=lambda view_errors: float(np.median(view_errors)))
-        return errors if errors is errors_of_views[0] else errors[::-1]
+        errors = min(both, key=lambda view_errors: float(np.median(view_errors)))
+        return errors if errors is both[0] else errors[::-1]
 
     @property
     def _flange(self) -> str:

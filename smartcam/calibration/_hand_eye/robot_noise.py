@@ -130,8 +130,8 @@ def _unlikely(total: Array, values: Array) -> float:
     scaled[:, :6] *= spread[:, None]
     scaled[:, :, :6] *= spread
     inner = scaled[:, :6, :6] + np.eye(6)
-    unlikely = scaled[:, 6:, 6:] - scaled[:, 6:, :6] @ np.linalg.solve(inner, scaled[:, :6, 6:])
-    reduced = unlikely.sum(axis=0)
+    left = scaled[:, 6:, 6:] - scaled[:, 6:, :6] @ np.linalg.solve(inner, scaled[:, :6, 6:])
+    reduced = left.sum(axis=0)
     outer, right = reduced[:-1, :-1], reduced[:-1, -1]
     squares = float(reduced[-1, -1] - right @ solve_scaled(outer, right))
     determinants += float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(outer)[1])

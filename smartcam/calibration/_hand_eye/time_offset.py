@@ -146,19 +146,19 @@ class _Moving:
         """Return the sigma of an offset if all errors were noise; infinite if none is better."""
         # The minimum x of a mean square m + c x^2 of n values with noise m has the variance m/cn.
         step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -offset)
-        least, beside = (self.error(time, index) ** 2 for time in (offset, offset + step))
+        least, beside = (self.error(lag, index) ** 2 for lag in (offset, offset + step))
         rise = (beside - least) / step**2
         return math.sqrt(least / (rise * 6 * len(index))) if rise > 0 else math.inf
 
     def best(self, index: NDArray[np.intp]) -> float:
         """Return the best offset of the whole range."""
         tried = np.linspace(-self._most, self._most, COARSE_STEPS)
-        return self.refined(index, min(tried.tolist(), key=lambda time: self.error(time, index)))
+        return self.refined(index, min(tried.tolist(), key=lambda lag: self.error(lag, index)))
 
     def refined(self, index: NDArray[np.intp], start: float) -> float:
         """Return the best offset near a given one."""
         step = 2.0 * self._most / (COARSE_STEPS - 1)
         low, high = max(start - step, -self._most), min(start + step, self._most)
         search = load("scipy.optimize").minimize_scalar
-        minimum = search(lambda time: self.error(time, index), bounds=(low, high), method="bounded")
+        minimum = search(lambda lag: self.error(lag, index), bounds=(low, high), method="bounded")
         return float(minimum.x)

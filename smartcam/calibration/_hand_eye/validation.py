@@ -178,11 +178,11 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
     """
     least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
     for numbers, name in itertools.product(_parts(poses.size), CLOSED_FORMS):
-        renumbered = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
-        if renumbered is None:
+        solution = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
+        if solution is None:
             continue
-        expected = carried(renumbered[0], robot, renumbered[1])
-        as_is, turned = (_apart(turned, expected, arm) for turned in (poses, poses @ turn))
+        expected = carried(solution[0], robot, solution[1])
+        as_is, turned = (_apart(seen, expected, arm) for seen in (poses, poses @ turn))
         middle = float(np.median(np.minimum(as_is, turned)))
         if middle < least:
             least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
@@ -216,8 +216,8 @@ def check_poses(problem: Problem) -> Agreed:
     Raises ``WRONG_FRAME`` or ``MIRRORED`` if the poses fit far better when they are read otherwise,
     and ``POOR_FIT`` if they do not fit at all.
     """
-    agreement_found = agreement(problem)
-    error = math.inf if agreement_found is None else _on_target(problem, agreement_found)
+    as_given = agreement(problem)
+    error = math.inf if as_given is None else _on_target(problem, as_given)
     for robot, clear, code, how in _readings(problem.robot):
         other = dataclasses.replace(problem, robot=robot)
         agreed = agreement(other)
@@ -233,22 +233,23 @@ def check_poses(problem: Problem) -> Agreed:
                 less,
             )
     most = most_error(problem)
-    if agreement_found is None or error > most:
+    if as_given is None or error > most:
         so = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
         raise poor_fit(f"{so}, {1e3 * most:.3g} mm at most expected", error)
-    return agreement_found
+    return as_given
 
 
-def poor_fit(label: str, error: float | None) -> CalibrationError:
+def poor_fit(actual: str, error: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
-    ``label``: description of what came instead. ``error``: error of the target, metres; None if
+    ``actual``: what was got instead. ``error``: error of the target, metres; None if
     it is not known.
     """
     return Code.POOR_FIT.refusal(
-        f"hand-eye: expected a camera that sees the target where it is, got {label}: are the poses "
-        "those of the views, in their order and in metres, are their angles in the convention that "
-        "was read, is the setup right, and is the target numbered from the same end in all views?",
+        f"hand-eye: expected a camera that sees the target where it is, got {actual}: are the "
+        "poses those of the views, in their order and in metres, are their angles in the "
+        "convention that was read, is the setup right, and is the target numbered from the same "
+        "end in all views?",
         got=error,
     )
 

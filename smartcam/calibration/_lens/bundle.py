@@ -127,10 +127,8 @@ class Bundle:
         """Return the bundle after steps of the shared unknowns (S,) and of the poses (P, 6)."""
         columns = self.lens_columns
         cameras = tuple(
-            with_lens(camera, lens_values(camera) + basis @ shared[values])
-            if basis.size
-            else camera
-            for camera, basis, values in zip(self.cameras, self.basis, columns, strict=True)
+            with_lens(camera, lens_values(camera) + basis @ shared[part]) if basis.size else camera
+            for camera, basis, part in zip(self.cameras, self.basis, columns, strict=True)
         )
         rig, points = self.rig, self.points
         if not self.rigid and rig.size:
@@ -307,8 +305,8 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
 
     ``left_out``: all poses, each once.
     """
-    changes = [adjusted.bundle.camera_changes(pose.bundle) for pose in left_out]
-    spreads = np.array([pose.by_noise for pose in left_out])
+    changes = [adjusted.bundle.camera_changes(left.bundle) for left in left_out]
+    spreads = np.array([left.by_noise for left in left_out])
     return weighed_jackknife(np.array(changes), spreads, adjusted.by_noise, WEIGHT_POWER)
 
 
@@ -396,14 +394,11 @@ class BundleEquations:
                 normal.mixed[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and self._prior is not None:
             # minimise also |p - nominal|^2 / loose^2, and the same of the whole sheet: see _prior
-            rows_of_pose, misses = (
-                slice(bundle.of_cameras, bundle.shared),
-                bundle.points - self._meant,
-            )
-            pull = self._prior @ misses.ravel()
-            matrix[rows_of_pose, rows_of_pose] += self._prior
-            right[rows_of_pose] -= pull
-            cost += float(misses.ravel() @ pull)
+            sheet, shift = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant
+            pull = self._prior @ shift.ravel()
+            matrix[sheet, sheet] += self._prior
+            right[sheet] -= pull
+            cost += float(shift.ravel() @ pull)
         return normal._replace(cost=cost if math.isfinite(cost) else math.inf)
 
     def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
@@ -432,12 +427,12 @@ class BundleEquations:
 
 def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     """Return the residuals of each view (N, 2), seen minus projected, pixels."""
-    residual_parts = []
+    per_view = []
     for number, pose, view in sights:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]
-        points_seen = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
-        residual_parts.append(view.points - bundle.cameras[number].project(points_seen))
-    return residual_parts
+        in_camera = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
+        per_view.append(view.points - bundle.cameras[number].project(in_camera))
+    return per_view
 
 
 def _prior(nominal: Array) -> Array:

@@ -66,17 +66,17 @@ class Lens(NamedTuple):
     views: int = 1
 
     @classmethod
-    def of(cls, calibration: IntrinsicCalibration | CameraModel) -> Lens:
+    def of(cls, given: IntrinsicCalibration | CameraModel) -> Lens:
         """Return the lens of a calibration, or a bare lens; raise ``SHAPE`` for anything else."""
-        if isinstance(calibration, IntrinsicCalibration):
-            views = sum(fit.used for fit in calibration.views)
-            return cls(calibration.camera, calibration.covariance, calibration.target_points, views)
-        if isinstance(calibration, CameraModel):
-            return cls(calibration)
+        if isinstance(given, IntrinsicCalibration):
+            views = sum(fit.used for fit in given.views)
+            return cls(given.camera, given.covariance, given.target_points, views)
+        if isinstance(given, CameraModel):
+            return cls(given)
         raise Code.SHAPE.unexpected(
             "compare: expected calibrations of lenses, or camera models",
             "IntrinsicCalibration or CameraModel",
-            type(calibration).__name__,
+            type(given).__name__,
         )
 
 
@@ -241,11 +241,7 @@ def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     image's centre: in corners without any view, lenses may project so differently that the camera
     would seem turned.
     """
-    finite = [
-        (calibration.camera, calibration.points)
-        for calibration in (a, b)
-        if calibration.points is not None
-    ]
+    finite = [(lens.camera, lens.points) for lens in (a, b) if lens.points is not None]
     if not finite:
         size = np.array(a.camera.size, dtype=np.float64)
         pixels = places(a.camera.size, SHAPE).reshape(-1, 2)

@@ -147,7 +147,7 @@ def suggest_views(
 
 def _variance(calibration: IntrinsicCalibration) -> float:
     """Return the variance of a coordinate in the views so far, pixels^2."""
-    sigmas = np.concatenate([view.view.sigmas for view in calibration.views if view.used])
+    sigmas = np.concatenate([fit.view.sigmas for fit in calibration.views if fit.used])
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
@@ -167,7 +167,7 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it
     comes from the views' scatter, the rest from the noise of the points times that ratio.
     """
-    used = [view for view in calibration.views if view.used]
+    used = [fit for fit in calibration.views if fit.used]
     points = None
     if calibration.sheet is not None:
         points = used[0].view.target.points + calibration.sheet
@@ -226,7 +226,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
     turned = around @ rotations.swapaxes(1, 2)
-    fills, parts = np.array([tilt[0] for tilt in ways]), np.array([tilt[2:0:-1] for tilt in ways])
+    fills, parts = np.array([fill for fill, *_ in ways]), np.array([[u, v] for _, v, u, _ in ways])
     shifts = _placed(camera, turned, fills, parts)
     poses = Rigid(rotations, shifts - rotations @ centre)
     good = _visible(camera, turned + shifts[:, None])

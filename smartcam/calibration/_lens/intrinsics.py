@@ -162,7 +162,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(view.view, number) for number, view in enumerate(self.views) if not view.used
+            label(fit.view, number) for number, fit in enumerate(self.views) if not fit.used
         )
 
     def uncertainty(
@@ -192,7 +192,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def target_points(self) -> Array:
         """Places of the target's points in the camera's frame, all used views, (N, 3), metres."""
         return np.concatenate(
-            [view.transform.apply(view.view.object_points) for view in self.views if view.used]
+            [fit.transform.apply(fit.view.object_points) for fit in self.views if fit.used]
         )
 
     def point_errors(self, views: Sequence[TargetView]) -> tuple[Array, ...]:
@@ -230,8 +230,8 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def _check(self, fields: Mapping[str, Any], called: str) -> None:
         count = 4 + len(self.camera.distortion)
         storage.check_shape(self.covariance, (count, count), called, "covariance")
-        for view in self.views:
-            storage.check_shape(view.residuals, view.view.points.shape, called, "residuals")
+        for fit in self.views:
+            storage.check_shape(fit.residuals, fit.view.points.shape, called, "residuals")
         if self.sheet is not None:
             storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
@@ -333,8 +333,8 @@ def _numbered_alike(
     calibration is ``calibration``.
     """
     # Shape and numbers are fitted in turn, which only lowers the squares: Lloyd, as for flips.
-    views = [view.view for view in calibration.views]
-    used = [number for number, view in enumerate(calibration.views) if view.used]
+    views = [fit.view for fit in calibration.views]
+    used = [number for number, fit in enumerate(calibration.views) if fit.used]
     bad = sorted(set(range(len(views))) - set(used))
     numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
     shaped = calibration
@@ -391,8 +391,8 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         common, first, second = np.intersect1d(views[0].ids, view.ids, return_indices=True)
         if not len(common):
             return
-        distances = views[0].points[first] - view.points[second]
-        largest = max(largest, float(np.linalg.norm(distances, axis=1).max()))
+        moves = views[0].points[first] - view.points[second]
+        largest = max(largest, float(np.linalg.norm(moves, axis=1).max()))
     if largest < least:
         raise Code.POSES_TOO_SIMILAR.refusal(
             f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "

@@ -172,8 +172,8 @@ class Reduced(NamedTuple):
         # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
         for sums_matrix, side in zip(self.matrix, self.right, strict=True) if places else ():
-            reduced = sums_matrix[np.ix_(places, places)]
-            both = solve_scaled(reduced, np.column_stack([sums_matrix[places], side[places]]))
+            block = sums_matrix[np.ix_(places, places)]
+            both = solve_scaled(block, np.column_stack([sums_matrix[places], side[places]]))
             matrix = matrix - sums_matrix[:, places] @ both[:, :-1]
             right = right - sums_matrix[:, places] @ both[:, -1]
             squares = squares - side[places] @ both[:, -1]
@@ -229,8 +229,8 @@ class _Misfit:
         """``free`` (COUNT,): mask of the values that were fitted."""
         self.reduced = Reduced.of(equations)
         self._count, views = sum(equation.residuals.size for equation in equations), len(equations)
-        adjusted = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
-        self.usual, bends = free & adjusted, adjusted.copy()
+        determined = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
+        self.usual, bends = free & determined, determined.copy()
         self.usual[SHEET], bends[: IMAGE.start] = True, False
         best = self.reduced.best
         explained = {
@@ -240,8 +240,8 @@ class _Misfit:
         }
         self._before = best(self.usual)[1]
         self._best = min(
-            self.score(*score_and_count)
-            for score_and_count in [(self._before, 0), *explained.values()]
+            self.score(squares, count)
+            for squares, count in [(self._before, 0), *explained.values()]
         )
         self._others = ", ".join(
             f"{name} {self._before / max(after, 1e-300):.3g}"
@@ -283,7 +283,7 @@ class _Misfit:
         for first in range(2, len(names) - 1):
             parts = [slice(None, first), slice(first, None)]
             sums = Reduced(
-                *(np.array([part[mask].sum(axis=0) for mask in parts]) for part in self.reduced)
+                *(np.array([part[span].sum(axis=0) for span in parts]) for part in self.reduced)
             )
             tried += [
                 (sums.best(self.usual, places)[1], first, how) for how, places in changes.items()
@@ -294,8 +294,8 @@ class _Misfit:
             return
         alike = [
             how
-            for changed, moment, how in sorted(tried)
-            if moment == first and self.score(changed, len(changes[how]) + 1) < least
+            for squares, moment, how in sorted(tried)
+            if moment == first and self.score(squares, len(changes[how]) + 1) < least
         ]
         code = Code.POOR_FIT if alike == [MOVED] else Code.WRONG_LENS
         yield code.remark(
@@ -334,9 +334,7 @@ def misfit_remarks(
     if len(fitted[0]) > 1:
         sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
         changes = {
-            f"{side} camera: {ZOOMED}": score_and_count
-            for side, score_and_count in sides.items()
-            if usual[score_and_count[0]]
+            f"{side} camera: {ZOOMED}": places for side, places in sides.items() if usual[places[0]]
         }
         changes[MOVED] = RIG
         after = reduced.best(usual, RIG)[1]

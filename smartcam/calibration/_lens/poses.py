@@ -105,8 +105,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         adjust(Bundle.single(camera, start), sights, 0.0) for start in plane_poses(view, camera)
     ]
     adjusted = sorted(
-        (bundle for bundle in adjusted if math.isfinite(bundle.weighted)),
-        key=lambda bundle: bundle.weighted,
+        (fit for fit in adjusted if math.isfinite(fit.weighted)), key=lambda fit: fit.weighted
     )
     if not adjusted:
         raise Code.POOR_FIT.refusal(
@@ -116,14 +115,10 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         )
     more = excess(adjusted[0].residuals[0], view.covariance, adjusted[0].freedom)
     if more:
-        adjusted = [adjust(bundle.bundle, sights, more) for bundle in adjusted]
+        adjusted = [adjust(fit.bundle, sights, more) for fit in adjusted]
     best, pose = adjusted[0], adjusted[0].bundle.poses
     other = next(
-        (
-            bundle
-            for bundle in adjusted[1:]
-            if pose.angle_to(bundle.bundle.poses)[0] > MAX_SAME_TURN_RADIANS
-        ),
+        (fit for fit in adjusted[1:] if pose.angle_to(fit.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
         None,
     )
     rms = view_rms(best.residuals[0])
@@ -137,8 +132,8 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     )
 
 
-def _transform(bundle: AdjustedBundle) -> Transform:
-    return Transform(CAMERA, TARGET, *bundle.bundle.poses.taken(0))
+def _transform(fit: AdjustedBundle) -> Transform:
+    return Transform(CAMERA, TARGET, *fit.bundle.poses.taken(0))
 
 
 def view_rms(residuals: Array) -> float:
@@ -254,7 +249,7 @@ def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
 def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
     poses = [pose.taken(0) for pose in plane_poses(view, camera)]
     residuals = (camera.project(pose.apply(view.object_points)) - view.points for pose in poses)
-    squares = [float(np.nan_to_num((squares**2).sum(), nan=math.inf)) for squares in residuals]
+    squares = [float(np.nan_to_num((pixels**2).sum(), nan=math.inf)) for pixels in residuals]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]
     if math.isfinite(best) and second > MAX_UNSURE_RATIO * best:
         return poses[squares.index(best)]

@@ -95,8 +95,8 @@ def whitening(covariance: Array, more: float) -> Array:
     """
     # With C^-1 = L L^T (Cholesky) the residuals L^T r have the covariance L^T C L = I, and their
     # squares add up to r^T C^-1 r.
-    covariance_ = covariance + max(more, MIN_SIGMA_PX**2) * np.eye(2)
-    matrices = np.linalg.cholesky(np.linalg.inv(covariance_)).swapaxes(1, 2)
+    total = covariance + max(more, MIN_SIGMA_PX**2) * np.eye(2)
+    matrices = np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
     return np.asarray(matrices, dtype=np.float64)
 
 

@@ -64,9 +64,9 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
     free = adjust_shape(adjusted.bundle, sights, adjusted.more)
-    left_out, distances = (
+    left_out, shifts = (
         leave_out(free, sights),
-        _adjustment(free.bundle, sights[0].view.target.points),
+        _shifts(free.bundle, sights[0].view.target.points),
     )
     # the simpler one, unless the other is better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
@@ -75,13 +75,13 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
         ddof=1
     )
     if sheet == "free" or (sheet == "auto" and better):
-        remarks = [_remark(distances, "the print or the board is not exact")] if better else []
-        return Shape(free, left_out, distances, remarks)
+        remarks = [_remark(shifts, "the print or the board is not exact")] if better else []
+        return Shape(free, left_out, shifts, remarks)
     done = "it is taken as exact all the same, which sheet='auto' does not"
-    return exact._replace(remarks=[_remark(distances, done)] if better else [])
+    return exact._replace(remarks=[_remark(shifts, done)] if better else [])
 
 
-def _adjustment(bundle: Bundle, nominal: Array) -> Array:
+def _shifts(bundle: Bundle, nominal: Array) -> Array:
     return np.zeros(nominal.shape) if bundle.points is None else bundle.points - nominal
 
 
@@ -91,12 +91,12 @@ def _squares(left_out: Sequence[LeftOut]) -> Array:
     )
 
 
-def _remark(distances: Array, label: str) -> Remark:
-    rms = 1e3 * math.sqrt(float((distances**2).sum(axis=1).mean()))
-    most = 1e3 * float(np.linalg.norm(distances, axis=1).max())
+def _remark(shifts: Array, text: str) -> Remark:
+    rms = 1e3 * math.sqrt(float((shifts**2).sum(axis=1).mean()))
+    most = 1e3 * float(np.linalg.norm(shifts, axis=1).max())
     return Code.SHEET_NOT_EXACT.remark(
         f"the sheet's points are {rms:.2g} mm rms from their nominal places, {most:.2g} mm "
-        f"at most: {label}"
+        f"at most: {text}"
     )
 
 

@@ -131,12 +131,12 @@ def _first(
         getattr(space, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
     )
     start = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
-    _, matrix_found, bends, *_ = calibrate(
+    _, fitted, bends, *_ = calibrate(
         points, pixels, (width, height), matrix, start, flags=flags, criteria=stop
     )
     distortion = np.zeros(COEFFICIENTS[model])
     distortion[: bends.size] = bends.ravel()
-    matrix_found[0, 1] = 0.0
+    fitted[0, 1] = 0.0
     return CameraModel(
-        size=(width, height), matrix=matrix_found, distortion=distortion, distortion_model=model
+        size=(width, height), matrix=fitted, distortion=distortion, distortion_model=model
     )

@@ -245,13 +245,13 @@ def examined(
     ``POOR_FIT``: the points are not the target's.
     """
     views, used = (
-        [view.view for view in calibration.views],
-        [view.used for view in calibration.views],
+        [fit.view for fit in calibration.views],
+        [fit.used for fit in calibration.views],
     )
     points = views[0].target.points + (0.0 if calibration.sheet is None else calibration.sheet)
     fitted = [
-        Fitted(view.view, calibration.camera, view.transform.rigid, points)
-        for view in calibration.views
+        Fitted(fit.view, calibration.camera, fit.transform.rigid, points)
+        for fit in calibration.views
     ]
     names = [label(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", calibration.rms, views)

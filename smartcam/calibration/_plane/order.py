@@ -107,7 +107,7 @@ def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
         alike = np.array([noise.chance(square, freedom) > MIN_NOISE_CHANCE for square in squares])
         moved = np.where(alike, (orders != np.arange(count)).sum(axis=1), 2 * count)
         first, *others = np.argsort(moved, kind="stable").tolist()
-        sure = all(SURE_ORDER_RATIO * moved[first] <= moved[order] for order in others)
+        sure = all(SURE_ORDER_RATIO * moved[first] <= moved[other] for other in others)
         after = max(squares[first] / freedom, scale)
         return Reordered(orders[first], float((given / freedom) ** 0.5), float(after**0.5), sure)
     return None
@@ -145,7 +145,7 @@ class _Similarity:
     def search(self) -> tuple[Order, Array]:
         """Return the orders (K, N) that no exchange improves, and their sums of squares (K,)."""
         rows = np.arange(len(self._marks))
-        starts = [np.roll(rotation, by) for rotation in (rows, rows[::-1]) for by in rows]
+        starts = [np.roll(order, by) for order in (rows, rows[::-1]) for by in rows]
         orders = np.unique([self._descended(start) for start in starts], axis=0)
         return orders, self.squares(orders)
 

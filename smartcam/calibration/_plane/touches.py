@@ -178,7 +178,7 @@ def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
     # Gauss and Newton's steps of shift and turn: 3 to 6 of them, in 2.5 ms; SciPy's least_squares
     # takes 6 ms (measured).
     origin = touched[ray == 0].mean(axis=0)
-    frame = frame_from_axes(*(touched[ray == side].mean(axis=0) - origin for side in (1, 2)))
+    frame = frame_from_axes(*(touched[ray == number].mean(axis=0) - origin for number in (1, 2)))
     for _ in range(MAX_STEPS):
         along, residuals, jacobian = _linear(touched, ray, origin, frame)
         step = np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]

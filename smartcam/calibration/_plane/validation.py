@@ -160,12 +160,12 @@ def check_samples(
 
 def check_field(robot: Array) -> None:
     """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than in any cell."""
-    if (field_extent := extent(robot)) > MAX_UNASKED_M:
+    if (size := extent(robot)) > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
-            f"of {field_extent:.4g} m: are they millimetres? Multiply them by 0.001",
+            f"of {size:.4g} m: are they millimetres? Multiply them by 0.001",
             MAX_UNASKED_M,
-            field_extent,
+            size,
         )
 
 
@@ -179,18 +179,18 @@ def extent(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(_turned(points)[:, :2], axis=0)))
 
 
-def check_lever(extent_found: float, touch_sigma: float) -> None:
+def check_lever(size: float, touch_sigma: float) -> None:
     """Raise SHORT_LEVER if points lie too close together for the error of the touches.
 
-    ``extent_found``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
+    ``size``: extent of the points, metres. ``touch_sigma``: that of one coordinate, metres.
     """
-    if extent_found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
+    if size < MIN_EXTENT_IN_SIGMAS * touch_sigma:
         raise Code.SHORT_LEVER.refusal(
             f"robot points: expected at least {MIN_EXTENT_IN_SIGMAS:g} sigmas of a touch "
             f"({1e3 * MIN_EXTENT_IN_SIGMAS * touch_sigma:.3g} mm) in each direction, "
-            f"got {1e3 * extent_found:.3g} mm: they lie too close together, or are in another unit",
+            f"got {1e3 * size:.3g} mm: they lie too close together, or are in another unit",
             MIN_EXTENT_IN_SIGMAS * touch_sigma,
-            extent_found,
+            size,
         )
 
 

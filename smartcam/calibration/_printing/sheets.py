@@ -187,7 +187,7 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
         )
         for wide, high in turns
     ]
-    layout = min(layouts, key=lambda sheet: sheet.excess)
+    layout = min(layouts, key=lambda layout: layout.excess)
     if layout.excess > 0:
         raise _too_small(target, page, layout)
     moved = (_moved(shape, *layout.origin) for shape in pattern)

@@ -88,7 +88,7 @@ class SheetPlane:
             CalibrationError: SHAPE or NOT_FINITE; OUT_OF_FIELD: outside of the image, or behind the
                 sheet's horizon.
         """
-        given = self._rays_of(pixels)
+        given = self._checked_pixels(pixels)
         return self._mapped(self._straight(given), given)
 
     def in_image(self, points: ArrayLike) -> Array:
@@ -142,7 +142,7 @@ class SheetPlane:
                 "sheet: expected poses in the image, turned about its z only, got some with a "
                 "height or a tilt"
             )
-        pixels = self._rays_of(poses.points[:, :2] * [1.0, -1.0])
+        pixels = self._checked_pixels(poses.points[:, :2] * [1.0, -1.0])
         ahead = np.column_stack([w * w - z * z, -2.0 * z * w])
         middles, ends, starts = (
             self._mapped(self._straight(at), at)
@@ -158,7 +158,7 @@ class SheetPlane:
             quaternion_about_z(np.arctan2(directions[:, 1], directions[:, 0])),
         )
 
-    def _rays_of(self, pixels: ArrayLike) -> Array:
+    def _checked_pixels(self, pixels: ArrayLike) -> Array:
         given = as_points(pixels, 2, "pixels")
         width, height = self.size
         outside = (

@@ -254,7 +254,7 @@ class StereoCalibration(storage.SavedCalibration):
         ways = [right]
         if right.target.half_turn_symmetric:
             ways.append(half_turned(right))
-        errors = [pair_errors(self._cameras, left, turned) for turned in ways]
+        errors = [pair_errors(self._cameras, left, view) for view in ways]
         return min(errors, key=lambda errors_of_pair: _rms([errors_of_pair.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
@@ -428,9 +428,9 @@ def _held_out(solution: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairEr
     if len(pairs) <= solution.least:
         return {}
     return {
-        left.pose: pair_errors(_cameras(left.bundle), *solution.pair(left.pose))
-        for left in left_out
-        if left.pose in pairs
+        fit.pose: pair_errors(_cameras(fit.bundle), *solution.pair(fit.pose))
+        for fit in left_out
+        if fit.pose in pairs
     }
 
 

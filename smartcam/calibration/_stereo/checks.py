@@ -90,7 +90,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     so, other = (
         np.array(
             [
-                sum(_squares(*view_and_lens) for view_and_lens in zip(pair, lenses, strict=True))
+                sum(_squares(view, lens) for view, lens in zip(pair, lenses, strict=True))
                 for pair in views
             ]
         )
@@ -166,7 +166,7 @@ def examined(
         ],
         calibration.sigma**2,
         free,
-        [label(left_view.fitted.view, left_view.pair) for left_view, _ in both],
+        [label(left.fitted.view, left.pair) for left, _ in both],
     )
     outliers = strays(fitted, calibration.sigma**2, used)
     if outliers and drop:

@@ -118,7 +118,7 @@ def rectify(
             MIN_ACROSS_COSINE,
             across,
         )
-    rectified_maps = tuple(
+    kept_parts = tuple(
         _kept_part(camera, turn, projection, output)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
@@ -130,7 +130,7 @@ def rectify(
         depth=depth,
         maps=(maps[0], maps[1]),
         masks=(masks[0], masks[1]),
-        kept=(rectified_maps[0], rectified_maps[1]),
+        kept=(kept_parts[0], kept_parts[1]),
         invalid=(1.0 - float(masks[0].mean()), 1.0 - float(masks[1].mean())),
     )
 
@@ -191,10 +191,10 @@ def _parallel(
         rectified = cv2.stereoRectify(
             *given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output
         )
-    first, second, first_projection, two, depth = (
+    first, second, first_projection, second_projection, depth = (
         np.array(each, dtype=np.float64) for each in rectified[:5]
     )
-    return (first, second), (first_projection, two), depth
+    return (first, second), (first_projection, second_projection), depth
 
 
 def _map(

@@ -84,13 +84,13 @@ def as_moments(
     for side, views in zip(SIDES, (left_views, right_views), strict=True):
         check_views([view for view in views if view is not None], f"{side} camera", 1)
     moments = list(zip(left_views, right_views, strict=True))
-    for left, two in moments:
-        if left is not None and two is not None and left.target != two.target:
+    for left, right in moments:
+        if left is not None and right is not None and left.target != right.target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"stereo: expected views of one target, {left.target}, got {two.target} on the "
+                f"stereo: expected views of one target, {left.target}, got {right.target} on the "
                 "right",
                 left.target,
-                two.target,
+                right.target,
             )
     return moments
 
@@ -123,7 +123,8 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
         if two is not None and second is not None:
             moments[number], poses[number] = (first, half_turned(second)), (one, two @ turns[1])
     firsts = Rigid.stacked(
-        left or (rig.inverse() @ two if two else IDENTITY) for left, two in poses
+        in_left or (rig.inverse() @ in_right if in_right else IDENTITY)
+        for in_left, in_right in poses
     )
     basis = lenses.basis(0), lenses.basis(1)
     return FirstGuess(moments, Bundle((left, right), Rigid.stacked([rig]), firsts, basis), apart)
@@ -140,16 +141,16 @@ def _side(
     views = [view for moment in moments if (view := moment[side]) is not None]
     known, label = lenses.known[side], f"{SIDES[side]} camera"
     if known is None:
-        calibration = fit_lens(views, lenses.model, lenses.fixed)
-        check_tilts(calibration, label)
+        adjusted = fit_lens(views, lenses.model, lenses.fixed)
+        check_tilts(adjusted, label)
     else:
         check_views(views, label, 1, known.size)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
-        calibration = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
+        adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
     poses: list[Rigid | None] = [None] * len(moments)
     for place, number in enumerate(seen):
-        poses[number] = calibration.bundle.poses.taken(place)
-    return calibration.bundle.cameras[0], poses
+        poses[number] = adjusted.bundle.poses.taken(place)
+    return adjusted.bundle.cameras[0], poses
 
 
 def _rig(
@@ -162,17 +163,17 @@ def _rig(
     upside down. Raises ``POOR_FIT``.
     """
     pairs = [
-        (number, left, two, moment[1])
-        for number, ((left, two), moment) in enumerate(zip(poses, moments, strict=True))
-        if left is not None and two is not None and moment[1] is not None
+        (number, in_left, in_right, moment[1])
+        for number, ((in_left, in_right), moment) in enumerate(zip(poses, moments, strict=True))
+        if in_left is not None and in_right is not None and moment[1] is not None
     ]
     best, least, distances = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
     sampled = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
-    for turn, (_, left, two, _) in itertools.product(turns, sampled):
+    for turn, (_, in_left, in_right, _) in itertools.product(turns, sampled):
         # T_right_left = T_right_target T_target_left; the one with the least median error is taken,
         # which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares Regression
         # (1984).
-        guess = two @ turn @ left.inverse()
+        guess = in_right @ turn @ in_left.inverse()
         tried = np.array(
             [_mean_distances(guess @ pose, view, right, turns) for _, pose, _, view in pairs]
         )
@@ -187,14 +188,14 @@ def _rig(
     limit = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
     numbers, nearest = [number for number, *_ in pairs], distances.min(axis=1).tolist()
     apart = {
-        number: nearest_turn
-        for number, nearest_turn in zip(numbers, nearest, strict=True)
-        if nearest_turn > limit
+        number: distance
+        for number, distance in zip(numbers, nearest, strict=True)
+        if distance > limit
     }
     turned = [
         number
-        for number, distance in zip(numbers, distances, strict=True)
-        if distance[0] > distance[-1]
+        for number, by_turn in zip(numbers, distances, strict=True)
+        if by_turn[0] > by_turn[-1]
     ]
     return best, apart, turned
 

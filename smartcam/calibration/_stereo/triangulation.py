@@ -93,12 +93,12 @@ def _step(
     # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
     # points are solved at once, which no solver of single problems does; a thousand take a few
     # milliseconds.
-    left_part = linearize(points, pair.left)
-    two = linearize(pair.transform.apply(points), pair.right)
-    rows = [white[0] @ left_part.by_point, white[1] @ two.by_point @ pair.transform.rotation]
+    in_left = linearize(points, pair.left)
+    in_right = linearize(pair.transform.apply(points), pair.right)
+    rows = [white[0] @ in_left.by_point, white[1] @ in_right.by_point @ pair.transform.rotation]
     misses = [
-        white[0] @ (pixels[0] - left_part.pixels)[..., None],
-        white[1] @ (pixels[1] - two.pixels)[..., None],
+        white[0] @ (pixels[0] - in_left.pixels)[..., None],
+        white[1] @ (pixels[1] - in_right.pixels)[..., None],
     ]
     jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(misses, axis=1)
     normal = jacobian.swapaxes(1, 2) @ jacobian

@@ -338,7 +338,7 @@ def compose_opencv(chain: CameraChain) -> str:
     alike, *others = (
         f"{camera.size} pixels and {camera.distortion_model}" for camera in chain.cameras
     )
-    if any(name != alike for name in others):
+    if any(other != alike for other in others):
         raise _cannot("opencv", f"cameras of {alike}", others[0])
     motion = chain.transforms[0]
     return (
@@ -372,8 +372,8 @@ def parse_opencv(
         data = {**_normal(load_storage(extrinsics)), **data}
     sides = next((ends for ends in _ENDS if _first(data, _MATRIX, ends[0])), None)
     stated = [data[key] for key in ("imagewidth", "imageheight") if key in data]
-    whole_image = _first(data, ("imagesize", "size"), "", [])
-    size = _size(stated or sequence(whole_image, "image_size"), size)
+    both = _first(data, ("imagesize", "size"), "", [])
+    size = _size(stated or sequence(both, "image_size"), size)
     if sides is None:
         camera = _opencv_camera(data, size, "")
         return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")

@@ -94,10 +94,10 @@ def _of_pair(pair: StereoCalibration) -> StoredLenses:
     sides = []
     for number, camera in enumerate((pair.left, pair.right)):
         seen = [
-            pair.transform.apply(view.object_points)
-            for pair in pair.pairs
-            for view in ((pair.left, pair.right)[number],)
-            if pair.used[number] and pair.transform is not None and view is not None
+            fit.transform.apply(view.object_points)
+            for fit in pair.pairs
+            for view in ((fit.left, fit.right)[number],)
+            if fit.used[number] and fit.transform is not None and view is not None
         ]
         points = np.concatenate(seen) if seen else None
         if points is not None and number:
@@ -128,9 +128,9 @@ def _ours(path: str | os.PathLike[str]) -> StoredLenses:
     if document.kind == StereoCalibration.kind:
         return _of_pair(StereoCalibration.from_data(document.data))
     if document.kind == HandEyeCalibration.kind:
-        calibration = _of_robot(HandEyeCalibration.from_data(document.data))
-        if calibration is not None:
-            return calibration
+        lenses = _of_robot(HandEyeCalibration.from_data(document.data))
+        if lenses is not None:
+            return lenses
     raise Code.WRONG_KIND.refusal(
         f"{path}: holds {document.kind!r}, expected a calibration that has a lens",
         "a calibration that has a lens",

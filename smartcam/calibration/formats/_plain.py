@@ -145,10 +145,10 @@ def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Pla
 
 def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
     """Return a value that must be a list, of ``count`` items if that is given."""
-    sequence_: list[Plain] | None = value if isinstance(value, list) else None
-    if sequence_ is None or count not in {None, len(sequence_)}:
+    items: list[Plain] | None = value if isinstance(value, list) else None
+    if items is None or count not in {None, len(items)}:
         raise malformed(where, "a list" if count is None else f"a list of {count}", value)
-    return sequence_
+    return items
 
 
 def number(value: Plain, where: str) -> float:
@@ -179,9 +179,7 @@ def reals(value: Plain, where: str, count: int | None = None) -> list[float]:
 def matrix_of(value: Plain, where: str, shape: tuple[int, int]) -> Array:
     """Return a matrix that is stored as a list of rows."""
     rows = sequence(value, where, shape[0])
-    return np.array([reals(numbers_of_row, where, shape[1]) for numbers_of_row in rows]).reshape(
-        shape
-    )
+    return np.array([reals(line, where, shape[1]) for line in rows]).reshape(shape)
 
 
 def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
@@ -220,10 +218,10 @@ def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
 
 def flag(value: Plain, where: str) -> bool:
     """Return a truth value."""
-    flag_ = _FLAGS.get(value.lower()) if isinstance(value, str) else None
-    if flag_ is None:
+    truth = _FLAGS.get(value.lower()) if isinstance(value, str) else None
+    if truth is None:
         raise malformed(where, "true or false", value)
-    return flag_
+    return truth
 
 
 def frame_name(value: Plain, where: str) -> str:

@@ -147,9 +147,7 @@ async def _ask_setup(
     robot = Option(
         name="robot",
         label="How the robot shows the pose of its flange",
-        options={
-            name: f"{', '.join(robot.numbers)}; {robot.title}" for name, robot in ROBOTS.items()
-        },
+        options={name: f"{', '.join(form.numbers)}; {form.title}" for name, form in ROBOTS.items()},
     )
     label = "Largest error that is good enough; empty: a hundredth of the sheet's distance"
     allowed = replace(ALLOWED, label=label)
@@ -355,13 +353,13 @@ class _Views:
             notes=(f"{len(self._samples)} views",),
             timeout=CALCULATION_TIMEOUT,
         )
-        check = (await ask(step, self._solve)).outcome
-        if "code" in check:
-            worst, code = len(self._samples), Code(check["code"])
-            judgement = refused(code, check["text"], worst=worst, cures=VIEW_CURES)
-            return None, (f"{code}: {check['text']}",), judgement
+        solved = (await ask(step, self._solve)).outcome
+        if "code" in solved:
+            worst, code = len(self._samples), Code(solved["code"])
+            judgement = refused(code, solved["text"], worst=worst, cures=VIEW_CURES)
+            return None, (f"{code}: {solved['text']}",), judgement
         views = [view.to_data() for view in self._views()]
-        calibration = HandEyeCalibration.from_data({**check, "views": views})
+        calibration = HandEyeCalibration.from_data({**solved, "views": views})
         _, _, notes, judgement = _outcome(calibration)
         return calibration, notes, judgement
 
@@ -441,8 +439,8 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
         "views": len(calibration.views),
         "held_out_mm": None if held_out is None else 1e3 * held_out,
         "mean_mm": 1e3 * calibration.mean_error,
-        "translation_error_mm": _measured(1e3, calibration.translation_error),
-        "rotation_error_deg": _measured(math.degrees(1.0), calibration.rotation_error),
+        "translation_error_mm": _finite(1e3, calibration.translation_error),
+        "rotation_error_deg": _finite(math.degrees(1.0), calibration.rotation_error),
         "remarks": remarks,
     }
     notes = [f"{figures['views']} views, {figures['method']}"]
@@ -461,5 +459,5 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     return Calibrated(calibration, figures, (*notes, *remarks), judgement)
 
 
-def _measured(factor: float, value: float) -> float | None:
+def _finite(factor: float, value: float) -> float | None:
     return factor * value if math.isfinite(value) else None

@@ -261,13 +261,13 @@ class PointSource(Touches, ABC):
 
     def _fits_without(self, index: int) -> bool:
         """Return True if the touches fit without one of them, and another one is left as a test."""
-        others = copy.copy(self)
-        others.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        without = copy.copy(self)
+        without.touches = [*self.touches[:index], *self.touches[index + 1 :]]
         try:
-            codes = {warning.code for warning in others.fit(robust=False).warnings}
+            codes = {warning.code for warning in without.fit(robust=False).warnings}
         except CalibrationError:
             return False
-        return len(others.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
+        return len(without.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,

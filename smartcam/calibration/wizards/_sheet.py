@@ -167,16 +167,13 @@ class _SheetSource(PointSource):
             waiting=f"Waiting: {awaited}" if awaited else "",
             timeout=PICTURE_TIMEOUT,
         )
-        picture_taken = (await ask(step, look)).outcome
-        self._view = TargetView.from_data(picture_taken["view"], target=self._target)
+        outcome = (await ask(step, look)).outcome
+        self._view = TargetView.from_data(outcome["view"], target=self._target)
         self._camera = (
-            None
-            if picture_taken["camera"] is None
-            else CameraModel.from_data(picture_taken["camera"])
+            None if outcome["camera"] is None else CameraModel.from_data(outcome["camera"])
         )
-        # older journals have no entry for it
-        self._lens_covariance = picture_taken.get("lens_covariance")
-        self._svg = picture_taken["preview"]
+        self._lens_covariance = outcome.get("lens_covariance")  # missing in older journals
+        self._svg = outcome["preview"]
 
     def shown(self, mark: Mark) -> dict[str, Any]:
         """Return notes on the picture, and the picture with a ring around the point."""

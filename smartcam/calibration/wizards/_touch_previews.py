@@ -50,7 +50,7 @@ def before(touches: Sequence[Touch], marks: Sequence[Mark], mark: Mark) -> dict[
         return None
     return {
         **plain(touches),
-        "marks": [[mark.x, mark.y] for mark in marks],
+        "marks": [[other.x, other.y] for other in marks],
         "next": [mark.x, mark.y],
     }
 

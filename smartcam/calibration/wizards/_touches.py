@@ -142,7 +142,7 @@ class Touches:
         """Ask for a touch.
 
         ``place``: text that names the place to touch. ``mark``: the camera's mark there.
-        ``label``: attribute of :class:`Touch`.
+        ``label``: value of ``what`` of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
         step = Step(id=step_id, title=title, description=f"{description}.", **self.shown(mark))

@@ -271,7 +271,7 @@ class _DriftCheck(Touches):
     def _figures(self, drift: Drift) -> dict[str, Any]:
         offsets = 1e3 * np.linalg.norm(drift.offsets, axis=1)
         needed = [touches_needed(self.calibration, point) for point in self._touched_marks()]
-        enough = [name for name in needed if name is not None]
+        enough = [count for count in needed if count is not None]
         return {
             "stale": drift.stale,
             "touches": len(self.touches),

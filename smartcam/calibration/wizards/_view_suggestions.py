@@ -34,10 +34,7 @@ class Look(NamedTuple):
     tilt: float = 0.0  # tilt, degrees
     roll: float = 0.0  # turn about the line of sight, degrees
     fill: float = 0.6  # part of the image's width or height that the target takes
-    place: tuple[float, float] = (
-        0.5,
-        0.5,
-    )  # centre of the place, as parts of the image's width and height
+    place: tuple[float, float] = (0.5, 0.5)  # centre, as parts of the image's width and height
 
 
 LOOKS: Final = (
@@ -99,10 +96,10 @@ def _guided(views: Sequence[TargetView]) -> NextView | None:
         return None
     # parts will be about as far away as the target is
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
-    views_found = suggest_views(
+    suggested = suggest_views(
         lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]
     )
-    return views_found[0] if views_found else None
+    return suggested[0] if suggested else None
 
 
 FOCAL_LENGTH_WIDTHS: Final = 1.2
