@@ -87,7 +87,7 @@ def pytest_configure() -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Run two more side by side than there are cores, since many wait; a few files or tests alone."""
+    """Run two more than there are cores, since many tests wait; a few files or tests run alone."""
     few = len(config.args) <= 3 and all(".py" in one for one in config.args)
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
