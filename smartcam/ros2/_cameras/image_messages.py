@@ -37,10 +37,10 @@ ENCODINGS: Final[dict[str, str]] = {
     "RGBa8": "rgba8",
     "BGRa8": "bgra8",
     "RGBa16": "rgba16",
-    **{f"Bayer{ours}8": f"bayer_{ros_name}8" for ours, ros_name in _BAYER.items()},
+    **{f"Bayer{ours}8": f"bayer_{theirs}8" for ours, theirs in _BAYER.items()},
     **{
-        f"Bayer{ours}{bits}": f"bayer_{ros_name}16"
-        for ours, ros_name in _BAYER.items()
+        f"Bayer{ours}{bits}": f"bayer_{theirs}16"
+        for ours, theirs in _BAYER.items()
         for bits in (10, 12, 16)
     },
     "Coord3D_C16": "16UC1",
@@ -58,8 +58,8 @@ converted to ``rgb8`` or unpacked first: see :func:`prepared`.
 
 _FORMATS: Final[dict[str, str]] = {
     **{
-        ros_name: ours
-        for ours, ros_name in reversed(ENCODINGS.items())
+        theirs: ours
+        for ours, theirs in reversed(ENCODINGS.items())
         if ours not in {"Mono10", "Mono12", "Mono14"} and not ours.endswith(("10", "12"))
     },
     "8UC1": "Mono8",
@@ -335,13 +335,9 @@ def pixels_from(message: Any) -> NDArray[Any]:
 
 def _samples(encoding: str) -> tuple[str, int]:
     """Return the type of an encoding's numbers, and their count for a pixel."""
-    bits, _, channels_text = encoding.partition("C")
-    if (
-        bits[:-1] in {"8", "16", "32", "64"}
-        and bits[-1:] in _DTYPES
-        and channels_text in {*"1234", ""}
-    ):
-        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(channels_text or 1)
+    bits, _, count = encoding.partition("C")
+    if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and count in {*"1234", ""}:
+        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(count or 1)
     for name, channels in (("mono", 1), ("bayer_", 1), ("rgba", 4), ("bgra", 4), ("rgb", 3)):
         if encoding.startswith(name) and encoding.endswith(("8", "16")):
             return ("u2" if encoding.endswith("16") else "u1"), channels

@@ -189,11 +189,7 @@ def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
                     f"got {name!r}"
                 )
         if transform.target == transform.source or transform.source in checked:
-            other = (
-                checked[transform.source].target
-                if transform.source in checked
-                else transform.target
-            )
+            other = checked.get(transform.source, transform).target
             raise ConfigurationError(
                 f"tf: {transform.source}: expected one parent that is another frame, "
                 f"got {transform.target} and {other}"
