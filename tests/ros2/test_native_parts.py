@@ -167,4 +167,4 @@ def test_few_stamps_are_remembered() -> None:
     stamps = RosStamps(lambda: 1.0)
     for second in range(2 * MAX_STAMPS):
         assert stamps._moved(second * BILLION) == (second + 1) * BILLION
-    assert len(stamps._arrival_times) == MAX_STAMPS
+    assert len(stamps._moved_stamps) == MAX_STAMPS
