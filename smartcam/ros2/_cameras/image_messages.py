@@ -37,10 +37,10 @@ ENCODINGS: Final[dict[str, str]] = {
     "RGBa8": "rgba8",
     "BGRa8": "bgra8",
     "RGBa16": "rgba16",
-    **{f"Bayer{ours}8": f"bayer_{theirs}8" for ours, theirs in _BAYER.items()},
+    **{f"Bayer{ours}8": f"bayer_{ros_name}8" for ours, ros_name in _BAYER.items()},
     **{
-        f"Bayer{ours}{bits}": f"bayer_{theirs}16"
-        for ours, theirs in _BAYER.items()
+        f"Bayer{ours}{bits}": f"bayer_{ros_name}16"
+        for ours, ros_name in _BAYER.items()
         for bits in (10, 12, 16)
     },
     "Coord3D_C16": "16UC1",
@@ -58,8 +58,8 @@ converted to ``rgb8`` or unpacked first: see :func:`prepared`.
 
 _FORMATS: Final[dict[str, str]] = {
     **{
-        theirs: ours
-        for ours, theirs in reversed(ENCODINGS.items())
+        ros_name: ours
+        for ours, ros_name in reversed(ENCODINGS.items())
         if ours not in {"Mono10", "Mono12", "Mono14"} and not ours.endswith(("10", "12"))
     },
     "8UC1": "Mono8",
