@@ -67,7 +67,7 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol differs from the given address's.
+        other: whether the protocol differs from the one of the given address.
     """
 
     address: Address

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import itertools
 import logging
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
@@ -220,9 +221,7 @@ class Pump:
 
     async def _store_waiting(self) -> None:
         """Write the first waiting entries; if none wait, the gaps of dropped ones."""
-        batch = [
-            arrival for arrival, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)
-        ]
+        batch = [*itertools.islice(self._waiting, MAX_WRITTEN_TOGETHER)]
         lost = {} if batch else dict(self._lost)
         await self._store_arrivals(batch, lost)
 

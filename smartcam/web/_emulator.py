@@ -303,7 +303,7 @@ def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", f"{_CAMERA}/faults")
 def _faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Waiting faults, and the last past ones."""
+    """Waiting faults, and the last ones that have happened."""
     return serialize.faults_state(_emulator(site, call))
 
 

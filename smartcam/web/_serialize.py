@@ -225,7 +225,7 @@ def _byte_order(device: Device) -> ByteOrder:
 
 
 def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
-    """Return the waiting faults and the last past ones."""
+    """Return the waiting faults and the last ones that have happened."""
     waiting, fired = emulator.faults, list(emulator.fired)
     last = (event.fault for event in reversed(fired))
     return {

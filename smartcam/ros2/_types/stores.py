@@ -38,7 +38,7 @@ _DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
 }
-"""Defaults that the stores leave out; a name is a constant of the type."""
+"""Defaults that the stores leave out; a text is the name of a constant, if the type has it."""
 
 _NAME, _ARRAY, _SEQUENCE = 2, 3, 4
 

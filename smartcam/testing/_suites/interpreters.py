@@ -148,7 +148,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """Check that the number is the layout's field, or None, or an error."""
+        """Check that the number is the value of the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
         sequence = interpreter.sequence(reader)
