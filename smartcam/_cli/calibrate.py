@@ -305,7 +305,7 @@ class _Sources:
             sheet_wizard,
         )
 
-        wizards_found: list[Wizard] = []
+        wizards: list[Wizard] = []
         connect: dict[str, Any] | None = None
         if self.url is not None:
             with self.options.camera(self.url):  # raises for a wrong address or option
@@ -314,7 +314,7 @@ class _Sources:
                 name: getattr(self.options, name)
                 for name in ("application", "interpret_as", "y_down")
             }
-            wizards_found = [
+            wizards = [
                 plane_wizard(
                     localize=self.localize,
                     save_to=folder.calibration,
@@ -338,7 +338,7 @@ class _Sources:
         }
         known = None if lens is None else lens.covariance
         sheet = sheet_wizard(**pictures, lens_covariance=known, connect=connect)
-        return [*wizards_found, sheet, hand_eye_wizard(**pictures)]
+        return [*wizards, sheet, hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
         from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -347,9 +347,8 @@ class _Sources:
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
-                if (
-                    camera.settings.y_down != options.y_down
-                ):  # the fleet's agent has the calibration
+                # the agent of a fleet knows the direction of y
+                if camera.settings.y_down != options.y_down:
                     raise ConfigurationError(
                         f"{camera.url}: its agent says y_down: true: give --y-down here, too, or "
                         "the calibration is mirrored"

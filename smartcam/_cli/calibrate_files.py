@@ -157,12 +157,10 @@ async def compare(
     ]
     for name, comparison in zip(first.names, comparisons, strict=True):
         options.show(_data(name, comparison), _text(name, comparison))
-    neighbours = zip(
-        first.transforms, second.transforms, itertools.pairwise(comparisons), strict=True
-    )
-    for first_lens, other, pair in neighbours:
-        turn, shift = rig_difference(first_lens, other, *pair)
-        between = f"{first_lens.target} to {first_lens.source}"
+    pairs = itertools.pairwise(comparisons)
+    for transform, other, pair in zip(first.transforms, second.transforms, pairs, strict=True):
+        turn, shift = rig_difference(transform, other, *pair)
+        between = f"{transform.target} to {transform.source}"
         value = {"between": between, "turn_deg": math.degrees(turn), "shift_mm": 1e3 * shift}
         text = f"{between}: {math.degrees(turn):.4f} degrees and {1e3 * shift:.3f} mm apart"
         options.show(value, text)
@@ -247,10 +245,8 @@ def _text(name: str, comparison: LensComparison) -> str:
 
 def _numbers(figures: MapFigures) -> dict[str, float | None]:
     """Return the figures for JSON, which knows no NaN."""
-    return {
-        name: figure if math.isfinite(figure) else None
-        for name, figure in figures._asdict().items()
-    }
+    values = figures._asdict().items()
+    return {name: value if math.isfinite(value) else None for name, value in values}
 
 
 def _row(name: str, figures: MapFigures) -> list[object]:

@@ -45,8 +45,8 @@ class Collecting:
         """Add a view if the target is still, and at a new place; return whether it was added."""
         last, self._last = self._last, view
         still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
-        least_distance = MIN_NEW_VIEW_SHARE * view.size[0]
-        if not still or any(_apart(earlier, view) < least_distance for earlier in self.views):
+        least_motion = MIN_NEW_VIEW_SHARE * view.size[0]
+        if not still or any(_apart(earlier, view) < least_motion for earlier in self.views):
             return False
         self.views.append(view)
         return True
@@ -268,12 +268,10 @@ def _report_once(error: CalibrationError, reported: set[str]) -> None:
 def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
     points = 0 if view is None else len(view.ids)
     value = {"picture": name, "used": view is not None, "points": points, "reason": why}
-    seen_text = (
-        "; ".join([f"{points} points", *(warning.text for warning in view.warnings)])
-        if view
-        else ""
-    )
-    options.show(value, f"{name}: {seen_text or f'not used: {why}'}")
+    text = f"not used: {why}"
+    if view is not None:
+        text = "; ".join([f"{points} points", *(warning.text for warning in view.warnings)])
+    options.show(value, f"{name}: {text}")
 
 
 def _save(output: str, calibration: IntrinsicCalibration) -> None:
@@ -317,7 +315,7 @@ def _text(output: str, calibration: IntrinsicCalibration) -> str:
         table_text(("", "pixels", "sigma"), rows),
     ]
     if value["lacking"]:
-        lines.append(f"  lacking: {', '.join(_LACKING[region] for region in value['lacking'])}")
+        lines.append(f"  lacking: {', '.join(_LACKING[kind] for kind in value['lacking'])}")
     lines += [f"  {remark}" for remark in value["remarks"]]
     return "\n".join(lines)
 

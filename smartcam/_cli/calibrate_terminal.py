@@ -87,10 +87,7 @@ def _resumed_text(resumed: Mapping[str, Any]) -> str:
         "was touched or seen then counts as it was: begin anew if camera, marks or sheet may have "
         "been moved since."
     )
-    rows = [
-        f"  {number}. {_done_text(step_done)}"
-        for number, step_done in enumerate(resumed["done"], 1)
-    ]
+    rows = [f"  {number}. {_done_text(step)}" for number, step in enumerate(resumed["done"], 1)]
     return "\n".join(["", *textwrap.wrap(text, WIDTH), *rows])
 
 
@@ -214,7 +211,7 @@ async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Inst
             return text
         if command in can:
             return _Instead(command)
-        click.echo(f"! :{command}: expected one of {', '.join(f':{command}' for command in can)}")
+        click.echo(f"! :{command}: expected one of {', '.join(f':{known}' for known in can)}")
 
 
 # ---------------------------------------------------------------------- texts

@@ -253,19 +253,17 @@ def _palletize(
             break
         pose = (part.x, part.y, part.theta)
         sigma = math.hypot(part.sigma_x, part.sigma_y)
-        palletized = demo.robot.palletize(pose, grip, pattern, number)
-        placed.append(palletized)
+        put = demo.robot.palletize(pose, grip, pattern, number)
+        placed.append(put)
         expected.append(sigma)
         rows.append(
             (
                 *(f"{1e3 * length:.2f}".rjust(8) for length in (part.x, part.y)),
-                *(f"{1e3 * length:.3f}" for length in (palletized.error, sigma)),
-                f"{math.degrees(palletized.turned):+.3f}",
+                *(f"{1e3 * length:.3f}" for length in (put.error, sigma)),
+                f"{math.degrees(put.turned):+.3f}",
                 f"{math.degrees(part.sigma_theta):.3f}",
-                "/".join(str(1 + count) for count in pattern.at(number))
-                if palletized.taken
-                else "missed",
-                f"{1e3 * palletized.off_place:.2f}",
+                "/".join(str(1 + count) for count in pattern.at(number)) if put.taken else "missed",
+                f"{1e3 * put.off_place:.2f}",
             )
         )
     demo.steps.step(

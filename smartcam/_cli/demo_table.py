@@ -205,11 +205,11 @@ class DrawnTable:
         ``taught``: the part as it lay in the picture that was taught; ``reference``: the place of
         the model's reference there, pixels. A real cell does not know this true pose.
         """
-        at = self._on_table(*reference)
+        here = self._on_table(*reference)
         ahead = self._on_table(reference[0] + 1.0, reference[1])
-        angle = math.atan2(ahead[1] - at[1], ahead[0] - at[0]) - taught.pose.theta
+        angle = math.atan2(ahead[1] - here[1], ahead[0] - here[0]) - taught.pose.theta
         cos, sin = math.cos(taught.pose.theta), math.sin(taught.pose.theta)
-        x, y = at[0] - taught.pose.x, at[1] - taught.pose.y
+        x, y = here[0] - taught.pose.x, here[1] - taught.pose.y
         return TablePose(cos * x + sin * y, cos * y - sin * x, angle)
 
     def _on_table(self, u: float, v: float) -> tuple[float, float]:
@@ -341,9 +341,9 @@ class TableRobot:
         """Return the offset of a part's reference from a pose, and the angle it is turned by."""
         pose = part.pose
         x, y = _turned([grip.x, grip.y], pose.theta).tolist()
-        at = self._true.apply([pose.x + x, pose.y + y, 0.0])
+        true = self._true.apply([pose.x + x, pose.y + y, 0.0])
         heading = pose.theta + grip.theta + math.atan2(*self._true.rotation[1::-1, 0])
-        offset = complex(at[0] - located[0], at[1] - located[1])
+        offset = complex(true[0] - located[0], true[1] - located[1])
         return offset, math.remainder(located[2] - heading, math.tau)
 
 

@@ -268,7 +268,7 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     """
     sight = table.look((x, y, ABOVE), MAPS)
     average, smooth = TemporalFilter(delta=EDGE), SpatialFilter(delta=EDGE)
-    depth = smooth([average(depth) for depth in sight.depth][-1])
+    depth = smooth([average(each) for each in sight.depth][-1])
     middle = (sight.rgb.shape[1] / 2, sight.rgb.shape[0] / 2)
     high = min(_high(sight, depth), key=lambda region: math.dist(region.centre, middle))
     level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of the region
@@ -332,14 +332,12 @@ def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that describes the regions of a colour, none of which is a block."""
     least, most = _area(sight)
     regions = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))
-    actual = (
-        f"{len(regions)} regions of it, the largest {_shape(regions[0])}"
-        if regions
-        else "none of it"
-    )
+    got = "none of it"
+    if regions:
+        got = f"{len(regions)} regions of it, the largest {_shape(regions[0])}"
     return FrameFormatError(
         f"{ARM}: expected a block on the table of the colour {colours.as_json()}, {least:.0f} to "
-        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {actual}",
+        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {got}",
         source=ARM,
     )
 
@@ -361,15 +359,10 @@ def _text(rows: list[Compared]) -> str:
     head = ("mm, degrees", *(title.rjust(8) for title in ("x", "y", "angle", "height")))
     titles = [title.rjust(8) for title in ("beside", "turned", "higher", "sigma")]
     cells: list[tuple[Any, ...]] = []
-    for label, measured, beside, turned, higher in rows:
-        places = (
-            1e3 * measured.x,
-            1e3 * measured.y,
-            math.degrees(measured.angle),
-            1e3 * measured.height,
-        )
-        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * measured.sigma)
-        known = errors if measured.sigma else errors[:2]  # the height was not measured
+    for label, block, beside, turned, higher in rows:
+        places = (1e3 * block.x, 1e3 * block.y, math.degrees(block.angle), 1e3 * block.height)
+        errors = (1e3 * beside, math.degrees(turned), 1e3 * higher, 1e3 * block.sigma)
+        known = errors if block.sigma else errors[:2]  # otherwise its height was not measured
         shown = [f"{value:8.2f}" for value in (*places, *known)]
         cells.append((label, *shown, *[""] * (8 - len(shown))))
     return table_text((*head, *titles), cells)

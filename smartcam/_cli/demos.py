@@ -106,8 +106,8 @@ async def demo(
     options: Options,
 ) -> None:
     """Show smartcam's main job with an emulated camera over real TCP."""
-    options_given = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
-    given = [name for name, wanted in options_given.items() if wanted]
+    flags = {"--pick": pick, "--fleet": shared, "--tower": tower, "--inspect": inspected}
+    given = [name for name, wanted in flags.items() if wanted]
     if len(given) > 1:
         raise click.UsageError(f"{' and '.join(given)} do not go together")
     if plain and not pick:

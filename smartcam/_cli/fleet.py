@@ -233,16 +233,16 @@ def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
 async def _ask_outlets(url: str, options: Options) -> None:
     """Show the counts of outlets that a fleet's agents report."""
     async with _opened(url, options) as opened:
-        outlets_met = await opened.outlets(timeout=options.step(5.0))
+        outlets = await opened.outlets(timeout=options.step(5.0))
     if options.as_json:
-        for outlet in outlets_met:
+        for outlet in outlets:
             account = outlet._asdict()
             shown = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
             options.show({**shown, "account": account}, "")
         return
     rows = [
         (outlet.agent, outlet.outlet, *_account_row(outlet._asdict()), outlet.trouble or "well")
-        for outlet in outlets_met
+        for outlet in outlets
     ]
     head = ("agent", "outlet", "results", "delivered", "spooled", "dropped", "state")
     click.echo(table_text(head, rows) if rows else "no agent has outlets")

@@ -52,9 +52,8 @@ def numbered(file: str, count: int) -> list[str]:
     if count == 1:
         return [file]
     path, digits = Path(file), max(MIN_NUMBER_DIGITS, len(str(count)))
-    return [
-        str(path.with_stem(f"{path.stem}-{number:0{digits}}")) for number in range(1, count + 1)
-    ]
+    names = [f"{path.stem}-{number:0{digits}}" for number in range(1, count + 1)]
+    return [str(path.with_stem(name)) for name in names]
 
 
 def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:

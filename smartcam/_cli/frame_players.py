@@ -99,10 +99,8 @@ def rtsp_urls(
     server: RtspServer, sources: Sequence[FrameSource], password: str | None
 ) -> dict[str, str]:
     """Return the URLs for players, by name."""
-    credentials = "" if password is None else f"{RTSP_USER}:{password}@"
-    return {
-        name: server.url(name).replace("//", f"//{credentials}", 1) for name in names_of(sources)
-    }
+    login = "" if password is None else f"{RTSP_USER}:{password}@"
+    return {name: server.url(name).replace("//", f"//{login}", 1) for name in names_of(sources)}
 
 
 # ---------------------------------------------------------------------- RTP

@@ -69,9 +69,8 @@ async def list_(scheme: str | None, options: Options) -> None:
 
     known = [info.name for info in FRAMES.available()]
     schemes = known if scheme is None else [scheme]
-    looks = await asyncio.gather(
-        *(_look(scheme, options.step(FRAME_TIMEOUT)) for scheme in schemes)
-    )
+    seconds = options.step(FRAME_TIMEOUT)
+    looks = await asyncio.gather(*(_look(name, seconds) for name in schemes))
     shown: set[str] = set()
     searched = [name for name, look in zip(schemes, looks, strict=True) if look is not None]
     for name, look in zip(schemes, looks, strict=True):
@@ -144,15 +143,10 @@ def _found(source: FoundSource) -> dict[str, Any]:
 
 def _found_text(value: dict[str, Any]) -> str:
     lines = [f"{value['url']}  {value['name']}"]
-    for pixel_format in value["formats"]:
-        rates = (
-            f" at {', '.join(f'{rate:g}' for rate in pixel_format['rates'])}/s"
-            if pixel_format["rates"]
-            else ""
-        )
-        lines.append(
-            f"  {pixel_format['format']} {pixel_format['width']}x{pixel_format['height']}{rates}"
-        )
+    for each in value["formats"]:
+        rates = ", ".join(f"{rate:g}" for rate in each["rates"])
+        at = f" at {rates}/s" if rates else ""
+        lines.append(f"  {each['format']} {each['width']}x{each['height']}{at}")
     if value["remark"]:
         lines.append(f"  {value['remark']}")
     return "\n".join(lines)

@@ -92,7 +92,7 @@ async def gateway(camera: str | None, demo: bool, options: Options, **style: Any
         make = stack.enter_context(options.cameras(url, reconnect=Backoff()))
         first = make()
         server = await stack.enter_async_context(Gateway(first, settings))
-        stack.callback(_log_account, server, options)
+        stack.callback(_print_account, server, options)
 
         def show() -> None:
             value = {"gateway": server.address, "camera": url}
@@ -177,7 +177,7 @@ async def _emulated(options: Options) -> AsyncIterator[str]:
         yield emulator.url
 
 
-def _log_account(server: Gateway, options: Options) -> None:
+def _print_account(server: Gateway, options: Options) -> None:
     """Print the account of all requests and parts."""
     account = server.account
     if options.as_json:

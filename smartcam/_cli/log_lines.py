@@ -73,13 +73,7 @@ class JsonLines(logging.Formatter):
         cameras = self._cameras()
         given = record.args if isinstance(record.args, tuple) else ()
         for argument in given[:2]:
-            name = (
-                argument
-                if isinstance(argument, str)
-                else str(argument)
-                if isinstance(argument, Exception)
-                else ""
-            )
+            name = str(argument) if isinstance(argument, str | Exception) else ""
             for part in (name, name.partition(": ")[0]):
                 if part and part in cameras:
                     return part

@@ -152,12 +152,12 @@ def runs(
 
 
 @contextmanager
-def naming(label: str) -> Iterator[None]:
+def naming(place: str) -> Iterator[None]:
     """Turn errors of a file in the block into a ConfigurationError that names the file."""
     try:
         yield
     except OSError as exc:
-        raise ConfigurationError(f"{label}: {exc.strerror}") from exc
+        raise ConfigurationError(f"{place}: {exc.strerror}") from exc
 
 
 def from_hex(text: str, where: str) -> bytes:
@@ -205,15 +205,15 @@ class Options:
         """Return the bound of a step, seconds."""
         return default if self.timeout is None else self.timeout
 
-    def check_y_down(self, calibration: AnyCalibration, label: str) -> None:
+    def check_y_down(self, calibration: AnyCalibration, option: str) -> None:
         """Raise ConfigurationError if ``--y-down`` differs from a calibration's direction of y.
 
-        ``label``: the option that names the calibration.
+        ``option``: the option that names the calibration.
         """
         if calibration.y_down is not None and calibration.y_down != self.y_down:
             made, then = ("with", "give it") if calibration.y_down else ("without", "leave it out")
             raise ConfigurationError(
-                f"{label}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
+                f"{option}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
             )
 
     async def located(self, url: str) -> str:
@@ -280,23 +280,23 @@ class Options:
         if self.y_down or not fleet:
             options["y_down"] = self.y_down
         if self.calibration is not None:
-            label = f"--calibration {self.calibration}"
+            option = f"--calibration {self.calibration}"
             # without "y_down" the camera checks it, since it learns the agent's value
-            calibration, doubt = self._calibrated(label, check_y_down="y_down" in options)
+            calibration, doubt = self._calibrated(option, check_y_down="y_down" in options)
             options["calibration"] = calibration
             if doubt:
-                click.echo(f"{tinted('error', 'warning:')} {label}: {doubt}", err=True)
+                click.echo(f"{tinted('error', 'warning:')} {option}: {doubt}", err=True)
         return options
 
-    def _calibrated(self, label: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
+    def _calibrated(self, option: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
         """Return the calibration, and the reason to doubt it; "" means none."""
         with from_part("calibration", "--calibration needs"):
             from smartcam.calibration import load_calibration
             from smartcam.calibration._inside import doubt_of
-        with naming(label):
+        with naming(option):
             calibration = load_calibration(self.calibration or "")
         if check_y_down:
-            self.check_y_down(calibration, label)
+            self.check_y_down(calibration, option)
         return calibration, doubt_of(calibration)
 
     @contextmanager

@@ -81,14 +81,8 @@ async def _served(
             server.address,
             _section(namespace or section.namespace, autostart=section.autostart),
             cameras=sections,
-            calibrations={
-                name: calibration
-                for name, calibration in calibrations.items()
-                if calibration is not None
-            },
-            hand_eyes={
-                name: hand_eye for name, hand_eye in hand_eyes.items() if hand_eye is not None
-            },
+            calibrations={name: made for name, made in calibrations.items() if made is not None},
+            hand_eyes={name: made for name, made in hand_eyes.items() if made is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
             desks=server.calibrations,
         ) as ros:

@@ -152,7 +152,7 @@ def _one_line(error: Exception) -> str:
     hung_up = (
         isinstance(error, ConnectionLostError)
         and isinstance(cause, ConnectionError)
-        and not isinstance(cause, LinkError)  # an event such as the loss of an agent
+        and not isinstance(cause, LinkError)  # such as a lost agent
     )
     return f"{text}. {TAKEN_ADVICE}" if hung_up else text
 

@@ -153,7 +153,7 @@ class Serving:
                 await stack.enter_async_context(self._server)
             except ConnectFailedError as exc:
                 if self._server.file.endpoints[0] or not policy.transient(exc):
-                    raise  # the site cannot listen, or its token would never be accepted
+                    raise  # the agent cannot listen, or would never be accepted
                 if not warned:
                     self._warn(f"{exc}; it is tried on")
                 warned = True

@@ -215,12 +215,12 @@ class CommandTable(MutableMapping[str, click.Command]):
         self._commands: dict[str, Listed | click.Command] = {**listed}
 
     def __getitem__(self, name: str) -> click.Command:
-        summary = self._commands[name]
-        if isinstance(summary, Listed):
+        command = self._commands[name]
+        if isinstance(command, Listed):
             with importing():
-                module = _module(name, summary)
-            summary = self._commands[name] = cast("click.Command", getattr(module, name))
-        return summary
+                module = _module(name, command)
+            command = self._commands[name] = cast("click.Command", getattr(module, name))
+        return command
 
     def __setitem__(self, name: str, command: click.Command) -> None:
         self._commands[name] = command

@@ -117,9 +117,8 @@ def _change(
     if learn:
         if not pictures:
             raise click.UsageError("--learn: expected PICTURES of good parts, got none")
-        tools, remarks = learned(
-            tools, {str(file): program.inspect(picture) for file, picture in pictures}
-        )
+        seen = {str(file): program.inspect(picture) for file, picture in pictures}
+        tools, remarks = learned(tools, seen)
         program = teaching.program(tools)
     for file, picture in pictures:
         _show(str(file), program.inspect(picture), options)

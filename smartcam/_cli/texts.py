@@ -108,7 +108,7 @@ def value_text(value: Any, units: ShownUnits, layout: Layout | None) -> str:
     plain, symbols = jsonable(value), units_of(value, layout)
     if isinstance(plain, dict):
         lists = {name: units_of(getattr(value, name, None)) for name in plain}
-        texts = (_field_text(name, value, symbols, units, lists) for name, value in plain.items())
+        texts = (_field_text(name, field, symbols, units, lists) for name, field in plain.items())
         return "\n".join(texts)
     if _is_table(plain):
         return _records_text(plain, symbols, units)

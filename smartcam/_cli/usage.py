@@ -152,11 +152,8 @@ def _options_suggested() -> Iterator[None]:
             raise
         from smartcam._suggestions import did_you_mean
 
-        known = [
-            name
-            for parameter in exc.ctx.command.params
-            for name in (*parameter.opts, *parameter.secondary_opts)
-        ]
+        params = exc.ctx.command.params
+        known = [name for each in params for name in (*each.opts, *each.secondary_opts)]
         names = [name for name in known if name.startswith("--")]
         end = did_you_mean(exc.option_name, names) or "."
         text = f"No such option {exc.option_name!r}{end}"

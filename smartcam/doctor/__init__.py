@@ -251,10 +251,8 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         async with asyncio.timeout(limit):
             await check.run(exam)
             if not check.in_session:
-                return (
-                    not any(finding.exit_code for finding in exam.pending)
-                    or exam.camera is not None
-                )
+                failed = any(finding.exit_code for finding in exam.pending)
+                return not failed or exam.camera is not None
             if not exam.connected_camera.connected and check.name != "clock":
                 await exam.connected_camera.query_application()  # raises the reason
     except LinkError as exc:

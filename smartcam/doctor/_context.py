@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_STATUSES = 1000
+MAX_OBSERVED = 1000
 """Largest number of statuses and arrival times kept: 300 results per second for 3 seconds."""
 
 MAX_CONTAINERS = 32
@@ -88,8 +88,8 @@ class Witness(Observer):
     """
 
     def __init__(self) -> None:
-        self.statuses: deque[Status] = deque(maxlen=MAX_STATUSES)
-        self.arrivals: deque[float] = deque(maxlen=MAX_STATUSES)
+        self.statuses: deque[Status] = deque(maxlen=MAX_OBSERVED)
+        self.arrivals: deque[float] = deque(maxlen=MAX_OBSERVED)
         self.containers: deque[Result] = deque(maxlen=MAX_CONTAINERS)
         self.results: int = 0
         self.unreadable: InterpretationError | None = None

@@ -110,22 +110,20 @@ def ports_of(
             )
     if not chosen:
         raise ConfigurationError("find: no protocol is named")
-    protocols_of_port: dict[int, tuple[Protocol, ...]] = {}
+    by_port: dict[int, tuple[Protocol, ...]] = {}
     for name in chosen:
         port = known[name].default_port
-        protocols_of_port[port] = (*protocols_of_port.get(port, ()), known[name])
+        by_port[port] = (*by_port.get(port, ()), known[name])
     for number in check_all(further, "ports", "numbers of ports", "find"):
         port = check_integer(number, "port", 1, 0xFFFF, "find")
-        protocols_here = protocols_of_port.get(port, ())
-        protocols_of_port[port] = (
-            *protocols_here,
-            *(known[name] for name in chosen if known[name] not in protocols_here),
+        here = by_port.get(port, ())
+        by_port[port] = (
+            *here,
+            *(known[name] for name in chosen if known[name] not in here),
         )
-    if len(protocols_of_port) > MAX_PORTS:
-        raise ConfigurationError(
-            f"find: {len(protocols_of_port)} ports: expected {MAX_PORTS} at most"
-        )
-    return protocols_of_port
+    if len(by_port) > MAX_PORTS:
+        raise ConfigurationError(f"find: {len(by_port)} ports: expected {MAX_PORTS} at most")
+    return by_port
 
 
 def serves_one(protocol: Protocol) -> bool:
@@ -139,14 +137,8 @@ def _scheme(protocol: Protocol) -> str:
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
     """Raise ConfigurationError if asking at these ports may take a camera from its client."""
-    names = sorted(
-        {
-            protocol.name
-            for several in ports.values()
-            for protocol in several
-            if serves_one(protocol)
-        }
-    )
+    known = [protocol for several in ports.values() for protocol in several]
+    names = sorted({protocol.name for protocol in known if serves_one(protocol)})
     if names:
         raise ConfigurationError(
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
@@ -162,12 +154,8 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
     """Return an open port with the protocols that fit the received bytes."""
     received = opened.received.lstrip()
-    greeted = [
-        protocol
-        for protocol in protocols
-        if protocol.greeting and received.startswith(protocol.greeting)
-    ]
-    possible = greeted or [protocol for protocol in protocols if _may_be(protocol, opened)]
+    greeted = [each for each in protocols if each.greeting and received.startswith(each.greeting)]
+    possible = greeted or [each for each in protocols if _may_be(each, opened)]
     evidence: Evidence = "silent"
     if greeted:
         evidence = "greeted"

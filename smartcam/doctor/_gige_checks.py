@@ -134,8 +134,8 @@ async def examine_gige(
         except FrameSourceError as exc:
             exam.fail(f"this check failed: {exc}", "", Exit.NO_SESSION)
             over = True
-        earlier, exam.findings = exam.findings, []
-        for finding in earlier:
+        findings, exam.findings = exam.findings, []
+        for finding in findings:
             yield finding
         if over:
             return
@@ -170,9 +170,7 @@ async def _look_at_networks(exam: _GigEExamination) -> None:
         exam.add("hint", "the networks of this machine cannot be listed here")
         return
     host = ipaddress.IPv4Address(exam.host)
-    around = [
-        network for network in networks if network.network is not None and host in network.network
-    ]
+    around = [each for each in networks if each.network is not None and host in each.network]
     named = ", ".join(f"{network.address} in {network.network}" for network in networks)
     if not around:
         exam.add(

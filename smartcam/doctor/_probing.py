@@ -67,7 +67,7 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol differs from the given address' one.
+        other: whether the protocol differs from the one of the given address.
     """
 
     address: Address
@@ -106,7 +106,7 @@ def ways(address: Address) -> list[Way]:
     its protocol fails to load.
     """
     protocol, parameters = load_protocol(address.protocol), dict(address.parameters)
-    ways_found: list[Way] = []
+    made: list[Way] = []
     for scheme in sorted(protocol.schemes, key=lambda scheme: scheme != address.scheme):
         transport = protocol.schemes[scheme]
         groups = protocol.tries(transport, parameters=parameters)
@@ -115,8 +115,8 @@ def ways(address: Address) -> list[Way]:
             others = [tuple(d for d in group if d.name != address.dialect) for group in groups]
             groups = pinned + [group for group in others if group]
         at = address._replace(scheme=scheme)
-        ways_found += [Way(at, transport, group) for group in groups]
-    return ways_found
+        made += [Way(at, transport, group) for group in groups]
+    return made
 
 
 def other_ways(address: Address) -> list[Way]:
@@ -126,17 +126,17 @@ def other_ways(address: Address) -> list[Way]:
     uses its own default.
     """
     own_protocol = load_protocol(address.protocol)
-    ways_found: list[Way] = []
+    made: list[Way] = []
     for protocol in known_protocols():
         if protocol.name == own_protocol.name:
             continue
         port = protocol.default_port if address.port == own_protocol.default_port else address.port
         scheme = next(iter(protocol.schemes))
         try:
-            ways_found += ways(Address(protocol.name, scheme, address.host, port))
+            made += ways(Address(protocol.name, scheme, address.host, port))
         except ConfigurationError:  # the protocol needs more than the URL has, such as a login
             continue
-    return ways_found
+    return made
 
 
 async def trials(
@@ -158,13 +158,11 @@ async def trials(
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
-    ways_found = ways(address)
+    made = ways(address)
     if every_protocol:
-        first = ways_found[0].transport
-        ways_found = sorted(
-            [*ways_found, *other_ways(address)], key=lambda way: way.transport is not first
-        )
-    left = collections.deque((way, True) for way in ways_found)
+        first = made[0].transport
+        made = sorted([*made, *other_ways(address)], key=lambda way: way.transport is not first)
+    left = collections.deque((way, True) for way in made)
     while left:
         way, disconnect_first = left.popleft()
         share = max(0.0, deadline - loop.time()) / (len(left) + 1)
@@ -184,10 +182,7 @@ def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) 
     if greeted is not None:
         place = (greeted, trial.address.port)
         order = sorted(
-            left,
-            key=lambda way_and_flag: (
-                (way_and_flag[0].address.protocol, way_and_flag[0].address.port) != place
-            ),
+            left, key=lambda pair: (pair[0].address.protocol, pair[0].address.port) != place
         )
         left.clear()
         left.extend(order)
@@ -197,8 +192,8 @@ def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
     """Return the protocol whose greeting a try has received, None without one."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
-    first_frame = next((frame.hex for frame in trial.frames if frame.direction == "!"), "")
-    start = bytes.fromhex(first_frame).lstrip()
+    unread = next((entry.hex for entry in trial.frames if entry.direction == "!"), "")
+    start = bytes.fromhex(unread).lstrip()
     return next((name for name in names if _greets(load_protocol(name), start)), None)
 
 
@@ -240,7 +235,7 @@ def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectF
     )
 
 
-def by_telling(trials_made: Iterable[Trial]) -> list[Trial]:
+def by_telling(failed: Iterable[Trial]) -> list[Trial]:
     """Return failed tries, the most informative first.
 
     The order: a refusal, bytes of a frame that is no message, other bytes, silence, no link.
@@ -252,7 +247,7 @@ def by_telling(trials_made: Iterable[Trial]) -> list[Trial]:
         garbage = isinstance(trial.error, ProtocolError)
         return (not refused, not trial.received, not garbage, not linked)
 
-    return sorted(trials_made, key=rank)
+    return sorted(failed, key=rank)
 
 
 async def _try(

@@ -266,7 +266,7 @@ def _look_at_values(
     exam: Examination, layout: Layout, readings: list[Reading], *, integers: bool
 ) -> None:
     """Give a hint for each field whose values are not plausible in its unit, or without one."""
-    values: dict[str, float] = {}  # largest magnitude by field
+    largest: dict[str, float] = {}  # largest magnitude by field
     # converted values, by unit
     converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERTED}
     nonsense: dict[str, float] = {}
@@ -282,7 +282,7 @@ def _look_at_values(
                 ):
                     nonsense.setdefault(field.name, value)
                 elif field.unit is None:
-                    values[field.name] = max(value, values.get(field.name, 0.0))
+                    largest[field.name] = max(value, largest.get(field.name, 0.0))
                 elif field.unit in CONVERTED and not field.wire.is_integer:
                     of_unit = converted[field.unit]
                     of_unit[field.name] = max(value, of_unit.get(field.name, 0.0))
@@ -298,7 +298,7 @@ def _look_at_values(
             field=name,
             value=value,
         )
-    for name, value in values.items():
+    for name, value in largest.items():
         rule = next((rule for rule in PLAUSIBLE if rule.names.search(name)), None)
         if rule is not None and value > rule.most:
             kind = next(field for field in fields if field.name == name)

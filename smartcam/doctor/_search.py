@@ -212,11 +212,7 @@ class CameraSearch:
         Cancellation: every connection is closed; the results stay.
         """
         addresses = AddressSet([span for each in self._networks for span in await _spans(*each)])
-        leave = [
-            (text, left_span)
-            for text, span in self._leave
-            for left_span in await _spans(text, span)
-        ]
+        leave = [(text, each) for text, span in self._leave for each in await _spans(text, span)]
         _check_count(len(addresses), self._max_addresses)
         for text, span in leave:
             if span.size == 1 and span.first in addresses:

@@ -133,13 +133,13 @@ def _report_session(
 
 async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Report why there is no session; return a camera if another way leads to one."""
-    address, trials_made = exam.address, await _try_all(exam)
-    answer = trials_made[-1].answer
+    given, tries = exam.address, await _try_all(exam)
+    answer = tries[-1].answer
     if answer is None:
-        _report_no_session(exam, trials_made, None)
+        _report_no_session(exam, tries, None)
         return None
     exam.pin(answer.url)
-    if exam.address.scheme == address.scheme and address.dialect in {None, exam.address.dialect}:
+    if exam.address.scheme == given.scheme and given.dialect in {None, exam.address.dialect}:
         exam.report(
             "warning",
             f"no session at first ({failure}), and one a moment later",
@@ -148,7 +148,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
             attempts=list(failure.attempts),
         )
     else:
-        _report_no_session(exam, trials_made, answer)
+        _report_no_session(exam, tries, answer)
     try:
         return await exam.make_camera().open()
     except ConnectFailedError as exc:
@@ -164,44 +164,42 @@ async def _try_all(exam: Examination) -> list[Trial]:
         return [trial async for trial in tries]
 
 
-def _report_no_session(
-    exam: Examination, trials_made: list[Trial], answer: CameraAnswer | None
-) -> None:
-    address = trials_made[0].address
-    reason, trial = _reason(trials_made, pinned=address.dialect is not None)
+def _report_no_session(exam: Examination, tries: list[Trial], answer: CameraAnswer | None) -> None:
+    address = tries[0].address
+    reason, trial = _reason(tries, pinned=address.dialect is not None)
     filled = words(trial, address, load_protocol(address.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
-        others = [other for other in by_telling(trials_made) if other is not trial]
+        others = [other for other in by_telling(tries) if other is not trial]
         also = f" Also tried: {_folded(others)}." if others else ""
         cure = reason.cure.format(**filled) + also
     exam.fail(
         reason.text.format(**filled),
         cure,
-        tries=[str(trial) for trial in trials_made],
-        frames=[tuple(trial.frames) for trial in trials_made],
+        tries=[*map(str, tries)],
+        frames=[tuple(each.frames) for each in tries],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _reason(trials_made: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
+def _reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     """Return the reason why the URL gives no session, and the try that shows it."""
-    first = trials_made[0]
-    trials_alike = [
+    first = tries[0]
+    alike = [
         trial
-        for trial in trials_made
+        for trial in tries
         if trial.transport == first.transport
         and not trial.other
         and (trial.dialect == first.dialect or not pinned)
     ]
-    return reason_for(trials_alike)
+    return reason_for(alike)
 
 
-def _folded(trials_made: list[Trial]) -> str:
+def _folded(tries: list[Trial]) -> str:
     """Return tries in one line, with equal outcomes of a transport's dialects together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for trial in trials_made:
+    for trial in tries:
         at = f" at port {trial.address.port}" if trial.other else ""
         key = (f"{trial.transport.upper()}{at}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)

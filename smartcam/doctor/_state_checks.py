@@ -94,11 +94,11 @@ async def look_at_status(exam: Examination) -> None:
     capable = camera.capabilities
     status = await camera.query_status() if capable.get_status else camera.status
     wrong = [condition for condition in _CONDITIONS if condition.bit in status]
-    for reading in wrong:
-        sticky = reading.bit is Status.OVERTRIGGERED and capable.reset_errors
-        cure = reading.cure + (_STICKY if sticky else "")
+    for condition in wrong:
+        sticky = condition.bit is Status.OVERTRIGGERED and capable.reset_errors
+        cure = condition.cure + (_STICKY if sticky else "")
         exam.report(
-            reading.severity, reading.text, cure, exit_code=reading.exit_code, status=status
+            condition.severity, condition.text, cure, exit_code=condition.exit_code, status=status
         )
     if not wrong:
         exam.report("ok", f"no fault is reported: {status}", status=status)
@@ -163,17 +163,15 @@ async def watch(exam: Examination) -> None:
     camera, witness, seconds = exam.connected_camera, exam.witness, exam.options.seconds
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
-        return  # the status was reported already, and explains the rest
+        return  # this was reported already, and explains the rest
     settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
     seen = [status] if settled else await _watch(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
     stopped = _is_stopped(seen[-1])  # the camera may have stopped since
     if any(_waits(status) for status in seen) and not stopped:
         exam.may_trigger = True
-        results_text = (
-            f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
-        )
-        text = f"{called(application)} runs and waits for triggers{results_text}"
+        text = f"{called(application)} runs and waits for triggers"
+        text += f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
         exam.report("ok", text, **details, **_rate(witness))
     elif witness.results and not stopped:
         _report_free_run(exam, details)

@@ -30,7 +30,7 @@ class Figures(NamedTuple):
 
     def __str__(self) -> str:
         """Return the figures as text, in milliseconds."""
-        low, middle, high, jitter = (f"{1e3 * time:.1f}" for time in self[1:])
+        low, middle, high, jitter = (f"{1e3 * seconds:.1f}" for seconds in self[1:])
         return f"min {low}, median {middle}, p99 {high} ms, jitter {jitter} ms"
 
 

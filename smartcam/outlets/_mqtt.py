@@ -71,11 +71,7 @@ def _broker(text: str) -> str:
 
 
 def _prefix(text: str) -> str:
-    if (
-        any(character in text for character in "+#\0")
-        or text.startswith(("/", "$"))
-        or text.endswith("/")
-    ):
+    if set("+#\0") & set(text) or text.startswith(("/", "$")) or text.endswith("/"):
         raise ValueError("expected a topic without + and #, such as plant1/smartcam")
     return text
 
@@ -272,17 +268,17 @@ class MqttOutlet(Outlet[MqttSettings]):
 
     async def _while_here(self, calls: list[Any]) -> None:
         """Publish messages concurrently, in order, while the broker is connected."""
-        hearing_task = self._hearing
-        if hearing_task is None:
+        hearing = self._hearing
+        if hearing is None:
             for call in calls:
                 call.close()
             raise OutletError("not connected to the broker")
         publishing: asyncio.Future[Any] = asyncio.gather(*calls)
         try:
-            ends: set[asyncio.Future[Any]] = {publishing, hearing_task}
+            ends: set[asyncio.Future[Any]] = {publishing, hearing}
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-            if hearing_task.done():
-                hearing_task.result()
+            if hearing.done():
+                hearing.result()
             await publishing
         finally:
             publishing.cancel()
@@ -325,17 +321,17 @@ class MqttOutlet(Outlet[MqttSettings]):
         """Publish states and receive commands until the broker's connection is lost."""
         loop = asyncio.get_running_loop()
         telling = loop.create_task(self._send_states(client))
-        listening_task = loop.create_task(self._take_commands(client))
+        commands = loop.create_task(self._take_commands(client))
         try:
-            await asyncio.wait({telling, listening_task}, return_when=asyncio.FIRST_COMPLETED)
-            for task in (telling, listening_task):
+            await asyncio.wait({telling, commands}, return_when=asyncio.FIRST_COMPLETED)
+            for task in (telling, commands):
                 if task.done():
                     task.result()
             raise OutletError("the broker is gone")
         finally:
-            for task in (telling, listening_task):
+            for task in (telling, commands):
                 task.cancel()
-            await asyncio.wait({telling, listening_task})
+            await asyncio.wait({telling, commands})
 
     async def _send_states(self, client: Any) -> None:
         while True:

@@ -154,7 +154,7 @@ class Outlets(Server):
         """
         check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
         answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
-        return {name: rows for name, rows in answers.items() if rows is not None}
+        return {name: answer for name, answer in answers.items() if answer is not None}
 
     # ------------------------------------------------------------------ what cameras bring
 
@@ -217,8 +217,8 @@ def _result(
         raise
     except BaseException as exc:  # noqa: BLE001 - an interpreter is a plug-in
         text = str(exc) if isinstance(exc, SmartCamError) else text_of(exc)
-        stored = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
-        return "error", application, object_text({**result._asdict(), "value": None, **stored})
+        failure = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
+        return "error", application, object_text({**result._asdict(), "value": None, **failure})
 
 
 def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import itertools
 import logging
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
@@ -95,9 +96,8 @@ class Pump:
         self.trouble = self.disk_trouble = ""
         self._waiting: collections.deque[Arrival] = collections.deque()
         self._waiting_bytes = 0
-        self._lost: dict[
-            str, tuple[Arrival, int]
-        ] = {}  # dropped entries that no gap stands for yet
+        # dropped entries that no gap stands for yet
+        self._lost: dict[str, tuple[Arrival, int]] = {}
         self._numbers: dict[str, int] = {}
         self._arrived, self._spooled = asyncio.Event(), asyncio.Event()
         self._account = OutletAccount()
@@ -221,9 +221,7 @@ class Pump:
 
     async def _store_waiting(self) -> None:
         """Write the first waiting entries; if none wait, the gaps of dropped ones."""
-        batch = [
-            arrival for arrival, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)
-        ]
+        batch = [*itertools.islice(self._waiting, MAX_WRITTEN_TOGETHER)]
         lost = {} if batch else dict(self._lost)
         await self._store_arrivals(batch, lost)
 
@@ -391,16 +389,16 @@ class Pump:
             Exception: the server is lost.
         """
         loop = asyncio.get_running_loop()
-        arrival = loop.create_task(self._spooled.wait())
+        spooled = loop.create_task(self._spooled.wait())
         watching = loop.create_task(self.outlet.watch())
         try:
-            await asyncio.wait({arrival, watching}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({spooled, watching}, return_when=asyncio.FIRST_COMPLETED)
             if watching.done():
                 watching.result()
         finally:
-            for task in (arrival, watching):
+            for task in (spooled, watching):
                 task.cancel()
-            await asyncio.wait({arrival, watching})
+            await asyncio.wait({spooled, watching})
 
     def _report_delivery(self, why: str) -> None:
         if why != self.trouble:

@@ -226,14 +226,11 @@ class Spool:
 
     def _forget_damaged(self) -> None:
         pattern = f"{self.path.name}.damaged-*"
-        names = sorted(
-            path
-            for path in self.path.parent.glob(pattern)
-            if path.name[-4:] not in ("-wal", "-shm")
-        )
-        for name in names[:-MAX_DAMAGED_FILES]:
+        found = self.path.parent.glob(pattern)
+        paths = sorted(path for path in found if path.name[-4:] not in ("-wal", "-shm"))
+        for path in paths[:-MAX_DAMAGED_FILES]:
             for suffix in ("", "-wal", "-shm"):
-                name.with_name(name.name + suffix).unlink(missing_ok=True)
+                path.with_name(path.name + suffix).unlink(missing_ok=True)
 
     @property
     def _open_database(self) -> sqlite3.Connection:
@@ -265,10 +262,8 @@ class Spool:
             results = sum(entry.kind != "gap" for entry in entries)
             new["results"] = new.get("results", 0) + results
             taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
-            accepted, refused = (
-                entries[:taken],
-                [entry for entry in entries[taken:] if entry.kind != "gap"],
-            )
+            accepted = entries[:taken]
+            refused = [entry for entry in entries[taken:] if entry.kind != "gap"]
             size = self._write(database, accepted)
             for last, count in _by_camera(refused):
                 _add_gap(database, last, count, "the spool was full", self._in_flight)
@@ -542,10 +537,10 @@ def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
 
 def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
     """Return the last entry of each camera, and the number of the camera's entries."""
-    gaps: dict[str, tuple[OutletEntry, int]] = {}
+    counted: dict[str, tuple[OutletEntry, int]] = {}
     for entry in entries:
-        gaps[entry.camera] = entry, gaps.get(entry.camera, (entry, 0))[1] + 1
-    return [*gaps.values()]
+        counted[entry.camera] = entry, counted.get(entry.camera, (entry, 0))[1] + 1
+    return [*counted.values()]
 
 
 def _add_gap(
@@ -570,19 +565,19 @@ def _add_gap(
         unknown: whether more may be missing than the count.
     """
     unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
-    for gap_place, checksum, *fields in database.execute(
+    for older_place, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
         (last.camera, in_flight, MAX_PLACE if place is None else place),
     ):
         entry = OutletEntry(*fields)
-        if entry.kind != "gap" or _checksum(entry, gap_place) != checksum:
+        if entry.kind != "gap" or _checksum(entry, older_place) != checksum:
             break
         older = json.loads(entry.body)
         count += older["lost"]
         unknown = unknown or older["at_least"]
         reasons.append(older["error"])
-        gone.append((gap_place,))
+        gone.append((older_place,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
     each = dict.fromkeys(reason for text in reversed(reasons) for reason in text.split("; "))
     error = "; ".join(each)[:MAX_REASON_CHARACTERS]

@@ -132,9 +132,9 @@ def _failure_condition(database: sqlite3.Connection) -> str:
         if good is not None:
             quoted = column.replace('"', '""')
             conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
-    conditions_sql = [
+    clauses = [
         f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
         for application, each in conditions.items()
     ]
-    either = " OR ".join(["kind != 'result'", *conditions_sql])
+    either = " OR ".join(["kind != 'result'", *clauses])
     return f"({either})"

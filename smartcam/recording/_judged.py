@@ -122,11 +122,7 @@ class PictureMatcher:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
         return next(
-            (
-                picture
-                for picture in pictures
-                if (picture.result_number, picture.result_received_at) == key
-            ),
+            (seen for seen in pictures if (seen.result_number, seen.result_received_at) == key),
             None,
         )
 
@@ -137,13 +133,11 @@ class PictureMatcher:
         if self._dropped >= triggered:
             return None
         for picture in self._pictures:
-            began = picture.frame.utc - picture.frame.duration
-            if (
-                picture.result_number is None
-                and triggered <= began <= picture.frame.utc <= received
-            ):
-                missing = picture.left_out or picture.frame.lost  # perhaps the result's picture
-                return None if missing else picture.frame
+            frame = picture.frame
+            began = frame.utc - frame.duration
+            if picture.result_number is None and triggered <= began <= frame.utc <= received:
+                missing = picture.left_out or frame.lost  # perhaps the result's picture
+                return None if missing else frame
         return None
 
 

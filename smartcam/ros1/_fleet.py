@@ -48,9 +48,8 @@ class RosbridgeFleet(RosFleet):
     @property
     def bridged(self) -> list[RosbridgeNode]:
         """The nodes, in the order of their names."""
-        return sorted(
-            (node.node for node in self.nodes.values()), key=lambda service: service.full_name
-        )
+        nodes = [camera.node for camera in self.nodes.values()]
+        return sorted(nodes, key=lambda node: node.full_name)
 
     async def wait_first_attempts(self) -> None:
         """Wait, for a bounded time, until every node is connected or has failed to connect."""

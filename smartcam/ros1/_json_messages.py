@@ -173,7 +173,7 @@ def _checked_value(
             if type(item) not in allowed:
                 raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {item!r:.80}")
         if field.type == "byte":
-            values = [value + 256 if -128 <= value < 0 else value for value in values]
+            values = [item + 256 if -128 <= item < 0 else item for item in values]
         return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:

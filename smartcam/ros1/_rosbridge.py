@@ -348,9 +348,8 @@ class RosbridgeNode(NamedNode):
         new, leaving = self._new, [*self._leaving]
         self._new = []
         await asyncio.gather(*(service.still() for service in leaving))
-        await retire(
-            self._link.url, list(dict.fromkeys(service.name for service in (*leaving, *new)))
-        )
+        names = dict.fromkeys(service.name for service in (*leaving, *new))
+        await retire(self._link.url, list(names))
         if leaving:  # first handle calls that the bridge has aborted
             await self.ask(PROBED_SERVICE, {})
         self._leaving = self._leaving[len(leaving) :]
@@ -407,7 +406,7 @@ class RosbridgeNode(NamedNode):
             logger.warning("%s: no call: %.200r", self.full_name, operation)
             return
         service = self._services.get(name)
-        if any(service.name == name for service in self._leaving):
+        if any(left.name == name for left in self._leaving):
             return  # the call fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)

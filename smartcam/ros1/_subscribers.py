@@ -28,15 +28,13 @@ async def listen_for_subscribers(
     for publisher in publishers.values():
         publisher.subscribed = True
     while True:
-        for publisher in [
-            publisher for publisher in publishers.values() if publisher.type.name in LARGE_TYPES
-        ]:
+        for publisher in [each for each in publishers.values() if each.type.name in LARGE_TYPES]:
             answer = await node.ask(SERVICE, {"topic": publisher.name})
             values = answer.get("values") if answer else None
             names = values.get("subscribers") if isinstance(values, dict) else None
             if not isinstance(names, list):
-                for known in publishers.values():
-                    known.subscribed = True
+                for each in publishers.values():
+                    each.subscribed = True
                 return
             publisher.subscribed = bool(names)
         await asyncio.sleep(PERIOD)

@@ -147,9 +147,9 @@ class CameraLog(Sequence["LogEntry"]):
         __tracebackhide__ = True
         grace = check_seconds(grace, "grace", "expect_nothing_while_busy")
         timeout = check_seconds(timeout, "timeout", "expect_nothing_while_busy")
-        for message in also:
-            if not (isinstance(message, type) and issubclass(message, m.Message)):
-                raise wrong_argument("also", "types of messages", message)
+        for kind in also:
+            if not (isinstance(kind, type) and issubclass(kind, m.Message)):
+                raise wrong_argument("also", "types of messages", kind)
         allowed = (*ALLOWED_WHILE_BUSY, *also)
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
@@ -201,13 +201,13 @@ class CameraLog(Sequence["LogEntry"]):
         end = time.monotonic() + timeout
         while True:
             entries = self._read()
-            found_text = finding(entries)
+            failure = finding(entries)
             gone = self._pushed_out()
             missing = f"{gone} older entries were pushed out of the full log" if gone else None
-            if found_text is None and not (missing and whole):
+            if failure is None and not (missing and whole):
                 return
-            if time.monotonic() >= end or found_text is None:
-                reasons = [text for text in (found_text, missing) if text]
+            if time.monotonic() >= end or failure is None:
+                reasons = [text for text in (failure, missing) if text]
                 raise AssertionError("\n".join([*reasons, _shown(entries)]))
             time.sleep(CHECK_INTERVAL)
 

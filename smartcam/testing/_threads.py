@@ -298,11 +298,11 @@ class ThreadedCamera(_InLoop):
         else:
             await asyncio.wrap_future(future)
 
-    def _bvs(self, label: str) -> EmulatedCamera:
+    def _bvs(self, ability: str) -> EmulatedCamera:
         """Return the emulator; UnsupportedError: it is of another make."""
         if isinstance(self._emulator, EmulatedCamera):
             return self._emulator
-        raise UnsupportedError(f"{self._emulator!r} has no {label}; an EmulatedCamera has")
+        raise UnsupportedError(f"{self._emulator!r} has no {ability}; an EmulatedCamera has")
 
     def _look(self, function: Callable[[], T]) -> T:
         """Call a function in the thread; in the caller's if the thread has ended."""

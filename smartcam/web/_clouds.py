@@ -130,8 +130,8 @@ class CloudSite(ThreadedSite):
             made = loop.run_in_executor(self._threads, packed, self._cloud)
             made.add_done_callback(_mark_handled)
             self._packing = (self._number, made)
-        cloud_packed, job = self._packing
-        return cloud_packed, await asyncio.shield(job)
+        packed_number, job = self._packing
+        return packed_number, await asyncio.shield(job)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the cloud and the number of viewers, as values for JSON."""

@@ -73,7 +73,7 @@ class Visitor(asyncio.Protocol):
         self._head: bytearray | None = None  # received part of an unfinished head
         self._idle = False  # between requests, when the next may take long
         # body of a request that was refused before its end
-        self._stream: StreamReader | None = None
+        self._body: StreamReader | None = None
         self._peer = "?"
 
     # ------------------------------------------------------------------ from the transport
@@ -122,8 +122,8 @@ class Visitor(asyncio.Protocol):
         self._acceptor.leave(self)
         if self._inner is not None:
             self._inner.connection_lost(exc)
-        if self._stream is not None:  # aiohttp would still wait for its end
-            self._stream.feed_eof()
+        if self._body is not None:  # aiohttp would still wait for its end
+            self._body.feed_eof()
 
     # ------------------------------------------------------------------ from the site
 
@@ -139,7 +139,7 @@ class Visitor(asyncio.Protocol):
                 self._head, self._idle = bytearray(), True
                 self._acceptor.expect(self, KEEP_ALIVE_TIMEOUT, "no request")
             else:  # the connection ends with the request
-                self._stream = request.content
+                self._body = request.content
                 self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager

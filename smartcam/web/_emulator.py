@@ -186,13 +186,13 @@ def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
     return site.cameras[_name(site, call)]
 
 
-def _operator(site: EmulatorSite, call: CallRequest, label: str) -> Any:
+def _operator(site: EmulatorSite, call: CallRequest, action: str) -> Any:
     """Return a method of the camera's operator; RefusedError: the camera does not have it."""
     emulator = _emulator(site, call)
-    if not hasattr(emulator.device, label):
+    if not hasattr(emulator.device, action):
         able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
-        raise RefusedError(409, f"{label} of a camera that speaks {emulator.dialect}", able)
-    return getattr(emulator.device, label)
+        raise RefusedError(409, f"{action} of a camera that speaks {emulator.dialect}", able)
+    return getattr(emulator.device, action)
 
 
 def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
@@ -303,7 +303,7 @@ def _kinds(_site: EmulatorSite, _ask: CallRequest) -> object:
 
 @CALLS.add("GET", f"{_CAMERA}/faults")
 def _faults(site: EmulatorSite, call: CallRequest) -> object:
-    """Waiting faults, and the last past ones."""
+    """Waiting faults, and the last ones that have happened."""
     return serialize.faults_state(_emulator(site, call))
 
 

@@ -61,8 +61,6 @@ def refused_fields(error: ValidationError) -> RefusedError:
         }
         for item in error.errors(include_url=False)
     )
-    received = "; ".join(
-        f"{refused['field'] or 'the body'}: {refused['came']}" for refused in fields
-    )
-    expected = "; ".join(refused["expected"] for refused in fields)
+    received = "; ".join(f"{field['field'] or 'the body'}: {field['came']}" for field in fields)
+    expected = "; ".join(field["expected"] for field in fields)
     return RefusedError(422, received, expected, fields)

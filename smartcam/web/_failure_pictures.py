@@ -40,7 +40,7 @@ class FailurePictures:
 
     def __init__(self, view: FleetView) -> None:
         self._view = view
-        self._rows_with_pictures: collections.deque[tuple[FleetRow, int, int]] = collections.deque()
+        self._attached: collections.deque[tuple[FleetRow, int, int]] = collections.deque()
         self._bytes = 0
 
     async def run(self) -> None:
@@ -68,9 +68,9 @@ class FailurePictures:
         if row.failure != serial:
             return
         row.history.attach(serial, data)
-        self._rows_with_pictures.append((row, serial, len(data)))
+        self._attached.append((row, serial, len(data)))
         self._bytes += len(data)
-        while self._bytes > MAX_BYTES or len(self._rows_with_pictures) > MAX_PICTURES:
-            oldest, number, size = self._rows_with_pictures.popleft()
+        while self._bytes > MAX_BYTES or len(self._attached) > MAX_PICTURES:
+            oldest, number, size = self._attached.popleft()
             oldest.history.drop_picture(number)
             self._bytes -= size

@@ -259,7 +259,7 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     "(errors, gaps, failures), `camera` (a pattern), `most`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
-    return {"stores": [result._asdict() for result in await site.outlets.stored(call.query)]}
+    return {"stores": [answer._asdict() for answer in await site.outlets.stored(call.query)]}
 
 
 def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:

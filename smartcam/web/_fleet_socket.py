@@ -81,7 +81,7 @@ class FleetSocket(PageSocket):
         self._sight = RowsInSight()
         self._moved = asyncio.Event()  # set when other rows are in sight
         self._looked = -1  # version of the view at the last look
-        self._counts_sent: dict[str, int] = {}  # versions of the rows that the page has
+        self._versions_sent: dict[str, int] = {}  # versions of the rows that the page has
         self._window: tuple[Any, ...] = ()  # window that the page has: found cameras and names
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
@@ -149,13 +149,13 @@ class FleetSocket(PageSocket):
         if window != self._window:
             self._window = window
             parts.append(f'"found":{count},"first":{first},"names":{json.dumps(names)}')
-        seen, self._counts_sent = self._counts_sent, {}
+        seen, self._versions_sent = self._versions_sent, {}
         changed: list[str] = []
         for name in names:
             row = view.rows.get(name)
             if row is None:
                 continue  # the row was forgotten
-            self._counts_sent[name] = row.version
+            self._versions_sent[name] = row.version
             if seen.get(name) != row.version:
                 changed.append(row.as_json())
                 if len(changed) % ROWS_PER_TURN == 0:

@@ -31,7 +31,7 @@ MAX_EVENTS: Final = 50_000
 """Largest number of events of cameras between two looks; after more, the whole fleet is read
 again."""
 
-MAX_REMOVED: Final = 10_000
+MAX_UNSHARED: Final = 10_000
 """Largest number of cameras shown although no agent shares them any more; the oldest are
 forgotten."""
 
@@ -112,7 +112,7 @@ class FleetView:
         self._names: list[str] = []  # sorted; empty until it is made again
         self._rang: dict[FleetRow, None] = {}
         self._aging: set[FleetRow] = set()  # rows whose rate or error mark changes by itself
-        self._removed: dict[str, None] = {}  # the longest gone first
+        self._unshared: dict[str, None] = {}  # the longest gone first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
@@ -279,11 +279,11 @@ class FleetView:
         if row.error_at is not None or not row.agents or "connected" not in row.flags:
             self._aging.add(row)  # the reason of a loss may change without an event
         if row.agents:
-            self._removed.pop(row.name, None)
-        elif row.name not in self._removed:
-            self._removed[row.name] = None
-            if len(self._removed) > MAX_REMOVED:
-                self._forget(next(iter(self._removed)))
+            self._unshared.pop(row.name, None)
+        elif row.name not in self._unshared:
+            self._unshared[row.name] = None
+            if len(self._unshared) > MAX_UNSHARED:
+                self._forget(next(iter(self._unshared)))
 
     def _forget(self, name: str) -> None:
         row = self.rows.pop(name)
@@ -291,7 +291,7 @@ class FleetView:
         self.failing.pop(row, None)
         self._flags.subtract(row.flags)
         self._aging.discard(row)
-        self._removed.pop(name, None)
+        self._unshared.pop(name, None)
         self._names = []
         self.version += 1
 
@@ -365,19 +365,17 @@ class FleetView:
         return known is None or known.version != self.version
 
     async def _sorted(self, query: RowQuery) -> list[str]:
-        words, rows_found = query.search.lower().split(), list[FleetRow]()
+        words, found = query.search.lower().split(), list[FleetRow]()
         names = self._names
         for start in range(0, len(names), MAX_SIFTED_ROWS):
             rows = map(self.rows.get, names[start : start + MAX_SIFTED_ROWS])
-            rows_found += [
-                row for row in rows if row is not None and _fits(row, query.filter, words)
-            ]
+            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
             await asyncio.sleep(0)
         if query.sort in SORTS:
-            rows_found.sort(key=SORTS[query.sort], reverse=query.down)
+            found.sort(key=SORTS[query.sort], reverse=query.down)
         elif query.down:
-            rows_found.reverse()
-        return [row.name for row in rows_found]
+            found.reverse()
+        return [row.name for row in found]
 
 
 def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:

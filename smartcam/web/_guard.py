@@ -73,8 +73,8 @@ class Guard:
         if self.token is None:
             return
         wanted = f"Bearer {self.token}".encode()
-        token = (given or "").encode("utf-8", "surrogateescape")
-        if not hmac.compare_digest(token, wanted):
+        offered = (given or "").encode("utf-8", "surrogateescape")
+        if not hmac.compare_digest(offered, wanted):
             problem = "no Authorization" if given is None else "an Authorization with another token"
             raise RefusedError(
                 401,

@@ -115,7 +115,7 @@ class LiveView:
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
-        self._questions = 0  # number of the failure whose picture was asked for
+        self._failure_asked = 0  # number of the failure whose picture was asked for
         self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -266,9 +266,9 @@ class LiveView:
         while True:
             wanted = self._picture_wanted and self._is_watched()
             failure = self.history.last_failure
-            missing = self._writes and self.history.wants_picture and failure != self._questions
+            missing = self._writes and self.history.wants_picture and failure != self._failure_asked
             if (wanted or missing) and self.camera.connected:
-                self._questions = failure
+                self._failure_asked = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()
@@ -346,12 +346,6 @@ def _part(localization: Localization) -> dict[str, Any]:
     """Return a part's place on the plane: metres, and radians about z."""
     (x, y, z), (i, j, k, w) = localization.pose.position, localization.pose.orientation
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
-    part = {
-        "name": localization.feature_id,
-        "quality": localization.quality,
-        "x": x,
-        "y": y,
-        "z": z,
-        "theta": theta,
-    }
+    place = {"x": x, "y": y, "z": z, "theta": theta}
+    part = {"name": localization.feature_id, "quality": localization.quality, **place}
     return {name: jsonable(item) for name, item in part.items()}

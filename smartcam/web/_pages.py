@@ -56,10 +56,7 @@ def read_file(name: str) -> bytes:
 def page_html(name: str) -> str:
     """Return a page: the common head and top, and the page's own contents."""
     page = PAGES[name]
-    sheets = [
-        f'  <link rel="stylesheet" href="/{name_of_sheet}.css">'
-        for name_of_sheet in (*page.styles, name)
-    ]
+    sheets = [f'  <link rel="stylesheet" href="/{sheet}.css">' for sheet in (*page.styles, name)]
     values = page._asdict() | {"styles": "\n".join(sheets), "script": name}
     parts = ("head.html", "top.html") if page.printed else ("head.html",)
     common = [Template(read_file(part).decode()).substitute(values) for part in parts]

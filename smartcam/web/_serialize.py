@@ -225,13 +225,13 @@ def _byte_order(device: Device) -> ByteOrder:
 
 
 def faults_state(emulator: WireCamera, limit: int = MAX_LISTED) -> dict[str, Any]:
-    """Return the waiting faults and the last past ones."""
+    """Return the waiting faults and the last ones that have happened."""
     waiting, fired = emulator.faults, list(emulator.fired)
-    last = (fault.fault for fault in reversed(fired))
+    last = (event.fault for event in reversed(fired))
     return {
         "waiting": [_fault(fault) for fault in waiting[: _shown_count(waiting, limit)]],
         "waiting_count": len(waiting),
-        "fired": [_fired(fault) for fault in fired[len(fired) - _shown_count(last, limit) :]],
+        "fired": [_fired(event) for event in fired[len(fired) - _shown_count(last, limit) :]],
     }
 
 
@@ -251,9 +251,9 @@ def _fault(fault: BaseFault) -> dict[str, Any]:
     return {"kind": getattr(fault, "kind", None), **given}
 
 
-def _fired(fault: FiredFault) -> dict[str, Any]:
-    message = None if fault.message is None else type(fault.message).__name__
-    return {"time": fault.time, "fault": _fault(fault.fault), "message": message}
+def _fired(event: FiredFault) -> dict[str, Any]:
+    message = None if event.message is None else type(event.message).__name__
+    return {"time": event.time, "fault": _fault(event.fault), "message": message}
 
 
 def kinds() -> list[dict[str, Any]]:

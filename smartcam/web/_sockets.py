@@ -29,12 +29,11 @@ def check_websocket(request: web.Request, protocol: str, viewers: int, most: int
         RefusedError: 400, it asks for another; 503, there are ``most`` viewers already.
     """
     headers = request.headers
-    offered = [
-        offer.strip() for offer in headers.get("Sec-WebSocket-Protocol", protocol).split(",")
-    ]
+    asked = headers.get("Sec-WebSocket-Protocol", protocol)
+    offered = [offer.strip() for offer in asked.split(",")]
     if headers.get("Upgrade", "").lower() != "websocket" or protocol not in offered:
-        offered_text = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-        raise RefusedError(400, offered_text, f"a WebSocket of {protocol}")
+        received = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, received, f"a WebSocket of {protocol}")
     if viewers >= most:
         raise RefusedError(503, f"viewer {most + 1}", f"{most} at one time")
 
@@ -45,7 +44,7 @@ class PageSocket(ABC):
     Args:
         request: request that asks for the WebSocket.
         protocol: subprotocol of the WebSocket.
-        label: word for the shown messages, for the log.
+        subject: word for the shown messages, for the log.
         heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
         longest: largest number of bytes of a message from the page.
     """
@@ -54,13 +53,13 @@ class PageSocket(ABC):
         self,
         request: web.Request,
         protocol: str,
-        label: str,
+        subject: str,
         *,
         heartbeat: float | None = None,
         longest: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
-        self._subject = label
+        self._subject = subject
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
             max_msg_size=longest,

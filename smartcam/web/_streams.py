@@ -75,7 +75,7 @@ class Streams:
         try:
             await response.prepare(request)
             while not self._closing.is_set() and is_open(request):
-                await _write(response, "".join(text.as_text() for text in look()))
+                await _write(response, "".join(news.as_text() for news in look()))
                 await self.pause(PERIOD)
             if is_open(request):
                 await _write(response, None)

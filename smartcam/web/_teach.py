@@ -144,10 +144,10 @@ class TeachSite(ThreadedSite):
         Raises:
             RefusedError: there is no such picture.
         """
-        picture_file = self.pictures.get(int(number)) if number.isdecimal() else None
-        if picture_file is None:
+        named = self.pictures.get(int(number)) if number.isdecimal() else None
+        if named is None:
             raise RefusedError(404, f"picture {number:.20}", "one of those that are listed")
-        return picture_file
+        return named
 
     def try_tools(self, given: dict[str, dict[str, str]]) -> dict[str, Any]:
         """Return the verdicts and values of every picture; call it in a thread.
@@ -160,9 +160,9 @@ class TeachSite(ThreadedSite):
         program = self.teaching.program(read_settings(given))
         results: list[dict[str, Any]] = []
         tried: dict[int, Inspection] = {}
-        for number, picture_file in list(self.pictures.items()):
+        for number, named in list(self.pictures.items()):
             try:
-                seen = tried[number] = program.inspect(picture_file.picture)
+                seen = tried[number] = program.inspect(named.picture)
             except SmartCamError as exc:
                 results.append({"picture": number, "ok": False, "reason": str(exc), "marks": []})
                 continue
@@ -209,13 +209,8 @@ class TeachSite(ThreadedSite):
             "kinds": tool_settings(),
             "live": self.source is not None,
             "pictures": [
-                {
-                    "number": number,
-                    "name": picture.name,
-                    "size": picture.picture.size,
-                    "file": picture.file,
-                }
-                for number, picture in self.pictures.items()
+                {"number": key, "name": named.name, "size": named.picture.size, "file": named.file}
+                for key, named in self.pictures.items()
             ],
         }
 
@@ -242,12 +237,8 @@ def _marks(seen: Inspection) -> list[dict[str, Any]]:
 
 def _mark(drawing: Drawing) -> dict[str, Any]:
     points = [[round(x, 2), round(y, 2)] for x, y in drawing.points[:MAX_POINTS]]
-    return {
-        "kind": drawing.kind,
-        "role": drawing.role,
-        "text": drawing.text,
-        "points": jsonable(points),
-    }
+    words = {"kind": drawing.kind, "role": drawing.role, "text": drawing.text}
+    return {**words, "points": jsonable(points)}
 
 
 def _png(picture: Picture) -> bytes:

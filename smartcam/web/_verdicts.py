@@ -23,7 +23,7 @@ def verdicts(value: Any) -> list[dict[str, Any]]:
     rows: list[Any] = value if isinstance(value, list) else [value]
     if not (rows and all(isinstance(row, dict) for row in rows)):
         return []
-    names = [str(name) for name, value in rows[0].items() if isinstance(value, bool)]
+    names = [str(name) for name, field in rows[0].items() if isinstance(field, bool)]
     return [_verdict(name, [row.get(name) is True for row in rows]) for name in names]
 
 
@@ -43,10 +43,10 @@ def judged(value: Any) -> Outcome:
     for row in rows[:MAX_JUDGED]:
         if isinstance(row, Localization) or not hasattr(row, "_asdict"):
             return "other"
-        for name, field_value in row._asdict().items():
-            if field_value is True or field_value is False:
+        for name, field in row._asdict().items():
+            if field is True or field is False:
                 good = _meaning(name)
-                if good is not None and field_value is not good:
+                if good is not None and field is not good:
                     return "failed"
                 if good is not None:
                     verdict = "passed"
@@ -55,15 +55,11 @@ def judged(value: Any) -> Outcome:
 
 def failing(value: Any) -> str:
     """Return the truth values that are wrong, in words; "" without any."""
-    bad = [verdict for verdict in verdicts(jsonable(value)) if verdict["verdict"] == "fail"]
+    bad = [row for row in verdicts(jsonable(value)) if row["verdict"] == "fail"]
     texts = []
-    for bad_verdict in bad:
-        wanted = "true" if meaning(bad_verdict["name"]) else "false"
-        of = (
-            ""
-            if bad_verdict["of"] == 1
-            else f" in {bad_verdict['true']} of {bad_verdict['of']} records"
-        )
-        actual = {"true": "false", "false": "true"}[wanted] if bad_verdict["of"] == 1 else "true"
-        texts.append(f"{bad_verdict['name']} is {actual}{of}, expected {wanted}")
+    for row in bad:
+        wanted = "true" if meaning(row["name"]) else "false"
+        of = "" if row["of"] == 1 else f" in {row['true']} of {row['of']} records"
+        actual = {"true": "false", "false": "true"}[wanted] if row["of"] == 1 else "true"
+        texts.append(f"{row['name']} is {actual}{of}, expected {wanted}")
     return "; ".join(texts)

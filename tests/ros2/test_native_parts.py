@@ -6,6 +6,8 @@ import ast
 import importlib.util
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -14,6 +16,7 @@ from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.fleet import FleetFile
 from smartcam.ros2 import RosTypes
 from smartcam.ros2._inside import NativeContext
+from smartcam.ros2._native import parameters
 from smartcam.ros2._native.outbox import MAX_WAITING_MESSAGES, MessageThread
 from smartcam.ros2._native.stamps import BILLION, MAX_STAMPS, RosStamps
 from tests.cli.commandline import run
@@ -115,6 +118,31 @@ def test_a_job_that_fails_leaves_the_others() -> None:
     assert done == [1]
 
 
+# ---------------------------------------------------------------------- parameters
+
+
+def test_changes_of_parameters_reach_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    node: Any = SimpleNamespace(full_name="/cam", types=TYPES)
+    seen: list[tuple[str, object]] = []
+    node.ros = SimpleNamespace(
+        add_on_set_parameters_callback=lambda _hook: None,
+        describe_parameter=lambda _name: SimpleNamespace(read_only=False),
+        set_parameters=lambda values: seen.append(("set", values)),
+        undeclare_parameter=lambda name: seen.append(("undeclare", name)),
+    )
+    made = parameters.NativeParameters(node)
+    monkeypatch.setattr(made, "_declare_in_ros", lambda name: seen.append(("declare", name)))
+    monkeypatch.setattr(made, "_parameter", lambda name: (name, made.get(name)))
+    made.declare("rate", 1)
+    assert seen == []
+    made.open()
+    made.declare("gain", 2)
+    made.update("rate", 3)
+    made.undeclare("gain")
+    assert seen[:2] == [("declare", "rate"), ("declare", "gain")]
+    assert seen[2:] == [("set", [("rate", 3)]), ("undeclare", "gain")]
+
+
 # ---------------------------------------------------------------------- stamps
 
 
@@ -139,4 +167,4 @@ def test_few_stamps_are_remembered() -> None:
     stamps = RosStamps(lambda: 1.0)
     for second in range(2 * MAX_STAMPS):
         assert stamps._moved(second * BILLION) == (second + 1) * BILLION
-    assert len(stamps._arrival_times) == MAX_STAMPS
+    assert len(stamps._moved_stamps) == MAX_STAMPS

@@ -340,7 +340,7 @@ async def test_more_events_than_are_kept_are_made_good(monkeypatch: pytest.Monke
 
 
 async def test_cameras_that_are_gone_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_module, "MAX_REMOVED", 3)
+    monkeypatch.setattr(view_module, "MAX_UNSHARED", 3)
     async with served(10) as world, world.looking() as looker:
         for name in names(8):
             world.fleet.leave(name)

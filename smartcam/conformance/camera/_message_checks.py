@@ -40,11 +40,9 @@ def _ignored(camera: CameraUnderTest, label: str, *data: bytes) -> None:
         client.write(*data)
         client.fence()
         client.listen(camera.options.quiet)
-        answers = [
-            message for message in client.received[mark:] if message.message_id != MessageId.STATUS
-        ]
-        results = of_kind(answers, MessageId.RESULT_CONTAINER)
-        if len(answers) - len(results) != 1:
+        frames = [each for each in client.received[mark:] if each.message_id != MessageId.STATUS]
+        results = of_kind(frames, MessageId.RESULT_CONTAINER)
+        if len(frames) - len(results) != 1:
             raise Differs(f"no answer to {label}, one to the Query after it", client.words(mark))
 
 

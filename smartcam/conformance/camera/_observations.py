@@ -58,11 +58,11 @@ class ObservedRun(NamedTuple):
     def places(self) -> tuple[int | None, int | None, int | None]:
         """Return the places where Waiting ended, the first result came, and Waiting began again."""
         fell = result = rose = None
-        for place, message in enumerate(self.frames):
-            if message.message_id == MessageId.RESULT_CONTAINER and result is None:
+        for place, frame in enumerate(self.frames):
+            if frame.message_id == MessageId.RESULT_CONTAINER and result is None:
                 result = place
-            elif message.message_id == MessageId.STATUS:
-                set_ = int.from_bytes(message.body[: self.word], "little") & self.waiting
+            elif frame.message_id == MessageId.STATUS:
+                set_ = int.from_bytes(frame.body[: self.word], "little") & self.waiting
                 if not set_ and fell is None:
                     fell = place
                 elif set_ and fell is not None and rose is None:
@@ -178,11 +178,11 @@ def no_id(camera: CameraUnderTest) -> bool:
         for inspection in inspections(camera)
         if inspection.results
     ]
-    application_is_new = camera.application not in first
-    if not application_is_new and len(set(first)) > 1:
+    absent = camera.application not in first
+    if not absent and len(set(first)) > 1:
         raise Undescribed("the same id in front of each result", str(first))
-    camera.learn_quirk("no_id", on=application_is_new)
-    return application_is_new
+    camera.learn_quirk("no_id", on=absent)
+    return absent
 
 
 # ---------------------------------------------------------------------- triggers too many
@@ -215,13 +215,13 @@ def overtrigger(camera: CameraUnderTest) -> DoubleTrigger:
                 left = deadline - time.monotonic()
                 if left <= 0 or client.next(left) is None:
                     break
-            message, place = client.received[place], place + 1
-            if message.message_id != MessageId.STATUS:
+            frame, place = client.received[place], place + 1
+            if frame.message_id != MessageId.STATUS:
                 continue
-            if not camera.wire.numbers(message.body)[0] & bits.overtriggered:
-                fell_at = None if rose_at is None else message.at
+            if not camera.wire.numbers(frame.body)[0] & bits.overtriggered:
+                fell_at = None if rose_at is None else frame.at
             elif rose_at is None:
-                rose_at = message.at
+                rose_at = frame.at
                 deadline = rose_at + camera.options.timeout
         client.listen(takes)
         results = len(of_kind(client.received[mark:], MessageId.RESULT_CONTAINER))
@@ -244,8 +244,8 @@ def stopped_trigger(camera: CameraUnderTest) -> Stopped:
         camera.stop(client)
         mark = len(client.received)
         client.send(m.Trigger())
-        messages = client.listen(takes + camera.options.quiet)
-        return Stopped(messages, client.words(mark))
+        frames = client.listen(takes + camera.options.quiet)
+        return Stopped(frames, client.words(mark))
 
 
 # ---------------------------------------------------------------------- switch, reboot
@@ -285,9 +285,9 @@ def switch(camera: CameraUnderTest) -> Switch:
         )
         took = answer.at - began
         _wait_not_busy(camera, client, mark)
-        messages = client.received[mark:]
+        frames = client.received[mark:]
         camera.measured["switch"] = took
-        return Switch(other, messages, answer, camera.active(client), took)
+        return Switch(other, frames, answer, camera.active(client), took)
 
 
 def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
@@ -296,9 +296,9 @@ def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> Non
     words = camera.wire.statuses(client.received[mark:])
     if busy and any(word & busy for word in words) and words[-1] & busy:
         client.until(
-            lambda message: (
-                message.message_id == MessageId.STATUS
-                and not camera.wire.numbers(message.body)[0] & busy
+            lambda frame: (
+                frame.message_id == MessageId.STATUS
+                and not camera.wire.numbers(frame.body)[0] & busy
             ),
             camera.options.timeout,
             "a status without BUSY after the switch",

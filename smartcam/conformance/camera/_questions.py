@@ -51,10 +51,10 @@ def code(camera: CameraUnderTest) -> bool:
     """Answers begin with a result code."""
     with camera.link() as client:
         answer = client.answer(m.Connect())
-    code_ = {(1,): False, (0, 1): True}.get(camera.wire.numbers(answer.body))
-    if code_ is None:
+    has_code = {(1,): False, (0, 1): True}.get(camera.wire.numbers(answer.body))
+    if has_code is None:
         raise Undescribed("the version 1, or the code 0 and the version", camera.wire.spell(answer))
-    return code_
+    return has_code
 
 
 @question(
@@ -155,10 +155,10 @@ def stop_during_inspection(camera: CameraUnderTest) -> str:
         client.send(m.Trigger(), m.Stop())
         client.fence()
         client.listen(takes + camera.patience)
-        messages = client.received[mark:]
-        if all(word & camera.wire.bits.running for word in camera.wire.statuses(messages)):
+        frames = client.received[mark:]
+        if all(word & camera.wire.bits.running for word in camera.wire.statuses(frames)):
             raise Differs("a status without Running after Stop", client.words(mark))
-    results = len(of_kind(messages, MessageId.RESULT_CONTAINER))
+    results = len(of_kind(frames, MessageId.RESULT_CONTAINER))
     return f"{results or 'no'} result{'' if results == 1 else 's'}"
 
 
@@ -189,10 +189,10 @@ def switch_answer(camera: CameraUnderTest) -> str:
     seen, busy = switch(camera), camera.wire.bits.busy
     answered = seen.frames.index(seen.answer)
     was_busy = False
-    for place, message in enumerate(seen.frames):
-        if message.message_id != MessageId.STATUS:
+    for place, frame in enumerate(seen.frames):
+        if frame.message_id != MessageId.STATUS:
             continue
-        if camera.wire.numbers(message.body)[0] & busy:
+        if camera.wire.numbers(frame.body)[0] & busy:
             was_busy = True
         elif was_busy:
             return "after_status" if answered > place else "before_status"
@@ -251,13 +251,13 @@ def big_endian_number(camera: CameraUnderTest) -> bool:
         camera.ready(client)
         client.write(camera.wire.frame(MessageId.SET_SEQUENCE_NUMBER, little))
         field = next_number(camera, client)
-    order = {little: False, little[::-1]: True}.get(field)
-    if order is None:
+    is_big = {little: False, little[::-1]: True}.get(field)
+    if is_big is None:
         raise Undescribed(
             f"{little.hex(' ')}, as it was set, or the other way round", field.hex(" ")
         )
-    camera.learn_quirk("big_endian_number", on=order)
-    return order
+    camera.learn_quirk("big_endian_number", on=is_big)
+    return is_big
 
 
 @question(_OPEN, needs=Allow.INPUT | Allow.TRIGGER, dialects=SMART)
@@ -365,14 +365,14 @@ def second_client(camera: CameraUnderTest) -> str:
             goes_on = True
         except (Differs, EndedError):
             goes_on = False
-    verdict = {("answered", False): "takeover", ("ended", True): "refuse"}.get((outcome, goes_on))
-    if verdict is None:
+    policy = {("answered", False): "takeover", ("ended", True): "refuse"}.get((outcome, goes_on))
+    if policy is None:
         raise Undescribed(
             "one of two clients is served",
             f"the second client's Connect was {outcome}; the first client is "
             f"{'served on' if goes_on else 'not served any more'}",
         )
-    return verdict
+    return policy
 
 
 @question(_OPEN, dialects=("handbook", "thesis"), transports=("tcp",))
@@ -390,7 +390,7 @@ def bad_frame(camera: CameraUnderTest) -> str:
         return ways.pop()
     raise Undescribed(
         "the same after both: skip or close",
-        "; ".join(f"after {label}: {outcome}" for label, outcome in outcomes.items()),
+        "; ".join(f"after {data}: {way}" for data, way in outcomes.items()),
     )
 
 
@@ -414,9 +414,7 @@ def _after(camera: CameraUnderTest, data: bytes) -> str:
             return "close"
         if client.ended:
             return "close"
-        answers = [
-            message for message in client.received[mark:] if message.message_id != MessageId.STATUS
-        ]
+        answers = [each for each in client.received[mark:] if each.message_id != MessageId.STATUS]
         return "skip" if len(answers) == 1 else "it is taken for a frame"
 
 

@@ -121,11 +121,11 @@ class RawClient:
 
     def write(self, *data: bytes) -> float:
         """Send any bytes; as :meth:`send`."""
-        for message in data:
-            self._note(">", self.wire.spell_request(message))
+        for frame in data:
+            self._note(">", self.wire.spell_request(frame))
         at = time.monotonic()
-        for message in [b"".join(data)] if self._tcp else data:
-            self._write(message)
+        for frame in [b"".join(data)] if self._tcp else data:
+            self._write(frame)
         return at
 
     def _write(self, data: bytes) -> None:
@@ -148,9 +148,9 @@ class RawClient:
         """
         deadline = time.monotonic() + within
         while True:
-            message = self._cut()
-            if message is not None:
-                return message
+            frame = self._cut()
+            if frame is not None:
+                return frame
             left = deadline - time.monotonic()
             if left <= 0 or not self._receive(left):
                 return None
@@ -159,8 +159,8 @@ class RawClient:
         if not self._buffer:
             return None
         try:
-            frame = self.wire.cut(self._buffer)
-            if not self._tcp and (frame is None or frame[2] != len(self._buffer)):
+            parts = self.wire.cut(self._buffer)
+            if not self._tcp and (parts is None or parts[2] != len(self._buffer)):
                 raise BadBytesError(
                     f"a datagram is not one whole frame: {hex_excerpt(self._buffer)}"
                 )
@@ -168,19 +168,19 @@ class RawClient:
             self._note("<", hex_excerpt(self._buffer))
             self._buffer = b""
             raise Differs(f"frames of dialect {self.wire.dialect.name}", str(exc)) from exc
-        if frame is None:
+        if parts is None:
             return None
-        message_id, body, size = frame
+        message_id, body, size = parts
         self._buffer = self._buffer[size:]
-        message = ReceivedFrame(time.monotonic(), message_id, body)
-        self._note("<", self.wire.spell(message))
+        frame = ReceivedFrame(time.monotonic(), message_id, body)
+        self._note("<", self.wire.spell(frame))
         self._kept += len(body)
         if self._kept > MAX_RECEIVED_BYTES:
             raise NotObserved(f"the camera sent more than {MAX_RECEIVED_BYTES} bytes meanwhile")
-        self.received.append(message)
+        self.received.append(frame)
         if message_id == MessageId.STATUS and len(body) >= self.wire.word:
             self.status = self.wire.numbers(body)[0]
-        return message
+        return frame
 
     def _receive(self, within: float) -> bool:
         if self.ended:
@@ -228,11 +228,11 @@ class RawClient:
             Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
-        is_it = fits if callable(fits) else lambda message: message.message_id == fits
+        is_it = fits if callable(fits) else lambda frame: frame.message_id == fits
         first = len(self.received) if mark < 0 else mark
-        for message in self.received[first:]:
-            if is_it(message):
-                return message
+        for frame in self.received[first:]:
+            if is_it(frame):
+                return frame
         deadline = time.monotonic() + within
         while (left := deadline - time.monotonic()) > 0:
             heard_now = self.next(left)
@@ -276,7 +276,7 @@ class RawClient:
 
     def words(self, first: int = 0) -> str:
         """Describe the frames from a place of :attr:`received` on, for a difference."""
-        shown = [self.wire.spell(message) for message in self.received[first:]]
+        shown = [self.wire.spell(frame) for frame in self.received[first:]]
         if len(shown) > 5:
             shown = [*shown[:4], f"{len(shown) - 4} more"]
         end = ["the end of the link"] if self.ended else []

@@ -74,7 +74,7 @@ def trigger_is_acknowledged(camera: CameraUnderTest) -> None:
     """A trigger is answered with the code 0."""
     for inspection in inspections(camera):
         answers = of_kind(inspection.frames, MessageId.TRIGGER)
-        if [camera.wire.numbers(message.body) for message in answers] != [(0,)]:
+        if [camera.wire.numbers(answer.body) for answer in answers] != [(0,)]:
             shown = "; ".join(map(camera.wire.spell, inspection.frames)) or "nothing"
             raise Differs("one answer to the trigger, the code 0", shown)
 
@@ -85,11 +85,8 @@ def waiting_falls_and_rises(camera: CameraUnderTest) -> None:
     for inspection in inspections(camera):
         if inspection.under_way is not None:
             fell = not inspection.under_way & inspection.waiting
-            if (
-                not fell
-                and inspection.results
-                and inspection.results[0].at - inspection.sent_at < camera.options.quiet
-            ):
+            result = inspection.results[0] if inspection.results and not fell else None
+            if result is not None and result.at - inspection.sent_at < camera.options.quiet:
                 continue  # the inspection was over before the status came
             rose = True  # the observation has waited for it
         else:
@@ -180,8 +177,8 @@ def free_run_needs_no_trigger(camera: CameraUnderTest) -> None:
         camera.stop(client)
         client.fence()
         mark = len(client.received)
-        messages = client.listen(2 * camera.options.quiet)
-        if of_kind(messages, MessageId.RESULT_CONTAINER):
+        frames = client.listen(2 * camera.options.quiet)
+        if of_kind(frames, MessageId.RESULT_CONTAINER):
             raise Differs("no result after Stop", client.words(mark))
 
 

@@ -115,8 +115,8 @@ def silent_after_disconnect(camera: CameraUnderTest) -> None:
         client.fence()
         mark = len(client.received)
         client.send(m.Disconnect())
-        messages = _without_answer(camera, client.listen(camera.options.quiet))
-        if messages:
+        frames = _without_answer(camera, client.listen(camera.options.quiet))
+        if frames:
             raise Differs("nothing after Disconnect", client.words(mark))
 
 
@@ -132,11 +132,11 @@ def deaf_after_disconnect(camera: CameraUnderTest) -> None:
             raise Differs("no answer to a Query after Disconnect", client.words(mark))
 
 
-def _without_answer(camera: CameraUnderTest, messages: list[ReceivedFrame]) -> list[ReceivedFrame]:
+def _without_answer(camera: CameraUnderTest, frames: list[ReceivedFrame]) -> list[ReceivedFrame]:
     """Return the frames without the answer to Disconnect that ``bid`` may give (C3)."""
     if not camera.wire.is_bid:
-        return messages
-    return [message for message in messages if message.message_id != MessageId.DISCONNECT]
+        return frames
+    return [frame for frame in frames if frame.message_id != MessageId.DISCONNECT]
 
 
 @check("SC-A29, published", needs=Allow.TRIGGER)
@@ -148,9 +148,9 @@ def no_result_after_disconnect(camera: CameraUnderTest) -> None:
         mark = len(client.received)
         client.send(m.Trigger())
         ended_at = client.send(m.Disconnect())
-        messages = client.listen(takes + camera.options.quiet)
+        frames = client.listen(takes + camera.options.quiet)
         grace = max(TRANSIT_TIME, 2 * camera.measured.get("query", 0.0))
-        results = of_kind(messages, MessageId.RESULT_CONTAINER)
+        results = of_kind(frames, MessageId.RESULT_CONTAINER)
         if any(result.at - ended_at > grace for result in results):
             raise Differs("no result after Disconnect", client.words(mark))
     if results:

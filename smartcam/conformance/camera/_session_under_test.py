@@ -165,11 +165,11 @@ class CameraUnderTest:
             with client:
                 yield client
         finally:
-            for message in client.received:
-                self._learn_code(message)
-                flaw = self.wire.flaw(message)
+            for frame in client.received:
+                self._learn_code(frame)
+                flaw = self.wire.flaw(frame)
                 if flaw is not None:
-                    self.flaws.setdefault(flaw, self.wire.spell(message))
+                    self.flaws.setdefault(flaw, self.wire.spell(frame))
 
     def open(self) -> RawClient:
         """Open a link to the camera; the caller closes it.
@@ -237,10 +237,10 @@ class CameraUnderTest:
             client.until(MessageId.STATUS, self.options.timeout, "a status after Connect", mark=0)
         return answer
 
-    def _learn_code(self, message: ReceivedFrame) -> None:
+    def _learn_code(self, frame: ReceivedFrame) -> None:
         """Learn whether ``b16`` answers have a code, from the length of the answer to Connect."""
-        if self.dialect == "b16" and message.message_id == MessageId.CONNECT:
-            self.learn_quirk("code", on=len(message.body) == 4)
+        if self.dialect == "b16" and frame.message_id == MessageId.CONNECT:
+            self.learn_quirk("code", on=len(frame.body) == 4)
 
     # ------------------------------------------------------------------ its state
 

@@ -139,19 +139,19 @@ class RawDialect:
 
     # ------------------------------------------------------------------ in words
 
-    def spell(self, message: ReceivedFrame) -> str:
+    def spell(self, frame: ReceivedFrame) -> str:
         """Return a frame of the camera in readable form, with hex."""
-        return self._spell(Sender.CAMERA, message.message_id, message.body)
+        return self._spell(Sender.CAMERA, frame.message_id, frame.body)
 
     def spell_request(self, data: bytes) -> str:
         """Return a sent frame in readable form, with hex; only hex for bytes that are no frame."""
         try:
-            message = self.cut(data)
+            parts = self.cut(data)
         except BadBytesError:
-            message = None
-        if message is None or message[2] != len(data):
+            parts = None
+        if parts is None or parts[2] != len(data):
             return hex_excerpt(data)
-        return self._spell(Sender.CLIENT, message[0], message[1], data)
+        return self._spell(Sender.CLIENT, parts[0], parts[1], data)
 
     def _spell(self, sender: Sender, message_id: int, body: bytes, raw: bytes = b"") -> str:
         spelled = self.dialect.spell(sender, LibraryFrame(message_id, body))
@@ -161,18 +161,18 @@ class RawDialect:
             shown = f"id {message_id:#04x}"
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
 
-    def flaw(self, message: ReceivedFrame) -> str | None:
+    def flaw(self, frame: ReceivedFrame) -> str | None:
         """Return the undocumented property of a frame of the camera, None if there is none."""
-        if self.is_bid and self.numbers(message.body) in _REFUSALS:
+        if self.is_bid and self.numbers(frame.body) in _REFUSALS:
             return None  # a refusal may be only its code, for any request
-        size = self._sizes().get(message.message_id)
+        size = self._sizes().get(frame.message_id)
         if size is None:
-            return f"message {message.message_id:#04x} is not one of a camera's"
+            return f"message {frame.message_id:#04x} is not one of a camera's"
         least, exact = size
-        if len(message.body) < least or (exact and len(message.body) != least):
+        if len(frame.body) < least or (exact and len(frame.body) != least):
             more = "" if exact else " or more"
-            name = MessageId(message.message_id).name
-            return f"{name} has {len(message.body)} bytes of body: expected {least}{more}"
+            name = MessageId(frame.message_id).name
+            return f"{name} has {len(frame.body)} bytes of body: expected {least}{more}"
         return None
 
     def _sizes(self) -> Mapping[int, tuple[int, bool]]:

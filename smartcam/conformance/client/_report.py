@@ -59,7 +59,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
     wrong = check.rule(run)
     if wrong is None:
         return None
-    outcome_text = "; ".join(filter(None, (run.outcome.error, run.outcome.output)))
+    output = "; ".join(filter(None, (run.outcome.error, run.outcome.output)))
     return ClientFinding(
         check=check.name,
         grade=check.grade.value,
@@ -70,7 +70,7 @@ def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
         expects=check.expects,
         source=check.source,
         wire=tuple(run.lines),
-        output=outcome_text,
+        output=output,
     )
 
 
@@ -82,12 +82,10 @@ def write_findings(reporter: Any, findings: Sequence[ClientFinding]) -> None:
     """
     reporter.section("smartcam: the client")
     for grade in Grade:
-        findings_of_grade = [finding for finding in findings if finding.grade == grade.value]
-        if not findings_of_grade:
+        graded = [finding for finding in findings if finding.grade == grade.value]
+        if not graded:
             continue
-        reporter.write_line(f"{grade.value}: {len(findings_of_grade)}")
-        for named in findings_of_grade:
-            full = grade is Grade.SHOULD
-            reporter.write_line(
-                str(named) if full else f"{named.check} ({named.camera}): {named.wrong}"
-            )
+        reporter.write_line(f"{grade.value}: {len(graded)}")
+        for finding in graded:
+            short = f"{finding.check} ({finding.camera}): {finding.wrong}"
+            reporter.write_line(str(finding) if grade is Grade.SHOULD else short)

@@ -127,17 +127,17 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
     A trigger may stand between two Queries, or two Get status: their answers come in order.
     """
     open_requests: set[tuple[str, type[m.Message]]] = set()
-    for request in run.messages:
-        message = request.message
+    for recorded in run.messages:
+        message = recorded.message
         if isinstance(message, Request) and message.answer and run.dialect.answers(type(message)):
-            key = (request.peer, message.answer)
+            key = (recorded.peer, message.answer)
             if key in open_requests:
-                return f"{_name(request)} came although the one before was not answered yet"
+                return f"{_name(recorded)} came although the one before was not answered yet"
             open_requests.add(key)
         if isinstance(message, m.Trigger):  # a trigger may stand between two queries
-            open_requests -= {(request.peer, m.QueryAnswer), (request.peer, m.StatusReport)}
-        elif message is not None and request.sender is Sender.CAMERA:
-            open_requests.discard((request.peer, type(message)))
+            open_requests -= {(recorded.peer, m.QueryAnswer), (recorded.peer, m.StatusReport)}
+        elif message is not None and recorded.sender is Sender.CAMERA:
+            open_requests.discard((recorded.peer, type(message)))
     return None
 
 
@@ -207,11 +207,11 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
     return None
 
 
-def _is_command(request: RecordedMessage) -> bool:
+def _is_command(recorded: RecordedMessage) -> bool:
     """Return True if a message is a command; queries and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
-    return request.sender is Sender.CLIENT and not isinstance(request.message, harmless)
+    return recorded.sender is Sender.CLIENT and not isinstance(recorded.message, harmless)
 
 
-def _name(request: RecordedMessage) -> str:
-    return request.hex if request.message is None else type(request.message).__name__
+def _name(recorded: RecordedMessage) -> str:
+    return recorded.hex if recorded.message is None else type(recorded.message).__name__

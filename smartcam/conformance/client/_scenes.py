@@ -119,9 +119,7 @@ def _unknown_messages(dialect: FramedDialect) -> Sequence[BaseFault]:
     data = dialect.encode_frame(Frame(0x77, b"new in this firmware"))
     # not before the answer to Connect: until then the camera sends nothing (SC-A28, published)
     between = ("StatusReport", "QueryAnswer", "ResultContainer")
-    return [
-        f.Insert(data=data, on=message_type, where="before", times=None) for message_type in between
-    ]
+    return [f.Insert(data=data, on=name, where="before", times=None) for name in between]
 
 
 def _unknown_bits(dialect: FramedDialect) -> Sequence[BaseFault]:

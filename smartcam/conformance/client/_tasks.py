@@ -172,7 +172,7 @@ class _Worker:
     def cancel(self) -> None:
         inside = self._inside
         if inside is not None:
-            with contextlib.suppress(RuntimeError):  # the transport's loop is closed already
+            with contextlib.suppress(RuntimeError):  # the loop is closed already
                 inside[0].call_soon_threadsafe(inside[1].cancel)
 
     def _run(self) -> None:

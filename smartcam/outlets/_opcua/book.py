@@ -46,11 +46,11 @@ class ResultBook:
         self._handles: collections.OrderedDict[int, None] = collections.OrderedDict()
         self._last_handle = 0
 
-    def add(self, kept_result: KeptResult) -> None:
+    def add(self, kept: KeptResult) -> None:
         """Add a result; an earlier one with the same id is replaced."""
-        before = self._results.pop(kept_result.result.id, None)
-        self._characters += len(kept_result.text) - (0 if before is None else len(before.text))
-        self._results[kept_result.result.id] = kept_result
+        before = self._results.pop(kept.result.id, None)
+        self._characters += len(kept.text) - (0 if before is None else len(before.text))
+        self._results[kept.result.id] = kept
         while len(self._results) > self._most or (
             self._characters > MAX_BOOK_CHARACTERS and len(self._results) > 1
         ):
@@ -59,16 +59,14 @@ class ResultBook:
 
     def get(self, key: str, camera: str) -> KeptResult | None:
         """Return a camera's result by its id; None if it is unknown, or no longer kept."""
-        kept_result = self._results.get(key)
-        return (
-            kept_result if kept_result is not None and kept_result.result.camera == camera else None
-        )
+        kept = self._results.get(key)
+        return kept if kept is not None and kept.result.camera == camera else None
 
     def newest(self, camera: str, fits: Callable[[KeptResult], bool]) -> Iterator[KeptResult]:
         """Yield a camera's results that fit, the newest first."""
-        for kept_result in reversed(self._results.values()):
-            if kept_result.result.camera == camera and fits(kept_result):
-                yield kept_result
+        for kept in reversed(self._results.values()):
+            if kept.result.camera == camera and fits(kept):
+                yield kept
 
     def handle(self, timeout: int) -> int:
         """Return a new handle; 0 for a client that needs none, since its ``timeout`` is 0."""

@@ -69,10 +69,10 @@ class TransferFiles:
         await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
 
     async def _generate(self, nodes: CameraNodes, book: ResultBook, options: Any) -> Any:
-        key_asked = getattr(getattr(options, "Value", None), "Id", None)
-        key = getattr(key_asked, "Id", key_asked)
-        kept_result = book.get(key, nodes.name) if isinstance(key, str) else None
-        path = None if kept_result is None else kept_result.result.picture
+        given = getattr(getattr(options, "Value", None), "Id", None)
+        key = getattr(given, "Id", given)
+        kept = book.get(key, nodes.name) if isinstance(key, str) else None
+        path = None if kept is None else kept.result.picture
         if path is None:
             return _status(ua.StatusCodes.BadNotFound)
         if len(self._files) >= MAX_FILES:

@@ -54,11 +54,11 @@ class VisionStates:
     def _find(self, target: str, cause: str) -> Transition | None:
         """Return the transition from the present state, one that stays within its machine."""
         states = {VISION: self.vision, AUTOMATIC: self.automatic}
-        own_transitions = {(transition.machine, transition.source) for transition in transitions()}
+        sources = {(transition.machine, transition.source) for transition in transitions()}
         for transition in transitions():
             if states[transition.machine] != transition.source or transition.cause != cause:
                 continue
-            if (transition.machine, transition.target) not in own_transitions:
+            if (transition.machine, transition.target) not in sources:
                 continue  # Preoperational to Initialized leads into the other machine
             if target in ("", transition.target):
                 return transition

@@ -221,17 +221,14 @@ class Methods:
 
     async def _result_plain(self, job: str) -> list[ua.Variant]:
         """Return state, values and error of a job's result as plain values."""
-        kept_result = next(
-            self._book.newest(
-                self._nodes.name, lambda kept_result: kept_result.result.job_id == job
-            ),
-            None,
+        kept = next(
+            self._book.newest(self._nodes.name, lambda each: each.result.job_id == job), None
         )
-        if not job or kept_result is None:
+        if not job or kept is None:
             raise KeyError(f"there is no result of job {job!r:.80}")
-        state = ua.Variant(kept_result.result.state, ua.VariantType.Int32)
-        text = ua.Variant(kept_result.text, ua.VariantType.String)
-        return [state, text, ua.Variant(kept_result.result.error, ua.VariantType.String)]
+        state = ua.Variant(kept.result.state, ua.VariantType.Int32)
+        text = ua.Variant(kept.text, ua.VariantType.String)
+        return [state, text, ua.Variant(kept.result.error, ua.VariantType.String)]
 
     # ------------------------------------------------------------------ recipes
 
@@ -256,14 +253,14 @@ class Methods:
         if self._system.application:
             known[self._system.application] = None
         fits = [
-            recipe
-            for recipe in known
-            if prepared not in (0, 1) or (recipe == ready) == bool(prepared)
-            if not name or name in (self._system.recipe_name(recipe), str(recipe))
+            number
+            for number in known
+            if prepared not in (0, 1) or (number == ready) == bool(prepared)
+            if not name or name in (self._system.recipe_name(number), str(number))
             if not _text(product)
         ]
         page = fits[first : first + _most(most)]
-        listed = [self._values.identity("RecipeIdInternalDataType", str(recipe)) for recipe in page]
+        listed = [self._values.identity("RecipeIdInternalDataType", str(number)) for number in page]
         complete = first + len(page) >= len(fits)
         return [_boolean(complete), _number(len(page)), _number(0), _list(listed)]
 
@@ -271,14 +268,14 @@ class Methods:
 
     def _kept_result(self, result: Any) -> KeptResult:
         text = _text(result)
-        kept_result = self._book.get(text, self._nodes.name)
-        if kept_result is None:
+        kept = self._book.get(text, self._nodes.name)
+        if kept is None:
             raise KeyError(f"there is no result {text!r:.120}")
-        return kept_result
+        return kept
 
     async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
-        kept_result = self._kept_result(result)
-        value = ua.Variant(kept_result.value, ua.VariantType.ExtensionObject)
+        kept = self._kept_result(result)
+        value = ua.Variant(kept.value, ua.VariantType.ExtensionObject)
         return [_number(self._book.handle(timeout)), value]
 
     async def _components(self, result: Any, timeout: int) -> list[ua.Variant]:
@@ -298,10 +295,10 @@ class Methods:
             if (text := _text(filter_id))
         ]
 
-        def fits(kept_result: KeptResult) -> bool:
-            if state and kept_result.result.state != state:
+        def fits(kept: KeptResult) -> bool:
+            if state and kept.result.state != state:
                 return False
-            identities = [getattr(kept_result.value, name) for name, _ in wanted]
+            identities = [getattr(kept.value, name) for name, _ in wanted]
             texts = [text for _, text in wanted]
             return all(
                 identity is not None and identity.Id == text
@@ -311,7 +308,7 @@ class Methods:
         limit = _most(most)
         matching = self._book.newest(self._nodes.name, fits)
         page = [*itertools.islice(matching, first, first + limit + 1)]
-        listed = [kept_result.value for kept_result in page[:limit]]
+        listed = [kept.value for kept in page[:limit]]
         handle = _number(self._book.handle(timeout))
         return [_boolean(len(page) <= limit), _number(len(listed)), handle, _list(listed)]
 

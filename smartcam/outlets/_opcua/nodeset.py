@@ -83,7 +83,7 @@ def state_ids() -> Mapping[tuple[str, str], int]:
 @functools.cache
 def transitions() -> tuple[Transition, ...]:
     """Return the transitions of both machines, from the XML."""
-    transitions_found: list[Transition] = []
+    parsed: list[Transition] = []
     for key, node in _nodes().items():
         ends = [name for name, _ in _ends(node)]
         machine = _machine(node)
@@ -93,8 +93,8 @@ def transitions() -> tuple[Transition, ...]:
             source, target = ends
             cause = causes[0] if causes else ""
             made = Transition(machine, _name(node), _number(key), source, target, cause, effects)
-            transitions_found.append(made)
-    return tuple(transitions_found)
+            parsed.append(made)
+    return tuple(parsed)
 
 
 def _ends(node: ET.Element) -> list[tuple[str, str]]:

@@ -142,11 +142,7 @@ class FailedLogins:
             ServiceError: too many logins from this address have failed.
         """
         now = self._clock()
-        failed = [
-            attempt_at
-            for attempt_at in self._failed.get(address, ())
-            if now - attempt_at < LOGIN_SECONDS
-        ]
+        failed = [at for at in self._failed.get(address, ()) if now - at < LOGIN_SECONDS]
         if len(failed) >= MAX_FAILED_LOGINS:
             raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
         try:

@@ -210,10 +210,8 @@ class VisionSystem:
     def recipes(self) -> Mapping[str, int]:
         """Applications by name; names in the settings have priority over the camera's own."""
         named = self.settings.recipes
-        recipes_unnamed = {
-            name: number for name, number in self._names().items() if name not in named
-        }
-        return {**named, **recipes_unnamed}
+        others = {name: number for name, number in self._names().items() if name not in named}
+        return {**named, **others}
 
     def application_of(self, external: str, internal: str = "") -> int:
         """Return the application of a recipe.

@@ -99,9 +99,7 @@ class Structure(NamedTuple):
         except (KeyError, TypeError, ValueError, OverflowError, struct.error):
             return None
         kind = ua.VariantType.ExtensionObject
-        return [
-            ua.Variant(ua.ExtensionObject(self.encoding, structure), kind) for structure in packed
-        ]
+        return [ua.Variant(ua.ExtensionObject(self.encoding, data), kind) for data in packed]
 
     def _pack(self, record: Mapping[str, Any]) -> bytes:
         parts: list[bytes] = []
@@ -211,7 +209,7 @@ class VisionValues:
 
         So a client never decodes a new structure by an earlier one.
         """
-        versions = sum(structure[:2] == (camera, application) for structure in self._structures)
+        versions = sum(known[:2] == (camera, application) for known in self._structures)
         name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
         digest = hashlib.sha256(repr(columns).encode()).hexdigest()[:16]
         key = f"types.{camera}.App{application}.{digest}"

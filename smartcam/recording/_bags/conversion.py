@@ -103,7 +103,7 @@ class BagConversion:
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
         again = self.interpret_as is not None or self.calibration is not None
-        self._readers = {name.name: self._reader(name) for name in chosen} if again else {}
+        self._readers = {camera.name: self._reader(camera) for camera in chosen} if again else {}
         self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
         for camera in chosen:
             facts = {"interpret_as": self._spec(camera)} if again else camera.facts

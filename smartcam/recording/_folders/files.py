@@ -96,7 +96,7 @@ class FolderFiles:
         aged = self._clock() - track.begun >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
-    def _add(self, track: CameraTrack, thing: Any) -> int:
+    def _add(self, track: CameraTrack, given: Any) -> int:
         """Add an object's records to the file; return their number."""
         file = track.file
         if file is None:  # cannot happen: the file was begun
@@ -104,18 +104,18 @@ class FolderFiles:
         if track.gap is not None and not track.gap_written:
             self._add_gap(track, file, track.gap)
             track.gap_written = True
-        if isinstance(thing, Gap):
-            track.follow_all(thing)
-            self._add_gap(track, file, thing)
+        if isinstance(given, Gap):
+            track.follow_all(given)
+            self._add_gap(track, file, given)
             return 0
-        if isinstance(thing, Description):
-            track.facts |= thing.facts
+        if isinstance(given, Description):
+            track.facts |= given.facts
             file.add(Description(track.facts))
             return 0
-        track.follow(thing)
+        track.follow(given)
         written = 0
         try:
-            items = [*track.read(thing)]
+            items = [*track.read(given)]
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything

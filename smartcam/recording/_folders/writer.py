@@ -226,21 +226,21 @@ class FolderWriter:
             for track in self._tracks.values():
                 track.overflow = None
             over = self._closing
-        items_of_track: dict[CameraTrack, list[Any]] = {}
+        batches: dict[CameraTrack, list[Any]] = {}
         for track, item in taken.items:
-            items_of_track.setdefault(track, []).append(item)
-        return items_of_track, over
+            batches.setdefault(track, []).append(item)
+        return batches, over
 
-    def _write(self, items_of_track: dict[CameraTrack, list[Any]]) -> None:
+    def _write(self, batches: dict[CameraTrack, list[Any]]) -> None:
         """Write records, or count them as lost; never raises."""
         try:
-            if self._ready(items_of_track):
-                for track, given in items_of_track.items():
+            if self._ready(batches):
+                for track, given in batches.items():
                     self._files.write(track, given)
                 tracks = self._all_tracks()
                 self._files.end_old(tracks)
                 self._files.delete_old(tracks)
-                if items_of_track:
+                if batches:
                     self._heal()
         except (OSError, ConfigurationError) as exc:
             self._fail(exc)
@@ -249,10 +249,10 @@ class FolderWriter:
             self._fail(exc)
         trouble = self._trouble
         if trouble is not None:
-            for track, given in items_of_track.items():
+            for track, given in batches.items():
                 track.lose(given, trouble.reason)
 
-    def _ready(self, items_of_track: dict[CameraTrack, list[Any]]) -> bool:
+    def _ready(self, batches: dict[CameraTrack, list[Any]]) -> bool:
         """Return True if the disk should be tried; after a failure, check its free room first.
 
         Raises:
@@ -262,7 +262,7 @@ class FolderWriter:
         trouble, now = self._trouble, self._clock()
         if trouble is None:
             return True
-        if now < trouble.again or not items_of_track:
+        if now < trouble.again or not batches:
             return False
         self._files.enter()
         if trouble.full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:

@@ -137,22 +137,20 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
         ValueError: the message is not valid.
     """
     lists = values_of(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
-    drawings: dict[int, Drawing] = {}
+    drawn: dict[int, Drawing] = {}
     for annotation in lists.get("points", ()):
         values = values_of(_MESSAGES["PointsAnnotation"], annotation, MAX_POINTS + 100)
         kind = _KINDS.get(values.get("type", 0))
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
         points = tuple(map(_coordinates, values.get("points", ())))
-        drawings[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+        drawn[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
     for annotation in lists.get("texts", ()):
         values = values_of(_MESSAGES["TextAnnotation"], annotation, 100)
         if "place" in values:  # others are the words of points
             point = _coordinates(values.get("position", memoryview(b"")))
-            drawings[_number(values)] = Drawing(
-                "text", (point,), _role(values), _text(values, "text")
-            )
-    return tuple(drawing for _, drawing in sorted(drawings.items()))
+            drawn[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
+    return tuple(drawing for _, drawing in sorted(drawn.items()))
 
 
 def _point(x: float, y: float) -> bytes:
@@ -180,12 +178,10 @@ def _number(values: dict[str, Any]) -> int:
 
 
 def _role(values: dict[str, Any]) -> Role:
-    role_text = _text(values, "role")
-    role: Role | None = next(
-        (argument for argument in get_args(Role) if argument == role_text), None
-    )
+    text = _text(values, "role")
+    role: Role | None = next((known for known in get_args(Role) if known == text), None)
     if role is None:
-        raise ValueError(f"role: {role_text!r:.60} came, expected {', '.join(get_args(Role))}")
+        raise ValueError(f"role: {text!r:.60} came, expected {', '.join(get_args(Role))}")
     return role
 
 

@@ -201,13 +201,9 @@ def file_set(
     bodies = []
     for called, fields in messages.items():
         body = sized(1, called.encode())
-        for field, message_field in fields.items():
+        for key, field in fields.items():
             descriptor = _descriptor(
-                field,
-                message_field.number,
-                TYPES[message_field.type],
-                message_field.of,
-                repeated=message_field.repeated,
+                key, field.number, TYPES[field.type], field.of, repeated=field.repeated
             )
             body += sized(2, descriptor)
         for enum, names in enums.get(called, {}).items():
@@ -234,9 +230,5 @@ def _file(path: str, package: str, messages: list[bytes], needs: str = "") -> by
     """Return a FileDescriptorProto."""
     head = sized(1, path.encode()) + sized(2, package.encode())
     needed = sized(3, needs.encode()) if needs else b""
-    return (
-        head
-        + needed
-        + b"".join(sized(4, message_bytes) for message_bytes in messages)
-        + sized(12, b"proto3")
-    )
+    made = b"".join(sized(4, message) for message in messages)
+    return head + needed + made + sized(12, b"proto3")

@@ -84,10 +84,9 @@ class LineAnswers:
         if moment != self.asked_at:
             self.asked, self.asked_at = 0, moment
         nearest = min(
-            self.moments,
-            key=lambda place: ((place - moment) % 2, place > moment, abs(place - moment)),
+            self.moments, key=lambda at: ((at - moment) % 2, at > moment, abs(at - moment))
         )
-        of_moment = [at for at, moment in enumerate(self.moments) if moment == nearest]
+        of_moment = [place for place, at in enumerate(self.moments) if at == nearest]
         answer = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
         self.asked += 1
         return answer
@@ -179,22 +178,22 @@ def _forget_silence(lines: list[_AskedLine]) -> None:
 def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
     """Add the answer of each line to a plan."""
     triggers = [
-        line for line in lines if isinstance(line.line, bytes) and is_trigger(codec, line.line)
+        asked for asked in lines if isinstance(asked.line, bytes) and is_trigger(codec, asked.line)
     ]
     plan.triggers = len(triggers)
-    for line in lines:
+    for asked in lines:
         answers = (
-            plan.answers.setdefault(line.line, LineAnswers())
-            if isinstance(line.line, bytes)
-            else plan.secrets.setdefault(line.line, LineAnswers())
+            plan.answers.setdefault(asked.line, LineAnswers())
+            if isinstance(asked.line, bytes)
+            else plan.secrets.setdefault(asked.line, LineAnswers())
         )
-        answers.given.append(line.pieces)
-        answers.moments.append(_moment(line.begin, triggers))
+        answers.given.append(asked.pieces)
+        answers.moments.append(_moment(asked.begin, triggers))
 
 
 def _moment(place: int, triggers: list[_AskedLine]) -> int:
     """Return the moment of a place in a recording, see :class:`LineAnswers`."""
-    before = bisect_left(triggers, place, key=lambda answers: answers.begin)
+    before = bisect_left(triggers, place, key=lambda trigger: trigger.begin)
     end = triggers[before - 1].end if before else None
     return 2 * before - (before > 0 and (end is None or end > place))
 
@@ -310,8 +309,8 @@ class ReplayedLines(LineCamera):
     def remaining(self) -> int:
         """Number of triggers that are left, in this round."""
         return sum(
-            answer.left
-            for line, answer in self.plan.answers.items()
+            answers.left
+            for line, answers in self.plan.answers.items()
             if is_trigger(self.lines, line)
         )
 
@@ -333,21 +332,21 @@ class ReplayedLines(LineCamera):
         if self._at_once:
             client = client.answer_later()
         data = line.encode(self.lines.encoding, "replace")
-        answer = self.plan.secrets.get(place) or self.plan.answers.get(data)
-        if answer is None and (image := self._image_for(line)) is not None:
+        answers = self.plan.secrets.get(place) or self.plan.answers.get(data)
+        if answers is None and (image := self._image_for(line)) is not None:
             self._play(client, [TimedLine(0.0, image)], client.end_line)
             return
-        if answer is None:
+        if answers is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
         triggers = is_trigger(self.lines, data)
         self._triggered += triggers
-        if triggers and not answer.left and not self._loop:
+        if triggers and not answers.left and not self._loop:
             client.answer(None)
             return
         if place + 1 in self.plan.secrets:
             client.hide_next_line()
-        pieces = self._take(data, answer)
+        pieces = self._take(data, answers)
         self._play(client, pieces, self._ended(client, trigger=triggers and bool(pieces)))
         if triggers and self._on_over is not None and not self.remaining:
             on_over, self._on_over = self._on_over, None

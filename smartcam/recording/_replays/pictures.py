@@ -64,13 +64,7 @@ class ReplayedPictures:
         self._times_given: collections.Counter[tuple[int, bytes]] = collections.Counter()
         self._pictures = _by_application(recording, camera, applications)
         self.first: Frame | None = next(
-            (
-                picture.frame
-                for pictures_of_key in self._pictures.values()
-                for picture in pictures_of_key
-                if picture is not None
-            ),
-            None,
+            (shown.frame for row in self._pictures.values() for shown in row if shown), None
         )
 
     def source(self) -> FrameSource:
@@ -105,27 +99,21 @@ def _by_application(
     recording: Recording, camera: str, applications: Mapping[int, ApplicationRuns]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
     """Return the pictures of results with the same bytes, if their order is certain."""
-    pictures_by_key: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
+    pictures: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
     size = 0
     for result, picture, _ in recording.judged(camera):
-        pictures_of_key = pictures_by_key.setdefault((result.application, result.raw), [])
+        row = pictures.setdefault((result.application, result.raw), [])
         size += 0 if picture is None else memoryview(picture.data).nbytes
         if picture is None or size > MAX_REPLAY_BYTES:
-            pictures_of_key.append(None)
+            row.append(None)
         else:
-            pictures_of_key.append(
-                _ShownPicture(picture, result.received_at.timestamp() - picture.utc)
-            )
+            row.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
     if size > MAX_REPLAY_BYTES:
         _log.warning(
             "%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
         )
     counts = _in_one_order(applications)
-    return {
-        key: pictures_of_key
-        for key, pictures_of_key in pictures_by_key.items()
-        if counts.get(key) == len(pictures_of_key)
-    }
+    return {key: row for key, row in pictures.items() if counts.get(key) == len(row)}
 
 
 def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int, bytes], int]:
@@ -136,11 +124,8 @@ def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int
     triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     untriggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     for number, takes in applications.items():
-        for count, numbers_and_data in (
-            (triggered, takes.triggered),
-            (untriggered, takes.untriggered),
-        ):
-            count.update((number, data) for take in numbers_and_data for data in take.containers)
+        for count, runs in ((triggered, takes.triggered), (untriggered, takes.untriggered)):
+            count.update((number, data) for run in runs for data in run.containers)
     both = triggered.keys() & untriggered.keys()
     return {
         key: n for count in (triggered, untriggered) for key, n in count.items() if key not in both

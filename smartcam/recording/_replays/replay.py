@@ -3,7 +3,7 @@
 The device is the emulator's own. Its applications send the recorded containers, byte for byte:
 
 - The n-th trigger of an application gets the container of the n-th recorded trigger, after the same
-  time. If the recorded trigger had no result or was dropped, so has or is the n-th trigger.
+  time. It has no result if the recorded one had none, and is dropped if the recorded one was.
 - Containers without a trigger are sent by themselves: the first at its time after the start of the
   run, each other at its time after the container before. They wait while the camera is stopped or
   has another application; none is left out.

@@ -371,14 +371,14 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
             most = min(most, by_program - by_agent)
     # a status follows most results at once
     offset = 0.0 if least <= 0 <= most else most if least <= most < math.inf else least
-    replay_steps: list[_ReplayStep] = []
+    fitted: list[_ReplayStep] = []
     last = -math.inf
     for step in steps:
         at = step.at + offset if step.kind in _BY_AGENT else step.at
         if step.kind is not _StepKind.TRIGGER:
             at = last = max(at, last)
-        replay_steps.append(step._replace(at=at, recorded_at=step.at))
-    return replay_steps
+        fitted.append(step._replace(at=at, recorded_at=step.at))
+    return fitted
 
 
 def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:

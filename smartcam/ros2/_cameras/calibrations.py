@@ -103,7 +103,7 @@ class RosCalibrationFace:
         """
         service = CALIBRATION[name]
         names = [field for field in service.request.model_fields if hasattr(message, field)]
-        fields = {name: _plain(getattr(message, name)) for name in names}
+        fields = {field: _plain(getattr(message, field)) for field in names}
         request = validated(service.request, fields, f"{self.name}: {name}")
         answer = await service.do(CalibrationCall(self, request, service.timeout))
         if "pose" in answer:

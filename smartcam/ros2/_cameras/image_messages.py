@@ -335,13 +335,9 @@ def pixels_from(message: Any) -> NDArray[Any]:
 
 def _samples(encoding: str) -> tuple[str, int]:
     """Return the type of an encoding's numbers, and their count for a pixel."""
-    bits, _, channels_text = encoding.partition("C")
-    if (
-        bits[:-1] in {"8", "16", "32", "64"}
-        and bits[-1:] in _DTYPES
-        and channels_text in {*"1234", ""}
-    ):
-        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(channels_text or 1)
+    bits, _, count = encoding.partition("C")
+    if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and count in {*"1234", ""}:
+        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(count or 1)
     for name, channels in (("mono", 1), ("bayer_", 1), ("rgba", 4), ("bgra", 4), ("rgb", 3)):
         if encoding.startswith(name) and encoding.endswith(("8", "16")):
             return ("u2" if encoding.endswith("16") else "u1"), channels

@@ -124,10 +124,10 @@ class CameraLens:
             )
         width, height = await self._size()
         if info.camera.size != (width, height):
-            actual = info.camera.size
+            got = info.camera.size
             raise RosMessageError(
                 f"camera_info: expected the size of the pictures, {width}x{height}, got "
-                f"{actual[0]}x{actual[1]}"
+                f"{got[0]}x{got[1]}"
             )
         async with self._writing:
             await asyncio.to_thread(

@@ -69,12 +69,8 @@ class ResultMessages:
     ) -> None:
         self.frame_id: str = frame_id
         self._camera, self._calibration = camera, calibration
-        robot_frames = {
-            frame_of_robot(calibration_) for calibration_ in calibrations_of(calibration).values()
-        }
-        self._in_ros: dict[str, str] = (
-            dict.fromkeys(robot_frames, robot_frame) if robot_frame else {}
-        )
+        robots = {frame_of_robot(each) for each in calibrations_of(calibration).values()}
+        self._in_ros: dict[str, str] = dict.fromkeys(robots, robot_frame) if robot_frame else {}
         self._in_ros[camera] = frame_id
         cls = {
             name: types.message(name).cls

@@ -45,23 +45,23 @@ class CameraPart(Protocol):
 
 
 PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
-    lambda node: CameraParameters.of(node.camera, node.node, node.options, node.status),
-    lambda node: node.status,
-    lambda node: node.results,
-    lambda node: CameraGraph(
-        node.node, node.calibrations, owned=node.calibrations is not node.options.calibrations
+    lambda this: CameraParameters.of(this.camera, this.node, this.options, this.status),
+    lambda this: this.status,
+    lambda this: this.results,
+    lambda this: CameraGraph(
+        this.node, this.calibrations, owned=this.calibrations is not this.options.calibrations
     ),
-    lambda node: node.services,
-    lambda node: node.rosout(),
-    lambda node: CameraPictures(
-        node.camera,
-        node.node,
-        frame_id=node.frames.optical,
-        camera_info_url=str(node.options.frames.get("camera_info_url", "")),
+    lambda this: this.services,
+    lambda this: this.rosout(),
+    lambda this: CameraPictures(
+        this.camera,
+        this.node,
+        frame_id=this.frames.optical,
+        camera_info_url=str(this.options.frames.get("camera_info_url", "")),
     ),
-    lambda node: node.controls(),
-    lambda node: StaticTransforms(node.node, node.frames.transforms()),
-    lambda node: node.lifecycle,
+    lambda this: this.controls(),
+    lambda this: StaticTransforms(this.node, this.frames.transforms()),
+    lambda this: this.lifecycle,
 )
 """Parts of a node, in the order of their start. The life cycle is the last, so that the others get
 its events."""

@@ -27,33 +27,27 @@ DIAGNOSTICS_PERIODS = (0.1, 3600.0)
 """Smallest and largest number of seconds between two diagnostics messages."""
 
 SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
-    "url": ("URL of the camera, without a password", lambda camera: masked(camera.address.url)),
+    "url": ("URL of the camera, without a password", lambda given: masked(given.address.url)),
     "interpret_as": (
         "interpretation of result containers; empty: none",
-        lambda camera: as_text(camera.interpret_as),
+        lambda given: as_text(given.interpret_as),
     ),
-    "y_down": ("the camera's y axis points down", lambda camera: camera.y_down),
-    "lenient": ("any non-zero byte is a true bool", lambda camera: camera.lenient),
+    "y_down": ("the camera's y axis points down", lambda given: given.y_down),
+    "lenient": ("any non-zero byte is a true bool", lambda given: given.lenient),
     "restore": (
         "application and run state are restored after a reconnect",
-        lambda camera: camera.restore,
+        lambda given: given.restore,
     ),
-    "reconnect": (
-        "the client reconnects after a loss",
-        lambda camera: camera.reconnect is not None,
-    ),
-    "connect_timeout": ("seconds to establish a session", lambda camera: camera.connect_timeout),
+    "reconnect": ("the client reconnects after a loss", lambda given: given.reconnect is not None),
+    "connect_timeout": ("seconds to establish a session", lambda given: given.connect_timeout),
     "switch_timeout": (
         "seconds for a switch until the camera is ready",
-        lambda camera: camera.switch_timeout,
+        lambda given: given.switch_timeout,
     ),
-    "request_timeout": (
-        "seconds for the answer to a request",
-        lambda camera: camera.request_timeout,
-    ),
+    "request_timeout": ("seconds for the answer to a request", lambda given: given.request_timeout),
     "liveness_timeout": (
         "seconds until a camera that does not answer counts as lost; 0: never",
-        lambda camera: camera.liveness_timeout or 0.0,
+        lambda given: given.liveness_timeout or 0.0,
     ),
 }
 """Read-only parameters: the description, and a function that returns the value."""

@@ -101,12 +101,12 @@ class PictureRequests:
             logger.warning("%s ! a request for a picture failed: %s", self._node.full_name, exc)
             return {"error": error_text(exc)}
 
-    async def _serve(self, requested_at: float) -> dict[str, Any]:
-        if not 0 <= requested_at <= MAX_TIMEOUT:
+    async def _serve(self, seconds: float) -> dict[str, Any]:
+        if not 0 <= seconds <= MAX_TIMEOUT:
             raise RosMessageError(
-                f"timeout: expected 0 to {MAX_TIMEOUT:g} seconds, got {requested_at:g}"
+                f"timeout: expected 0 to {MAX_TIMEOUT:g} seconds, got {seconds:g}"
             )
-        timeout = requested_at or MAX_TIMEOUT
+        timeout = seconds or MAX_TIMEOUT
         try:
             async with asyncio.timeout(timeout):
                 await self._one_at_a_time.acquire()

@@ -77,7 +77,7 @@ class CameraPictures:
         self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
         self.frame_id: str = frame_id or f"{node.name}_optical"
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
-        self._requests = PictureRequests(node, self.frame_id, self._lens, self._publish_one)
+        self._requests = PictureRequests(node, self.frame_id, self._lens, self._take_one)
         self._ends: list[Any] = []
         self._streams: list[SubscribedPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
@@ -162,7 +162,7 @@ class CameraPictures:
         quality = None if encoding == "raw" else self._quality
         return self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
 
-    async def _publish_one(self, timeout: float) -> Frame:
+    async def _take_one(self, timeout: float) -> Frame:
         frame = await one_frame(self._frames, self._camera, timeout)
         self._size = (frame.width, frame.height)
         return frame
@@ -171,7 +171,7 @@ class CameraPictures:
         if self._frames is not None:
             return self._frames.format.width, self._frames.format.height
         if self._size is None:
-            await self._publish_one(SIZE_TIMEOUT)
+            await self._take_one(SIZE_TIMEOUT)
         return self._size or (0, 0)
 
     # ------------------------------------------------------------------ messages
@@ -187,17 +187,15 @@ class CameraPictures:
 
     async def _publish_small(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
-        compressed_form = compression(frame)
+        form = compression(frame)
         small = frame
-        if compressed_form.first:
-            small = await self._codecs.converted(small, compressed_form.first)
-        if compressed_form.how == "png":
+        if form.first:
+            small = await self._codecs.converted(small, form.first)
+        if form.how == "png":
             small = await self._codecs.png(small)
-        elif compressed_form.how == "jpeg":
+        elif form.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        await publish_newest(
-            self._small, compressed_fields(small, compressed_form.text(), self.frame_id)
-        )
+        await publish_newest(self._small, compressed_fields(small, form.text(), self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:

@@ -89,13 +89,13 @@ class CameraGraph:
         """
         full = self._full(topic)
         kind = self._kind(full)
-        ages: list[float] = []
+        times: list[float] = []
         subscription = self._node.subscribe(full, kind, qos=QoS(reliable=False, depth=1))
         try:
             async with asyncio.timeout(PICTURE_WAIT):
-                message, utc = await _fresh(subscription, ages)
+                message, utc = await _fresh(subscription, times)
         except TimeoutError as exc:
-            raise self._missing(full, kind, ages) from exc
+            raise self._missing(full, kind, times) from exc
         except StopAsyncIteration as exc:
             raise RosError(f"{full}: the node of the camera was closed meanwhile") from exc
         finally:
@@ -135,17 +135,17 @@ class CameraGraph:
                 return kind
         return COMPRESSED if topic.endswith("/compressed") else IMAGE
 
-    def _missing(self, topic: str, kind: str, ages: list[float]) -> Exception:
-        old = f"; {len(ages)} came that were taken before" if ages else ""
+    def _missing(self, topic: str, kind: str, times: list[float]) -> Exception:
+        old = f"; {len(times)} came that were taken before" if times else ""
         return Code.NO_PICTURE.refusal(
             f"{topic}: no picture came within {PICTURE_WAIT:g} s{old}; expected {kind} with the "
             "time of its exposure, from a camera that is running",
             kind,
-            len(ages),
+            len(times),
         )
 
 
-async def _fresh(subscription: Any, ages: list[float]) -> tuple[Any, float | None]:
+async def _fresh(subscription: Any, times: list[float]) -> tuple[Any, float | None]:
     """Return the first picture that was taken after the call, and its time."""
     begun = time.time()
     while True:
@@ -154,6 +154,6 @@ async def _fresh(subscription: Any, ages: list[float]) -> tuple[Any, float | Non
         if abs(utc - time.time()) <= MAX_CLOCK_DIFFERENCE:
             if utc >= begun:
                 return message, utc
-        elif ages:
+        elif times:
             return message, None
-        ages.append(utc)
+        times.append(utc)

@@ -198,8 +198,10 @@ class CameraServices:
             results_per_trigger=wanted,
         )
         make = self._results.messages.result
-        parts = [make(result, localizations_in_metres(camera, result, spec)) for result in results]
-        return {"results": parts}
+        messages = [
+            make(result, localizations_in_metres(camera, result, spec)) for result in results
+        ]
+        return {"results": messages}
 
     def _check(self, request: Any, wanted: int, spec: str | None) -> None:
         name = self._camera.name
@@ -208,15 +210,13 @@ class CameraServices:
                 f"{name}: timeout {request.timeout}: expected seconds up to {MAX_TIMEOUT:g}, or 0 "
                 f"for {DEFAULT_TRIGGER_TIMEOUT:g}"
             )
-        for quantity, actual, most in (
+        for quantity, got, most in (
             ("results_per_trigger", wanted, MAX_RESULTS),
             ("bytes of input", len(request.input), MAX_INPUT_BYTES),
             ("characters of interpret_as", len(spec or ""), MAX_LAYOUT_CHARACTERS),
         ):
-            if actual > most:
-                raise ConfigurationError(
-                    f"{name}: {quantity}: expected {most} at most, got {actual}"
-                )
+            if got > most:
+                raise ConfigurationError(f"{name}: {quantity}: expected {most} at most, got {got}")
         if spec is not None and in_pixels(resolve(spec)):
             application = request.application_id or self._camera.active_application or 0
             if not calibrated(self._camera, application):

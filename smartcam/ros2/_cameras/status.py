@@ -191,7 +191,7 @@ class CameraStatus:
         """Return the fields of ``diagnostic_msgs/msg/DiagnosticStatus``."""
         counted = self._camera.statistics()
         counts = {name: int(getattr(counted, name)) for name in COUNTERS}
-        streams = [subscriber for subscriber in counted.subscribers if subscriber.name == "results"]
+        streams = [stream for stream in counted.subscribers if stream.name == "results"]
         counts["dropped"] = sum(stream.dropped for stream in streams)
         known = KnownState.of(self._camera)
         how = health(known, session_alive=self._is_session_alive(counted))

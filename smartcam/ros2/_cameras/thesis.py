@@ -209,7 +209,7 @@ class ThesisServices:
         """
         camera, node = self._face.name, self._node
         known = {camera, node.full_name, node.name}
-        if name and name.strip("/") not in {field.strip("/") for field in known}:
+        if name and name.strip("/") not in {other.strip("/") for other in known}:
             raise ConfigurationError(
                 f"camera_name {name!r:.80}: this is the node of {camera!r}: expected "
                 "that, or an empty text"

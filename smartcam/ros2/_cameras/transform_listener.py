@@ -295,11 +295,11 @@ class TransformListener:
 
     def _strange(self, frame: str, base: str = "") -> CalibrationError:
         known = sorted({*self._links, *(link.parent for link in self._links.values())})
-        frames_text = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
-        target_text = f" to {base!r}" if base and base != frame else ""
+        shown = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
+        to = f" to {base!r}" if base and base != frame else ""
         return Code.WRONG_FRAME.refusal(
-            f"TF: no way leads from {frame!r}{target_text}; expected frames of one tree on /tf and "
-            f"/tf_static, which have {frames_text}",
+            f"TF: no way leads from {frame!r}{to}; expected frames of one tree on /tf and "
+            f"/tf_static, which have {shown}",
             known[:MAX_FRAMES_IN_ERROR],
             frame,
         )

@@ -114,10 +114,8 @@ def _named(transform: Transform, parent: str, child: str) -> Transform:
 
 def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
     """Return ``geometry_msgs/TransformStamped``: the source's pose in the target, its parent."""
-    x, y, z, w = (
-        float(number) for number in transform.quaternion / np.linalg.norm(transform.quaternion)
-    )
-    across, down, ahead = (float(number) for number in transform.translation)
+    x, y, z, w = map(float, transform.quaternion / np.linalg.norm(transform.quaternion))
+    across, down, ahead = map(float, transform.translation)
     return {
         "header": {"stamp": stamp_fields(utc), "frame_id": transform.target},
         "child_frame_id": transform.source,
@@ -175,7 +173,7 @@ class StaticTransforms:
     def _publish(self) -> None:
         now = time.time()
         self._publisher.publish(
-            transforms=[transform_fields(transform, now) for transform in self._transforms]
+            transforms=[transform_fields(each, now) for each in self._transforms]
         )
 
 
@@ -189,11 +187,7 @@ def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
                     f"got {name!r}"
                 )
         if transform.target == transform.source or transform.source in checked:
-            other = (
-                checked[transform.source].target
-                if transform.source in checked
-                else transform.target
-            )
+            other = checked.get(transform.source, transform).target
             raise ConfigurationError(
                 f"tf: {transform.source}: expected one parent that is another frame, "
                 f"got {transform.target} and {other}"

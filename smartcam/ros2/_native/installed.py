@@ -86,13 +86,11 @@ def checked_service(kind: ServiceType) -> Any:
 
 def _compare(kind: MessageType, class_: Any) -> None:
     ours = [field.name for field in kind.fields]
-    actual_kinds = [kind for kind in class_.get_fields_and_field_types() if kind != EMPTY_FIELD]
-    if ours != actual_kinds:
+    theirs = [name for name in class_.get_fields_and_field_types() if name != EMPTY_FIELD]
+    if ours != theirs:
         raise ConfigurationError(
-            f"{kind.name}: the ROS that is installed has the fields "
-            f"{', '.join(actual_kinds)}: "
-            f"expected {', '.join(ours)}; name its distribution, or "
-            f"build the package of this smartcam"
+            f"{kind.name}: the ROS that is installed has the fields {', '.join(theirs)}: expected "
+            f"{', '.join(ours)}; name its distribution, or build the package of this smartcam"
         )
 
 

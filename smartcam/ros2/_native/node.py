@@ -234,17 +234,17 @@ class NativeNode(NamedNode):
         except Exception as exc:
             raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
 
-    def unmade(self, end_text: str, end: Any) -> None:
+    def unmade(self, kind: str, end: Any) -> None:
         """Destroy an endpoint of rclpy."""
         ros = self.ros
         if ros is not None:
-            getattr(ros, f"destroy_{end_text}")(end)
+            getattr(ros, f"destroy_{kind}")(end)
 
     def forget(self, end: Any) -> None:
         """Note that an endpoint was closed."""
         self._ends.discard(end)
 
-    def _with_end(self, end: End) -> End:
+    def _added(self, end: End) -> End:
         self._ends.add(end)
         return end
 
@@ -266,7 +266,7 @@ class NativeNode(NamedNode):
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         cls = checked_message(kind)
         self._note_missing(cls, type, name)
-        return self._with_end(NativePublisher(self, name, kind, qos, cls))
+        return self._added(NativePublisher(self, name, kind, qos, cls))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -282,7 +282,7 @@ class NativeNode(NamedNode):
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
         cls = self._built(checked_message(kind), type)
-        return self._with_end(NativeSubscription(self, name, kind, qos, cls))
+        return self._added(NativeSubscription(self, name, kind, qos, cls))
 
     def serve(
         self,
@@ -311,7 +311,7 @@ class NativeNode(NamedNode):
         kind, name = self.types.service(type), self._resolved(service, "service")
         cls = checked_service(kind)
         self._note_missing(cls, type, name)
-        return self._with_end(NativeService(self, name, kind, cls, handler, timeout))
+        return self._added(NativeService(self, name, kind, cls, handler, timeout))
 
     def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> NativeClient:
         """Return a client that calls a service.
@@ -327,9 +327,7 @@ class NativeNode(NamedNode):
         """
         del qos
         kind, name = self.types.service(type), self._resolved(service, "service")
-        return self._with_end(
-            NativeClient(self, name, kind, self._built(checked_service(kind), type))
-        )
+        return self._added(NativeClient(self, name, kind, self._built(checked_service(kind), type)))
 
     def manage(self, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]) -> NativeLifecycle:
         """Make ROS' own life cycle follow one of smartcam's.

@@ -63,16 +63,16 @@ class NativeParameters(RosParameters):
 
     # ------------------------------------------------------------------ from here to ROS
 
-    def _notify(self, **lists: Any) -> None:
+    def _notify(self, **changes: Any) -> None:
         """Add, change or delete parameters in ROS."""
         if getattr(self, "_ros", None) is None:
             return
-        for name in lists.get("new", ()):
+        for name in changes.get("new", ()):
             self._declare_in_ros(name)
-        changed = lists.get("changed", ())
+        changed = changes.get("changed", ())
         if changed and not _asked_by_ros.get():
             self._put(lambda: self._ros.set_parameters([self._parameter(name) for name in changed]))
-        for name in lists.get("deleted", ()):
+        for name in changes.get("deleted", ()):
             if not self._ros.describe_parameter(name).read_only:  # rclpy keeps read-only ones
                 self._put(lambda name=name: self._ros.undeclare_parameter(name))
 

@@ -200,12 +200,12 @@ class SpunNode:
         try:
             context = self._context.open()
         except BaseException as exc:  # noqa: BLE001 - passed to start()
-            self.in_loop(self._report_error, exc)
+            self.in_loop(self._report_made, exc)
             _open.discard(self)
             return
         try:
             self._make(context)
-            self.in_loop(self._report_error, None)
+            self.in_loop(self._report_made, None)
             why = self._spin(context)
         except BaseException as exc:  # noqa: BLE001 - passed to start(), or to on_end
             why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
@@ -213,10 +213,10 @@ class SpunNode:
             self._close()
             self._context.close()
             _open.discard(self)
-            self.in_loop(self._report_error, why)
+            self.in_loop(self._report_made, why)
             self.in_loop(self._on_end, why)
 
-    def _report_error(self, error: BaseException | None) -> None:
+    def _report_made(self, error: BaseException | None) -> None:
         if self._made.done():
             return
         if error is None:
@@ -294,5 +294,5 @@ _open: weakref.WeakSet[SpunNode] = weakref.WeakSet()
 
 @atexit.register
 def _abandon() -> None:
-    for future in tuple(_open):
-        future.abandon()
+    for spun in tuple(_open):
+        spun.abandon()

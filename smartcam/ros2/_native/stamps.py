@@ -33,7 +33,7 @@ class RosStamps:
 
     def __init__(self, shift: Callable[[], float]) -> None:
         self._shift = shift
-        self._arrival_times: collections.OrderedDict[int, int] = collections.OrderedDict()
+        self._moved_stamps: collections.OrderedDict[int, int] = collections.OrderedDict()
         self._lock = threading.Lock()
 
     def moved(self, kind: MessageType, data: bytes) -> bytes:
@@ -47,12 +47,12 @@ class RosStamps:
 
     def _moved(self, stamp: int) -> int:
         with self._lock:
-            known = self._arrival_times.get(stamp)
+            known = self._moved_stamps.get(stamp)
             if known is None:
                 known = max(0, stamp + round(self._shift() * BILLION))
-                self._arrival_times[stamp] = known
-                if len(self._arrival_times) > MAX_STAMPS:
-                    self._arrival_times.popitem(last=False)
+                self._moved_stamps[stamp] = known
+                if len(self._moved_stamps) > MAX_STAMPS:
+                    self._moved_stamps.popitem(last=False)
             return known
 
 
@@ -62,8 +62,8 @@ def headers(kind: MessageType, message: Any) -> Iterator[Any]:
         if not field.nested:
             continue
         value = getattr(message, field.attribute)
-        for header in value if field.shape else (value,):
+        for part in value if field.shape else (value,):
             if field.type == HEADER:
-                yield header
+                yield part
             else:
-                yield from headers(kind.nested[field.type], header)
+                yield from headers(kind.nested[field.type], part)

@@ -106,13 +106,13 @@ class NativePublisher:
         self._check_open()
         if self._raw is None:
             return
-        encoded = message_of(message, fields)
+        message = message_of(message, fields)
         done = asyncio.Event()
         failed: list[Exception] = []
 
         def publish() -> None:
             try:
-                self._pass_on(self.type.encode(encoded))
+                self._pass_on(self.type.encode(message))
             except Exception as exc:  # noqa: BLE001 - passed to the waiting task
                 failed.append(exc)
             self._node.in_loop(done.set)

@@ -197,8 +197,8 @@ class RosContext:
         for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
             watcher(other, present)
         if present and other.kind in OTHER_END:
-            for end_of_other in self._ends.get((other.name, OTHER_END[other.kind]), ()):
-                self._differ(end_of_other, other)
+            for end in self._ends.get((other.name, OTHER_END[other.kind]), ()):
+                self._differ(end, other)
 
     def _differ(self, one: Entity, other: Entity) -> None:
         if (one.type, one.hash) != (other.type, other.hash):

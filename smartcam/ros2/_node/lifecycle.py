@@ -141,12 +141,10 @@ class Lifecycle:
         """The transitions that begin at the current state."""
         return [transition for transition in TRANSITIONS if transition.start is self.state]
 
-    def listen(self, on_transition: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
-        """Call ``on_transition`` after each step; return a function that ends this."""
-        self._listeners.append(on_transition)
-        return lambda: (
-            self._listeners.remove(on_transition) if on_transition in self._listeners else None
-        )
+    def listen(self, on_step: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
+        """Call ``on_step`` after each step; return a function that ends this."""
+        self._listeners.append(on_step)
+        return lambda: self._listeners.remove(on_step) if on_step in self._listeners else None
 
     async def settled(self) -> None:
         """Wait for the end of a running transition.
@@ -220,24 +218,17 @@ class Lifecycle:
             task.cancel()
             await asyncio.wait((task,))
         for label in ("shutdown", SUCCESS):
-            step = next(
-                (transition for transition in self.available if transition.label == label), None
-            )
+            step = next((step for step in self.available if step.label == label), None)
             if step is not None and self.state is not FINALIZED:
                 self._enter(step)
 
     def _find(self, label: str, number: int) -> LifecycleTransition:
-        possible = [transition for transition in self.available if transition.id < PRIVATE]
-        for transition in possible:
-            if not self.closed and (
-                transition.label == label if label else transition.id == number
-            ):
-                return transition
+        possible = [step for step in self.available if step.id < PRIVATE]
+        for step in possible:
+            if not self.closed and (step.label == label if label else step.id == number):
+                return step
         wanted = repr(label[:40]) if label else f"transition {number}"
-        ways = (
-            ", ".join(f"{transition.label} ({transition.id})" for transition in possible)
-            or "nothing"
-        )
+        ways = ", ".join(f"{step.label} ({step.id})" for step in possible) or "nothing"
         state = "closed" if self.closed else self.state.label
         raise RosError(f"{self.name}: {wanted}: it is {state}, where {ways} can be asked for")
 
@@ -274,15 +265,15 @@ class Lifecycle:
             task.exception()
 
     def _follow(self, label: str) -> None:
-        self._enter(next(transition for transition in self.available if transition.label == label))
+        self._enter(next(step for step in self.available if step.label == label))
 
     def _enter(self, transition: LifecycleTransition) -> None:
         self.state = transition.goal
         if self.state.id < PRIVATE:
             logger.info("%s = %s", self.name, self.state.label)
-        for on_transition in tuple(self._listeners):
+        for on_step in tuple(self._listeners):
             try:
-                on_transition(transition)
+                on_step(transition)
             except ENDS_PROGRAM:
                 raise
             except BaseException:

@@ -169,7 +169,7 @@ class Node(NamedNode):
         """
         kind = self.types.message(type)
         entity = self._end(PUBLISHER, topic, "topic", kind.dds, kind.hash, qos)
-        return self._with_end(RosPublisher(self.context, entity, kind, self._ends.discard))
+        return self._added(RosPublisher(self.context, entity, kind, self._ends.discard))
 
     def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosSubscription:
         """Subscribe to a topic; read it by ``async for``.
@@ -185,7 +185,7 @@ class Node(NamedNode):
         """
         kind = self.types.message(type)
         entity = self._end(SUBSCRIPTION, topic, "topic", kind.dds, kind.hash, qos)
-        return self._with_end(RosSubscription(self.context, entity, kind, self._ends.discard))
+        return self._added(RosSubscription(self.context, entity, kind, self._ends.discard))
 
     def serve(
         self,
@@ -213,7 +213,7 @@ class Node(NamedNode):
         """
         kind = self.types.service(type)
         entity = self._end(SERVICE, service, "service", kind.dds, kind.hash, qos)
-        return self._with_end(
+        return self._added(
             RosService(self.context, entity, kind, handler, timeout, self._ends.discard)
         )
 
@@ -231,7 +231,7 @@ class Node(NamedNode):
         """
         kind = self.types.service(type)
         entity = self._end(CLIENT, service, "service", kind.dds, kind.hash, qos)
-        return self._with_end(RosClient(self.context, entity, kind, self._ends.discard))
+        return self._added(RosClient(self.context, entity, kind, self._ends.discard))
 
     def parameters_of(self, name: str, *, timeout: float = CALL_TIMEOUT) -> ParameterClient:
         """Return a client that lists, gets, describes and sets another node's parameters.
@@ -247,7 +247,7 @@ class Node(NamedNode):
             self.client, resolve(name, self.namespace, self.name, "node"), timeout
         )
 
-    def _with_end(self, end: End) -> End:
+    def _added(self, end: End) -> End:
         self._ends.add(end)
         return end
 

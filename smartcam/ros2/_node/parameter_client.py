@@ -74,10 +74,8 @@ class ParameterClient:
         """
         reply = await self._call("describe_parameters", "DescribeParameters", names=names)
         self._check("describe_parameters", names, reply.descriptors)
-        descriptions = zip(names, reply.descriptors, strict=True)
-        return {
-            name: ParameterDescription.decode(description) for name, description in descriptions
-        }
+        fields = zip(names, reply.descriptors, strict=True)
+        return {name: ParameterDescription.decode(described) for name, described in fields}
 
     async def set(self, values: Mapping[str, object] | None = None, /, **more: object) -> None:
         """Set parameters, all or none.
@@ -116,10 +114,10 @@ class ParameterClient:
             )
         return await client.call(timeout=self._timeout, **fields)
 
-    def _check(self, service: str, names: Sequence[str], replies: Sequence[Any]) -> None:
-        if len(replies) != len(names):
+    def _check(self, service: str, names: Sequence[str], answers: Sequence[Any]) -> None:
+        if len(answers) != len(names):
             raise ServiceCallError(
-                f"{self.name}: {len(replies)} answers for {len(names)} names: not all of "
+                f"{self.name}: {len(answers)} answers for {len(names)} names: not all of "
                 f"{', '.join(names):.200} are declared there",
                 service=f"{self.name}/{service}",
             )

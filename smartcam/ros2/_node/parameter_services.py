@@ -95,12 +95,8 @@ class ParameterServices:
         )
 
     def _messages(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        parameters_found = ((name, self._parameters.find(name)) for name in names)
-        return [
-            {"name": name, "value": encode_value(parameter)}
-            for name, parameter in parameters_found
-            if parameter
-        ]
+        values = ((name, self._parameters.find(name)) for name in names)
+        return [{"name": name, "value": encode_value(value)} for name, value in values if value]
 
     # ------------------------------------------------------------------ reading
 

@@ -159,9 +159,8 @@ def range_of(
             f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
         )
     if number == INTEGER:
-        wrong = [
-            bound for bound in (first, last, step) if bound is not None and not _is_integral(bound)
-        ]
+        given = [bound for bound in (first, last, step) if bound is not None]
+        wrong = [bound for bound in given if not _is_int64(bound)]
         if wrong:
             raise ConfigurationError(
                 f"parameter {name!r}: a range of {wrong[0]}: expected whole numbers of 64 bits"
@@ -173,7 +172,7 @@ def range_of(
     return first, last, step
 
 
-def _is_integral(value: float) -> bool:
+def _is_int64(value: float) -> bool:
     return (
         isinstance(value, int) and not isinstance(value, bool) and _INT64[0] <= value <= _INT64[1]
     )
@@ -266,7 +265,7 @@ def _number_of(kind: type) -> int:
 
 
 def _check_elements(name: str, number: int, given: Sequence[Any]) -> None:
-    if number == INTEGER and not (_is_integral(min(given)) and _is_integral(max(given))):
+    if number == INTEGER and not (_is_int64(min(given)) and _is_int64(max(given))):
         raise ConfigurationError(f"parameter {name!r}: expected integers of 64 bits")
     if number == STRING:
         text = "".join(given)

@@ -301,7 +301,7 @@ class RosParameters:
             raise
         for change in changes:
             change.declared.value = change.new
-        self._notify(changed=[value for value in values if value in self._declared])
+        self._notify(changed=[name for name in values if name in self._declared])
 
     async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
         """Undo changes; a change that cannot be undone stays, and is published and logged."""
@@ -343,9 +343,9 @@ class RosParameters:
             logger.exception("%s ! on_set of parameter %r failed", self._node.full_name, name)
             raise RosError(f"parameter {name!r}: {type(exc).__name__}: {exc!s:.200}") from exc
 
-    def _notify(self, **lists: Any) -> None:
+    def _notify(self, **changes: Any) -> None:
         if self._services is not None:
-            self._services.tell(**lists)
+            self._services.tell(**changes)
 
 
 def _refuse_sim_time(value: bool) -> None:

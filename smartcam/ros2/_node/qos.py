@@ -84,7 +84,7 @@ class QoS:
         if [len(part) for part in parts] != [1, 1, 2, 2, 2, 3]:
             raise ValueError(f"quality of service {text!r:.80}: expected six parts, as ::,5:,:,:,,")
         (reliability,), (durability,), (history, depth), _, lifespan, _ = [
-            [int(number) if number else 0 for number in part] for part in parts
+            [int(digits) if digits else 0 for digits in part] for part in parts
         ]
         seconds = lifespan[0] + lifespan[1] / 1e9
         endless = not seconds or tuple(lifespan) == _ENDLESS

@@ -242,7 +242,7 @@ class RosClient(RosEnd):
     def served(self) -> bool:
         """True if there is a server, as far as is known."""
         ends = self._context.graph.ends(self.name, SERVICE)
-        return not self._closed and any(endpoint.key == self.entity.key for endpoint in ends)
+        return not self._closed and any(end.key == self.entity.key for end in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until there is a server.
@@ -258,9 +258,7 @@ class RosClient(RosEnd):
                     self._check_open()
                     await asyncio.sleep(SERVER_POLL_INTERVAL)
         except TimeoutError as exc:
-            others = [
-                endpoint.ros_type for endpoint in self._context.graph.ends(self.name, SERVICE)
-            ]
+            others = [end.ros_type for end in self._context.graph.ends(self.name, SERVICE)]
             others_text = f", but one for {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: no server for {self.type.name} {self.type.hash} within "

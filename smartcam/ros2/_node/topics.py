@@ -229,7 +229,7 @@ class RosPublisher(RosEnd):
         Cancellation: the message is published or not.
         """
         self._check_open()
-        encoded = message_of(message, fields)
+        message = message_of(message, fields)
         if self._slot is None:
             self._slot = self._context.slot()
             self._lane = self._slot.lane
@@ -239,7 +239,7 @@ class RosPublisher(RosEnd):
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._send_newest(self.type.encode(encoded))
+                self._send_newest(self.type.encode(message))
             except BaseException as exc:  # noqa: BLE001 - passed to the waiting task
                 done.set_exception(exc)
             else:

@@ -93,7 +93,7 @@ class Definition:
             defaults: whether fields have their defaults behind them.
         """
         constants = (
-            f"{self.kinds[name]} {name}={constant}\n" for name, constant in self.constants.items()
+            f"{self.kinds[name]} {name}={value}\n" for name, value in self.constants.items()
         )
         fields = (
             f"{field} {field.name}{_default_text(field.default) if defaults else ''}\n"

@@ -38,7 +38,7 @@ _DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
 }
-"""Defaults that the stores leave out; a name is a constant of the type."""
+"""Defaults that the stores leave out; a text is the name of a constant, if the type has it."""
 
 _NAME, _ARRAY, _SEQUENCE = 2, 3, 4
 
@@ -57,21 +57,21 @@ def stored(distribution: str) -> Mapping[str, Any]:
             f"{distribution!r:.80}"
         )
     name = f"rosbags.typesys.stores.ros2_{DISTRIBUTIONS[distribution]}"
-    definition: Mapping[str, Any] = load(name).FIELDDEFS
-    return definition
+    definitions: Mapping[str, Any] = load(name).FIELDDEFS
+    return definitions
 
 
 def read_stored(name: str, stored: Any) -> Definition:
     """Return the definition of a message that a store holds."""
-    constants = {name: value for name, _, value in stored[0]}
+    constants = {constant: value for constant, _, value in stored[0]}
     fields = []
-    for constant, kind in stored[1]:
-        if constant != EMPTY.name:
-            default = _DEFAULTS.get((name, constant))
+    for field, kind in stored[1]:
+        if field != EMPTY.name:
+            default = _DEFAULTS.get((name, field))
             if isinstance(default, str):
                 default = constants.get(default)
-            fields.append(_field(constant, kind)._replace(default=default))
-    kinds: dict[str, str] = {name: str(OTHER_NAMES.get(kind, kind)) for name, kind, _ in stored[0]}
+            fields.append(_field(field, kind)._replace(default=default))
+    kinds = {constant: str(OTHER_NAMES.get(kind, kind)) for constant, kind, _ in stored[0]}
     return Definition(name, tuple(fields), constants, kinds)
 
 

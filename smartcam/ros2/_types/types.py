@@ -328,10 +328,10 @@ class RosTypes:
         with self._lock:
             if name in self.names():
                 if kind == "srv":
-                    definitions: Any = parse(name, self._service_text(name) or "")
+                    known: Any = parse(name, self._service_text(name) or "")
                 else:
-                    definitions = self.definition(name)
-                if bare(definitions) != bare(parsed):
+                    known = self.definition(name)
+                if bare(known) != bare(parsed):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )
@@ -370,10 +370,8 @@ class RosTypes:
         with self._lock:
             if (made := self._messages.get(name)) is None:
                 definition = self.definition(name)
-                nested = {
-                    needed: self.message_of(needed, (*within, name))
-                    for needed in sorted(definition.needs())
-                }
+                needs = sorted(definition.needs())
+                nested = {need: self.message_of(need, (*within, name)) for need in needs}
                 made = self._messages[name] = MessageType(definition, nested, self)
         return made
 

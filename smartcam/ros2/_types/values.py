@@ -133,8 +133,8 @@ def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
         return (np.zeros(count, dtype) if usual is None else np.array(usual, dtype)).copy
     if field.default is not None:
         return functools.partial(list, field.default)
-    single = _zero(kind, field._replace(shape=""))
-    return lambda: [single() for _ in range(count)]
+    make = _zero(kind, field._replace(shape=""))
+    return lambda: [make() for _ in range(count)]
 
 
 _ZERO: Final[dict[str, Any]] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
@@ -181,18 +181,18 @@ def rule_of(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
             return value
 
         return numbers
-    single_field = field._replace(shape="", size=0)
-    rule = _rule_of_one(kind, single_field)
+    element = field._replace(shape="", size=0)
+    rule = _rule_of_one(kind, element)
 
     def each(values: Any) -> list[Any]:
         counted(values, least, field.size)
-        array: list[Any] = []
+        checked: list[Any] = []
         for place, value in enumerate(values):
             try:
-                array.append(rule(value))
+                checked.append(rule(value))
             except _MISFITS as exc:
-                raise _located(exc, single_field, value, f"[{place}]") from exc
-        return array
+                raise _located(exc, element, value, f"[{place}]") from exc
+        return checked
 
     return each
 

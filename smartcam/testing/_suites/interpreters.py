@@ -116,9 +116,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         for name in ("spec", "samples"):
             if not getattr(suite, name, None):
                 raise pytest.UsageError(f"{suite.__name__}.{name}: expected one, got none")
-        labels = [
-            sample.name or sample.layout or f"sample {i}" for i, sample in enumerate(self.samples)
-        ]
+        labels = [each.name or each.layout or f"sample {i}" for i, each in enumerate(self.samples)]
         metafunc.parametrize("sample", self.samples, ids=labels)
 
     def make(self, layout: str | None = None) -> Interpreter:
@@ -150,7 +148,7 @@ class InterpreterSuite(SaysWhatWasExpected):
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """Check that the number is the layout's field, or None, or an error."""
+        """Check that the number is the value of the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
         sequence = interpreter.sequence(reader)
@@ -167,13 +165,8 @@ class InterpreterSuite(SaysWhatWasExpected):
         """Check this after other containers, and with a new interpreter; values share nothing."""
         interpreter = self.make(sample.layout)
         first = interpret(interpreter, sample.data)
-        between = [other for other in self.samples if other.layout == sample.layout]
-        for data in (
-            *(other.data for other in between),
-            sample.data[:-1],
-            sample.data + b"\0",
-            b"",
-        ):
+        between = [each.data for each in self.samples if each.layout == sample.layout]
+        for data in (*between, sample.data[:-1], sample.data + b"\0", b""):
             outcome(interpreter, data)
             again = interpret(interpreter, sample.data)
             assert _same(again, first), f"first {first!r}, after {data!r} {again!r}"
@@ -187,12 +180,12 @@ class InterpreterSuite(SaysWhatWasExpected):
         interpreter = self.make(sample.layout)
         outcome(interpreter, sample.data)  # facts learned at the first call may be kept
         data = bytes(bytearray(sample.data))
-        before_text, before = repr(vars(interpreter)), sys.getrefcount(data)
+        state, before = repr(vars(interpreter)), sys.getrefcount(data)
         for _ in range(3):
             outcome(interpreter, data)
         assert data == sample.data, f"the container was changed to {data!r}"
         now = repr(vars(interpreter))
-        assert now == before_text, f"the interpreter was changed from {before_text} to {now}"
+        assert now == state, f"the interpreter was changed from {state} to {now}"
         if sys.getrefcount(data) != before:
             gc.collect()
         assert sys.getrefcount(data) <= before or len(data) < 2, "the container's bytes are kept"
@@ -274,7 +267,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         interpreter = self.make(sample.layout)
         if not isinstance(interpreter, PlainInterpreter):
             return  # the client reads them one by one
-        burst = [other.data for other in self.samples if other.layout == sample.layout] * 2
+        burst = [each.data for each in self.samples if each.layout == sample.layout] * 2
         context = Context(camera="burst", number=5, received_at=_AT)
         values = interpreter.read_all(burst, context)
         assert len(values) == len(burst), f"{len(burst)} containers gave {len(values)} values"
@@ -394,8 +387,8 @@ def _parts(value: object) -> Iterator[object]:
     yield value
     inside: Sequence[object] = ()
     if isinstance(value, dict):
-        mapping_ = cast("dict[object, object]", value)
-        inside = [*mapping_.keys(), *mapping_.values()]
+        pairs = cast("dict[object, object]", value)
+        inside = [*pairs.keys(), *pairs.values()]
     elif isinstance(value, (list, tuple, set, frozenset)):
         inside = [*cast("Sequence[object]", value)]
     elif is_dataclass(value) and not isinstance(value, type):

@@ -45,12 +45,12 @@ def each_drawn(check: Callable[[DataObject], None]) -> None:
 
 def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
     """Draw any bytes, and samples that are cut, repeated, or have a byte changed."""
-    noises: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE_BYTES)
+    any_bytes: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE_BYTES)
     if not any(samples):
-        return noises
-    sample = st.sampled_from([sample for sample in samples if sample])
+        return any_bytes
+    sample = st.sampled_from([data for data in samples if data])
     return st.one_of(
-        noises,
+        any_bytes,
         sample,
         st.builds(lambda data, end: data[:end], sample, st.integers(0, MAX_NOISE_BYTES)),
         st.builds(lambda data, begin: data[begin:], sample, st.integers(0, MAX_NOISE_BYTES)),

@@ -45,8 +45,8 @@ class LinkLog:
         self.passed: Tally[str] = Tally()
 
     def note(
-        self, label: str, connection: int = 0, direction: str = "", at: int | None = None
+        self, what: str, connection: int = 0, direction: str = "", at: int | None = None
     ) -> None:
         """Keep an entry; the arguments are its fields."""
-        self.log.append(Entry(label, connection, direction, at))
-        self.counts.add(label)
+        self.log.append(Entry(what, connection, direction, at))
+        self.counts.add(what)

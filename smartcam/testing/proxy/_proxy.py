@@ -104,7 +104,7 @@ class LinkProxy:
         """Number of open connections; on UDP, of known client addresses."""
         return len(self._relay.members)
 
-    async def wait_for(self, label: str, count: int = 1, *, timeout: float = 5.0) -> None:
+    async def wait_for(self, what: str, count: int = 1, *, timeout: float = 5.0) -> None:
         """Wait until an entry is in the log ``count`` times, counted from the beginning.
 
         Raises:
@@ -112,7 +112,7 @@ class LinkProxy:
 
         Cancellation: safe.
         """
-        await self._log.counts.wait(label, count, timeout)
+        await self._log.counts.wait(what, count, timeout)
 
     async def wait_passed(self, direction: Direction, amount: int, *, timeout: float = 5.0) -> None:
         """Wait until the proxy sent ``amount`` bytes, or datagrams, in a direction.
@@ -182,5 +182,5 @@ class LinkProxy:
         self.refuse()
         self.reset()
 
-    def _note(self, kind: str, connection: int | None, direction: str = "") -> None:
-        self._log.note(kind, connection or 0, direction)
+    def _note(self, what: str, connection: int | None, direction: str = "") -> None:
+        self._log.note(what, connection or 0, direction)

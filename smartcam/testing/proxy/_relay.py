@@ -24,9 +24,9 @@ class Proxied(ABC):
         self.log: LinkLog = relay.log
         self._loop = asyncio.get_running_loop()
 
-    def note(self, label: str, direction: str = "", at: int | None = None) -> None:
+    def note(self, what: str, direction: str = "", at: int | None = None) -> None:
         """Log an event."""
-        self.log.note(label, self.number, direction, at)
+        self.log.note(what, self.number, direction, at)
 
     @abstractmethod
     def add(self, rules: Sequence[Rule]) -> None:
@@ -77,18 +77,18 @@ class Relay(ABC, Generic[C]):
 
     def add(self, rules: Sequence[Rule]) -> None:
         """Apply rules from here on."""
-        for connection_ in self.chosen(None):
-            connection_.add(rules)
+        for member in self.chosen(None):
+            member.add(rules)
 
     def cut(self, connection: int | None) -> None:
         """End connections in order."""
-        for relayed in self.chosen(connection):
-            relayed.cut()
+        for member in self.chosen(connection):
+            member.cut()
 
     def reset(self, connection: int | None) -> None:
         """End connections hard."""
-        for relayed in self.chosen(connection):
-            relayed.reset()
+        for member in self.chosen(connection):
+            member.reset()
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""

@@ -219,14 +219,14 @@ class StreamRelay(Relay[ProxiedConnection]):
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""
         super().stall(direction, connection)
-        for relayed in self.chosen(connection):
-            relayed.stall(direction)
+        for member in self.chosen(connection):
+            member.stall(direction)
 
     def resume(self) -> None:
         """Pass everything again."""
         super().resume()
-        for relayed in self.chosen(None):
-            relayed.resume()
+        for member in self.chosen(None):
+            member.resume()
 
     def take(self, client: socket.socket) -> None:
         """Pair a client's socket with one to the target."""

@@ -84,8 +84,8 @@ class LiveCamera:
         """Be gone for good."""
         self._cannot("have the camera gone")
 
-    def _cannot(self, label: str) -> NoReturn:
-        pytest.skip(f"{type(self).__name__} cannot {label}")
+    def _cannot(self, action: str) -> NoReturn:
+        pytest.skip(f"{type(self).__name__} cannot {action}")
 
 
 @dataclass(frozen=True, kw_only=True)

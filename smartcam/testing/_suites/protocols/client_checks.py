@@ -69,9 +69,7 @@ async def _watched(check: Coroutine[Any, Any, None]) -> None:
 
 def needs(camera_kind: CameraKind, *applications: int) -> None:
     """Skip the check if a camera does not have all of these applications."""
-    missing = [
-        application for application in applications if application not in camera_kind.applications
-    ]
+    missing = [number for number in applications if number not in camera_kind.applications]
     if missing:
         pytest.skip(f"{camera_kind} has no application {', '.join(map(str, missing))}")
 

@@ -91,13 +91,13 @@ class Conversation:
 
 def flat(events: Iterable[Event]) -> list[Any]:
     """Return events with each burst as its containers, and errors by their kind."""
-    steps: list[Any] = []
+    flattened: list[Any] = []
     for event in events:
         if isinstance(event, ResultBurst):
-            steps += event
+            flattened += event
         else:
-            steps.append(type(event.error) if isinstance(event, LinkFailed) else event)
-    return steps
+            flattened.append(type(event.error) if isinstance(event, LinkFailed) else event)
+    return flattened
 
 
 class Player:

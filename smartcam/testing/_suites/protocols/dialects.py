@@ -127,9 +127,7 @@ class DialectChecks(Parameters):
 
     def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
         """Check for a session, a sign of life, results, and the status: by itself or on request."""
-        missing = [
-            message_type.__name__ for message_type in NEEDED if not dialect.has(message_type)
-        ]
+        missing = [kind.__name__ for kind in NEEDED if not dialect.has(kind)]
         assert not missing, f"has() is False for {', '.join(missing)}"
         assert dialect.answers(m.Connect), "Connect must be answered"
         assert dialect.answers(m.Query), "Query must be answered: it is the sign of life"
@@ -142,8 +140,8 @@ class DialectChecks(Parameters):
         """Check that each ability has its messages, and the other way round."""
         for name, needed in ABILITIES.items():
             can = getattr(dialect.capabilities, name)
-            has = [dialect.has(message_type) for message_type in needed]
-            names = " and ".join(message_type.__name__ for message_type in needed)
+            has = [dialect.has(kind) for kind in needed]
+            names = " and ".join(kind.__name__ for kind in needed)
             if can:
                 assert all(has), f"capabilities.{name} is True, but it has not {names}"
             else:

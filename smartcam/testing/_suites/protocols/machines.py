@@ -106,8 +106,8 @@ class MachineChecks(Parameters):
 
         def check(data: DataObject) -> None:
             place = data.draw(strategies.st.sampled_from(places), label="at step")
-            data_whole = b"".join(data.draw(pieces, label="comes"))
-            compare(place, data_whole, strategies.cut(data, data_whole))
+            whole = b"".join(data.draw(pieces, label="comes"))
+            compare(place, whole, strategies.cut(data, whole))
 
         for place in places:
             compare(place, b"".join(samples), samples)
@@ -122,7 +122,7 @@ class MachineChecks(Parameters):
         places = range(len(conversation.steps) + 1)
         comes = strategies.noise(_samples(conversation))
         dialect = conversation.group(self.protocol)[0]
-        says = strategies.st.sampled_from([example(request, dialect) for request in REQUESTS])
+        says = strategies.st.sampled_from([example(kind, dialect) for kind in REQUESTS])
         actions = strategies.st.lists(strategies.st.one_of(comes, says), max_size=8)
 
         def check(data: DataObject) -> None:
@@ -181,9 +181,9 @@ class MachineChecks(Parameters):
                 assert waiting == 0, f"{where}: {waiting} bytes of a datagram are kept"
             if messages > MAX_MESSAGES:
                 break  # reports are messages
-        bytes_kept = tracemalloc.get_traced_memory()[0] - before
-        assert bytes_kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
-            f"{where}: the machine has grown by {bytes_kept} bytes"
+        grown = tracemalloc.get_traced_memory()[0] - before
+        assert grown <= MAX_HIDDEN_FACTOR * self.max_waiting, (
+            f"{where}: the machine has grown by {grown} bytes"
         )
 
     # ------------------------------------------------------------------ requests
@@ -233,7 +233,7 @@ class MachineChecks(Parameters):
         """Check that the answer is kept back, since it would pass for the next request's."""
         for place, answer, data in _answers(conversation):
             player = Player(self.protocol, conversation).play(place)
-            events = [event for data_part in data for event in player.deliver(data_part)]
+            events = [event for chunk in data for event in player.deliver(chunk)]
             answers = [event for event in events if isinstance(event, answer)]
             assert not answers, f"at step {place}, no request was open, but it reported {answers}"
 
@@ -383,8 +383,8 @@ class _Judge:
             elif isinstance(event, LinkEnded):
                 assert event.pending >= 0, f"{event}: expected the number of bytes left"
             else:
-                is_report = isinstance(event, (m.Report, m.UnknownMessage, ResultBurst))
-                assert is_report, f"{event!r} is none of a camera's messages"
+                is_message = isinstance(event, (m.Report, m.UnknownMessage, ResultBurst))
+                assert is_message, f"{event!r} is none of a camera's messages"
         for data in self.machine.data_to_send():
             assert isinstance(data, bytes), f"data_to_send() has {data!r}"
 

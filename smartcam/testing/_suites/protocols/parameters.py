@@ -72,10 +72,8 @@ def _label(value: object) -> str | None:
 def dialects_of(protocol: Protocol) -> list[Dialect]:
     """Return the dialects of a protocol, and those with quirks that a client tries."""
     dialects: list[Dialect] = list(protocol.dialects.values())
-    tried = [
-        dialect for groups in protocol.detection.values() for group in groups for dialect in group
-    ]
-    for dialect in tried:
+    groups = [group for tries in protocol.detection.values() for group in tries]
+    for dialect in (each for group in groups for each in group):
         if dialect not in dialects:
             dialects.append(dialect)
     return dialects

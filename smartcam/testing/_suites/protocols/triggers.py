@@ -104,7 +104,7 @@ class TriggerChecks(Parameters):
             for _ in range(3):
                 with pytest.raises(TriggerTimeoutError) as caught:
                     await camera.trigger(timeout=SHORT_TIMEOUT)
-                if "no trigger was sent" not in str(caught.value):  # like a slow machine
+                if "no trigger was sent" not in str(caught.value):  # as on a slow machine
                     inspections += 1
                 assert await number(camera) == inspections
                 inspections += 1

@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
 
 MESSAGES: tuple[type[m.Message], ...] = tuple(
-    value
+    kind
     for name in m.__all__
-    for value in [getattr(m, name)]
-    if isinstance(value, type)
-    and issubclass(value, (m.Request, m.Report))
-    and value not in {m.Request, m.Report, m.Acknowledgement}
+    for kind in [getattr(m, name)]
+    if isinstance(kind, type)
+    and issubclass(kind, (m.Request, m.Report))
+    and kind not in {m.Request, m.Report, m.Acknowledgement}
 )
 """Every message that a dialect may have."""
 
 REQUESTS: tuple[type[m.Request], ...] = tuple(
-    message for message in MESSAGES if issubclass(message, m.Request)
+    kind for kind in MESSAGES if issubclass(kind, m.Request)
 )
 """The types of all messages that a client sends."""
 
