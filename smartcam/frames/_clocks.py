@@ -31,7 +31,7 @@ class ClockStatistics:
 
     Attributes:
         drift: seconds per second by which the clock is too fast; None: not known yet.
-        jumps: number of times that the clock was set anew, forwards or backwards.
+        jumps: number of times that the clock was reset, forwards or backwards.
     """
 
     drift: float | None
@@ -50,7 +50,7 @@ class DeviceClock:
     queue; its frames count as too old until the offset has adapted.
 
     Attributes:
-        jumps: number of times that the clock was set anew.
+        jumps: number of times that the clock was reset.
     """
 
     def __init__(self) -> None:

@@ -115,7 +115,7 @@ class InSightDriver(FrameDriver):
         try:
             await self._camera.open()
         except SmartCamError as exc:
-            raise self._failed(exc) from exc
+            raise self._source_error(exc) from exc
         if not self._camera.capabilities.read_image:
             raise FrameSourceError(
                 f"{self.name}: this camera cannot be asked for a picture", source=self.name
@@ -127,9 +127,9 @@ class InSightDriver(FrameDriver):
         try:
             return await self._camera.read_image(timeout=self._timeout)
         except SmartCamError as exc:
-            raise self._failed(exc) from exc
+            raise self._source_error(exc) from exc
 
-    def _failed(self, exc: SmartCamError) -> FrameSourceError:
+    def _source_error(self, exc: SmartCamError) -> FrameSourceError:
         text = str(exc).removeprefix(f"{self.name}: ")
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 

@@ -439,7 +439,7 @@ class FrameSource(FrameSink):
             captured = self._clock.captured(frame.device_time, captured)
             if self._clock.jumps > jumps:
                 _log.warning(
-                    "%s: the camera's clock was set anew, at frame %d", self.name, frame.sequence
+                    "%s: the camera's clock was reset, at frame %d", self.name, frame.sequence
                 )
         if captured > now:  # a capture cannot be in the future
             self._ahead += 1

@@ -136,7 +136,7 @@ def test_bit_rate_is_kept(
         noise=noise,
     )
     link.run(20.0)
-    best = link.control.statistics().why == "the best quality"
+    best = link.control.statistics().why == "at the highest quality"
     fewest = link.control.statistics().why.endswith("fewer")
     for begin in (10.0, 15.0):
         found = link.bitrate(begin, begin + 5.0) / target
@@ -169,7 +169,7 @@ def test_latency_is_kept(
     for begin in (10.0, 15.0):
         found = link.latency(begin, begin + 5.0) / target
         assert found <= 1.1 or "lowest" in statistics.why or statistics.why.endswith("fewer")
-        assert found >= 0.9 or statistics.why == "the best quality"
+        assert found >= 0.9 or statistics.why == "at the highest quality"
     if statistics.quality > 11:
         assert statistics.fps == 30.0
     assert turns([one.quality for one in link.last(10.0, 20.0)], 0.2) <= 2
@@ -188,7 +188,7 @@ def test_rate_follows_a_slower_link_in_a_second_and_recovers_slowly(
     rises = [one.size for one in link.last(20.0, 40.0)]
     assert max(link.last(20.0, 20.9), key=lambda one: one.quality).size < 2.2 * rises[0]
     statistics = link.control.statistics()
-    assert statistics.why == "the best quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
+    assert statistics.why == "at the highest quality" or 0.09 <= link.latency(35.0, 40.0) <= 0.11
 
 
 @given(more=st.floats(1.5, 8.0))
@@ -266,7 +266,7 @@ def test_limit_that_cannot_be_kept_is_reported() -> None:
     link.run(10.0)
     statistics = link.control.statistics()
     assert (statistics.quality, statistics.fps) == (10, 1.0)
-    assert statistics.why == "bit rate: no frame may be smaller, nor fewer"
+    assert statistics.why == "bit rate, at the lowest quality and frame rate"
 
 
 @pytest.mark.parametrize(

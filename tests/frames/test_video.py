@@ -493,7 +493,7 @@ async def test_picture_of_another_size_ends_the_stream() -> None:
     camera = Camera()
     async with served(camera.serve) as port, frames.open(f"http://127.0.0.1:{port}/") as source:
         camera.pictures = [jpeg(0), jpeg(1, 256, 32)]
-        with pytest.raises(FrameFormatError, match="got 256x32: open it anew") as got:
+        with pytest.raises(FrameFormatError, match="got 256x32: open it again") as got:
             await numbers(source)
         assert got.value.available == ("256x32",)
 

@@ -211,11 +211,11 @@ class H264Decoder:
             except load("av").FFmpegError as exc:
                 if self._missing is None:
                     return None
-                raise self._damaged(frame, str(exc)) from exc
+                raise self._damaged_error(frame, str(exc)) from exc
             self._begun = True
             made = [self._made(picture) for picture in pictures]
             if any(picture.is_corrupt for picture in pictures) and missing == 0:
-                raise self._damaged(frame, "a picture with holes")
+                raise self._damaged_error(frame, "a picture with holes")
             return made[-1] if made and missing == 0 else None
 
     def _begin(self, frame: Frame) -> None:
@@ -260,10 +260,10 @@ class H264Decoder:
         picture = converted(picture, self._to) if self._to else picture
         pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
-            raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
+            raise self._damaged_error(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
 
-    def _damaged(self, frame: Frame, actual: str) -> FrameFormatError:
+    def _damaged_error(self, frame: Frame, actual: str) -> FrameFormatError:
         return FrameFormatError(
             f"{frame.source}: {self.NAME} {frame.width}x{frame.height}: expected a whole encoded "
             f"frame, got {len(frame.data)} bytes: {actual}",

@@ -53,7 +53,7 @@ def jpeg_header(data: bytes | bytearray | memoryview, label: str) -> tuple[int, 
     try:
         height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
     except (ValueError, KeyError) as exc:  # the second value is for unknown kinds of colours
-        raise _wrong(label, data, exc) from exc
+        raise _jpeg_error(label, data, exc) from exc
     return width, height, colours != "Gray"
 
 
@@ -83,7 +83,7 @@ def decode_jpeg(
     except ValueError as exc:
         remark = str(exc)
         if not remark.strip() or any(text in remark.lower() for text in DAMAGE):
-            raise _wrong(label, data, exc) from exc
+            raise _jpeg_error(label, data, exc) from exc
         _check_restarts(data, label, exc)
         return DecodedJpeg(_decode_tolerantly(decode, data, colours, label), remark)
 
@@ -94,7 +94,7 @@ def _decode_tolerantly(
     try:
         return decode(_joined_segments(bytes(data)), colours, strict=False)
     except ValueError as exc:
-        raise _wrong(label, data, exc) from exc
+        raise _jpeg_error(label, data, exc) from exc
 
 
 def _joined_segments(data: bytes) -> bytes:
@@ -128,12 +128,14 @@ def _check_restarts(data: bytes | bytearray | memoryview, label: str, warning: E
     scan = octets.rfind(b"\xff\xda")
     marks = [mark[0] - 0xD0 for mark in _RESTART.findall(octets, max(scan, 0))]
     if scan < 0 or b"\xff\xd9" not in octets[scan:]:
-        raise _wrong(label, data, warning)
+        raise _jpeg_error(label, data, warning)
     if marks != [place % 8 for place in range(len(marks))]:
-        raise _wrong(label, data, ValueError(f"a restart mark is missing; {warning}"))
+        raise _jpeg_error(label, data, ValueError(f"a restart mark is missing; {warning}"))
 
 
-def _wrong(label: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
+def _jpeg_error(
+    label: str, data: bytes | bytearray | memoryview, exc: Exception
+) -> FrameFormatError:
     return FrameFormatError(
         f"{label}: expected a whole JPEG, got {len(data)} bytes that "
         f"begin with {bytes(data[:4]).hex(' ')}: {exc}"

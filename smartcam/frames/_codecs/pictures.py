@@ -62,7 +62,9 @@ def to_jpeg(frame: Frame, quality: int) -> Frame:
     """Return the frame as a JPEG."""
     layout = frame.format.layout
     if frame.format.depth != 8:
-        raise _no_way(frame, "JPEG, which has 8 bits a sample", "png, jpegxl or converted")
+        raise _no_conversion_error(
+            frame, "JPEG, which has 8 bits a sample", "png, jpegxl or converted"
+        )
     if isinstance(layout, YuvPairs | Planes):
         data = _planes_to_jpeg(frame, layout.matrix, quality)
     elif isinstance(layout, SampleLayout) and frame.format.name in _JPEG_COLOURS:
@@ -74,7 +76,7 @@ def to_jpeg(frame: Frame, quality: int) -> Frame:
         pixels = frame.rgb() if coloured else frame.grey()[..., None]
         data = _samples_to_jpeg(pixels, "RGB" if coloured else "GRAY", quality)
     else:
-        raise _no_way(frame, "JPEG", "converted")
+        raise _no_conversion_error(frame, "JPEG", "converted")
     return _with_bytes(frame, data, "MJPEG")
 
 
@@ -132,7 +134,7 @@ def to_jpegxl(frame: Frame) -> Frame:
 def _lossless(frame: Frame, to: str) -> NDArray[Any]:
     """Return the samples that are written to the file."""
     if not isinstance(frame.format.layout, SampleLayout):
-        raise _no_way(frame, to, "converted")
+        raise _no_conversion_error(frame, to, "converted")
     name, pixels = frame.format.name, frame.array()
     if name.endswith("_limited"):
         pixels = frame.rgb()  # the file formats have no entry for that range
@@ -141,7 +143,7 @@ def _lossless(frame: Frame, to: str) -> NDArray[Any]:
     return np.ascontiguousarray(pixels)
 
 
-def _no_way(frame: Frame, to: str, instead: str) -> FrameFormatError:
+def _no_conversion_error(frame: Frame, to: str, instead: str) -> FrameFormatError:
     return FrameFormatError(
         f"{frame.source}: {frame.format.name} cannot become {to} as it is; see Codecs.{instead}",
         source=frame.source,
@@ -168,7 +170,7 @@ def _from_jpeg(frame: Frame, name: str) -> Frame:
     name = find_format(name or ("RGB8" if coloured else "Mono8")).name
     colours = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
     if name not in colours:
-        raise _unfit(frame, "Mono8, RGB8 or BGR8", name)
+        raise _unfit_error(frame, "Mono8, RGB8 or BGR8", name)
     size = (frame.width, frame.height)
     pixels, remark = decode_jpeg(frame.data, colours[name], size, "MJPEG")
     made = with_pixels(frame, pixels[..., 0] if name == "Mono8" else pixels, name)
@@ -178,7 +180,7 @@ def _from_jpeg(frame: Frame, name: str) -> Frame:
 def _from_png(frame: Frame, name: str) -> Frame:
     head = bytes(frame.data[:24])
     if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
-        raise _unfit(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
+        raise _unfit_error(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
     size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
     return _lossless_back(frame, name, size, "png_decode")
 
@@ -190,16 +192,16 @@ def _from_jpegxl(frame: Frame, name: str) -> Frame:
 def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
     """Decode a picture if it has the stated size; no memory is allocated for another size."""
     if size != (frame.width, frame.height):
-        raise _unfit(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
+        raise _unfit_error(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
     try:
         pixels: NDArray[Any] = getattr(load("imagecodecs"), decoder)(frame.data)
     except (ValueError, RuntimeError) as exc:
-        raise _unfit(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
+        raise _unfit_error(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
     if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha is returned with colours
         pixels = pixels[..., [0, 0, 0, 1]]
     wanted = _samples_named(name, pixels)
     if wanted is None:
-        raise _unfit(frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}")
+        raise _unfit_error(frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}")
     return with_pixels(frame, pixels[..., ::-1] if wanted.name == "BGR8" else pixels, wanted.name)
 
 
@@ -233,7 +235,7 @@ def jpegxl_size(frame: Frame) -> tuple[int, int]:
     """
     stream = _jpegxl_stream(bytes(frame.data[:4096]))
     if stream[:2] != b"\xff\x0a":
-        raise _unfit(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
+        raise _unfit_error(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
     bits, place = int.from_bytes(stream[2:14], "little"), 0
 
     def take(count: int) -> int:
@@ -268,7 +270,7 @@ def _jpegxl_stream(data: bytes) -> bytes:
     return data
 
 
-def _unfit(frame: Frame, expected: str, actual: str) -> FrameFormatError:
+def _unfit_error(frame: Frame, expected: str, actual: str) -> FrameFormatError:
     return FrameFormatError(
         f"{frame.source}: {frame.format.name}: expected {expected}, got {actual}",
         source=frame.source,

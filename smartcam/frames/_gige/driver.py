@@ -408,7 +408,7 @@ class GigEDriver(FrameDriver):
                 return
             shape, leader = self._shape, picture.leader
             if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
-                self._end(self._changed(picture, shape))
+                self._end(self._changed_format_error(picture, shape))
                 return
             chunks, remark = self._session.read_chunks(picture)
             if leader.payload_type == PayloadType.CHUNK and (doubt := in_doubt(picture, chunks)):
@@ -425,7 +425,7 @@ class GigEDriver(FrameDriver):
             error.__cause__ = fault
             self._end(error)
 
-    def _changed(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
+    def _changed_format_error(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
         leader = picture.leader
         return FrameFormatError(
             f"{self.name}: it streams {shape.format} ({shape.number:#010x}), then came "

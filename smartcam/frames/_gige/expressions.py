@@ -261,7 +261,7 @@ class _FormulaParser:
     def parsed(self) -> Tree:
         tree = self._choice()
         if self._at < len(self._tokens):
-            raise self._wrong("an operator or the end")
+            raise self._syntax_error("an operator or the end")
         return tree
 
     def _cut(self, formula: str) -> list[tuple[str, str]]:
@@ -276,7 +276,7 @@ class _FormulaParser:
             at = token.end()
         return tokens
 
-    def _wrong(self, expected: str) -> MessageError:
+    def _syntax_error(self, expected: str) -> MessageError:
         actual = repr(self._tokens[self._at][1]) if self._at < len(self._tokens) else "its end"
         return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {actual}")
 
@@ -291,7 +291,7 @@ class _FormulaParser:
 
     def _expect(self, sign: str) -> None:
         if self._next(sign) is None:
-            raise self._wrong(repr(sign))
+            raise self._syntax_error(repr(sign))
 
     def _choice(self) -> Tree:
         self._depth += 1
@@ -343,7 +343,7 @@ class _FormulaParser:
             self._expect(")")
             return tree
         if self._at == len(self._tokens) or self._tokens[self._at][0] == "operator":
-            raise self._wrong("a number, a name or '('")
+            raise self._syntax_error("a number, a name or '('")
         kind, token = self._tokens[self._at]
         self._at += 1
         if kind == "hex":
@@ -392,11 +392,11 @@ class _EmvaParser(_FormulaParser):
         at = self._at
         before = self._tokens[at - 1][1] if at else "("
         if before in _TIGHTER_THAN_NOT and self._next("~"):
-            raise self._misread(before, "~")
+            raise self._misread_error(before, "~")
         if self._next("-"):
             if self._at < len(self._tokens) and self._is_whole(self._at):
                 if at:
-                    raise self._misread(before, "-(")
+                    raise self._misread_error(before, "-(")
                 self._depth += 1
                 if self._depth > MAX_LEVELS:
                     raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
@@ -406,7 +406,7 @@ class _EmvaParser(_FormulaParser):
             self._at = at
         return super()._unary()
 
-    def _misread(self, before: str, sign: str) -> MessageError:
+    def _misread_error(self, before: str, sign: str) -> MessageError:
         return MessageError(
             f"formula {self._formula[:80]!r}: expected a value after {before}, got {sign}, which "
             "EMVA's GenApi misreads there"

@@ -131,7 +131,7 @@ class GenicamFeatures:
             try:
                 return await self._as_user_value(node)
             except MessageError as exc:
-                raise self._wrong(name, str(exc)) from exc
+                raise self._feature_error(name, str(exc)) from exc
 
     async def number(self, name: str) -> float | None:
         """Return a feature's number; None if it is no number, or not available now."""
@@ -155,7 +155,7 @@ class GenicamFeatures:
             try:
                 return await self._entries_now(node)
             except MessageError as exc:
-                raise self._wrong(name, str(exc)) from exc
+                raise self._feature_error(name, str(exc)) from exc
 
     async def set(
         self, name: str, value: FeatureValue, *, writing: Callable[[], None] | None = None
@@ -176,10 +176,10 @@ class GenicamFeatures:
             self._writing = writing
             try:
                 if await self._condition(node, "pIsLocked", False, 0):
-                    raise self._wrong(name, "it is locked now")
+                    raise self._feature_error(name, "it is locked now")
                 await self._set(node, await self._as_node_value(node, value), 0)
             except MessageError as exc:
-                raise self._wrong(name, str(exc)) from exc
+                raise self._feature_error(name, str(exc)) from exc
             finally:
                 self._writing = None
 
@@ -204,7 +204,7 @@ class GenicamFeatures:
         node = self._named(name)
         if (node.kind == "Command") != expected:
             is_not = "a command: it is executed" if not expected else "no command: it is set"
-            raise self._wrong(node.name, f"it is {is_not}")
+            raise self._feature_error(node.name, f"it is {is_not}")
 
     async def is_done(self, name: str) -> bool:
         """Return True if a command is done, so that its register has changed.
@@ -238,7 +238,9 @@ class GenicamFeatures:
         node = self._nodes.get(name)
         return "" if node is None else node.kind
 
-    def _wrong(self, name: str, text: str, available: tuple[str, ...] = ()) -> FrameFeatureError:
+    def _feature_error(
+        self, name: str, text: str, available: tuple[str, ...] = ()
+    ) -> FrameFeatureError:
         return FrameFeatureError(
             f"{self._source}: feature {name}: {text}", source=self._source, available=available
         )
@@ -262,9 +264,9 @@ class GenicamFeatures:
         try:
             available = await self._is_available(node, 0)
         except MessageError as exc:
-            raise self._wrong(name, str(exc)) from exc
+            raise self._feature_error(name, str(exc)) from exc
         if not available:
-            raise self._wrong(name, "it is not available now")
+            raise self._feature_error(name, "it is not available now")
         return node
 
     async def _is_available(self, node: Element, depth: int) -> bool:
@@ -300,12 +302,12 @@ class GenicamFeatures:
         if node.kind == "Boolean":
             text = str(value).lower()
             if text not in ("0", "1", "true", "false", "on", "off"):
-                raise self._wrong(node.name, f"expected true or false, got {value!r}")
+                raise self._feature_error(node.name, f"expected true or false, got {value!r}")
             return _on(node) if text in ("1", "true", "on") else _off(node)
         if node.kind == "Enumeration":
             entries = await self._entries_now(node)
             if str(value) not in entries:
-                raise self._wrong(
+                raise self._feature_error(
                     node.name,
                     f"expected {', '.join(entries)}, got {str(value)!r}"
                     f"{did_you_mean(str(value), entries)}",
@@ -314,7 +316,7 @@ class GenicamFeatures:
             return entries[str(value)]
         number = _number(str(value)) if isinstance(value, str) else value
         if node.kind in _WHOLE and number != int(number):
-            raise self._wrong(node.name, f"expected a whole number, got {value!r}")
+            raise self._feature_error(node.name, f"expected a whole number, got {value!r}")
         await self._within(node, number)
         return number
 
@@ -325,7 +327,7 @@ class GenicamFeatures:
         wrong_step = step > 1 and math.isfinite(least) and (number - least) % step
         if not least <= number <= most or wrong_step:
             steps = f" in steps of {step:g}" if step > 1 else ""
-            raise self._wrong(
+            raise self._feature_error(
                 node.name,
                 f"expected {least:g} to {most:g}{steps}, got {number:g}",
                 (f"{least:g} to {most:g}{steps}",),
@@ -541,7 +543,7 @@ class GenicamFeatures:
     async def _described(self, node: Element) -> Feature:
         kind = _KINDS.get(node.kind)
         if kind is None:
-            raise self._wrong(node.name, f"a {node.kind} cannot be read or set")
+            raise self._feature_error(node.name, f"a {node.kind} cannot be read or set")
         more = node.text_of("Description") or node.text_of("ToolTip")
         basis = Feature(
             node.name,

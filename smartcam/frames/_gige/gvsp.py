@@ -175,7 +175,7 @@ def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Lead
         raise MessageError(f"leader: expected 12 bytes or more, got {len(payload)}", data=payload)
     _, payload_type, ticks = _LEADER.unpack_from(payload)
     if payload_type not in PICTURES:
-        raise _no_picture(payload, payload_type)
+        raise _no_picture_error(payload, payload_type)
     if payload_type == PayloadType.CHUNK and implied is not None:
         return Leader(payload_type, ticks, *implied, 0, 0)
     if len(payload) < _LEADER.size + _IMAGE.size:
@@ -186,7 +186,7 @@ def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Lead
     return Leader(payload_type, ticks, pixel_format, width, height, padding_x, padding_y)
 
 
-def _no_picture(payload: bytes, payload_type: int) -> MessageError:
+def _no_picture_error(payload: bytes, payload_type: int) -> MessageError:
     try:
         name = PayloadType(payload_type).name
     except ValueError:

@@ -39,7 +39,7 @@ class RawPicture(NamedTuple):
     height: int
     stride: int
 
-    def wrong(self, expected: str, actual: str) -> FrameFormatError:
+    def format_error(self, expected: str, actual: str) -> FrameFormatError:
         """Return the error for bytes that do not fit the format."""
         return FrameFormatError(
             f"{self.format} {self.width}x{self.height}: expected {expected}, got {actual}"
@@ -76,20 +76,20 @@ class PixelLayout(ABC):
 
     def planes(self, picture: RawPicture) -> tuple[NDArray[np.uint8], ...]:
         """Return Y, U and V, if they were sent."""
-        raise picture.wrong("a format of Y, U and V", "one without")
+        raise picture.format_error("a format of Y, U and V", "one without")
 
     def check(self, picture: RawPicture) -> None:
         """Check that the bytes can be a picture of this layout."""
         _, data, width, height, stride = picture
         if width < 1 or height < 1:
-            raise picture.wrong("a width and a height of 1 or more", f"{width}x{height}")
+            raise picture.format_error("a width and a height of 1 or more", f"{width}x{height}")
         least = self.least_stride(width)
         if stride < least:
-            raise picture.wrong(f"{least} bytes or more from row to row", str(stride))
+            raise picture.format_error(f"{least} bytes or more from row to row", str(stride))
         size = self.size(width, height, stride)
         length = memoryview(data).nbytes
         if length < size:
-            raise picture.wrong(f"{size} bytes", str(length))
+            raise picture.format_error(f"{size} bytes", str(length))
 
 
 def _view(
@@ -164,13 +164,13 @@ class SampleLayout(PixelLayout):
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return the brightness: Y of BT.601 for colours, demosaiced for Bayer patterns."""
         if self.colours.grey is None:
-            raise picture.wrong("a format with brightness", "distances")
+            raise picture.format_error("a format with brightness", "distances")
         return self.colours.grey(self.array(picture))
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours; for a grey format, three equal channels."""
         if self.colours.rgb is None:
-            raise picture.wrong("a format with colours", "distances")
+            raise picture.format_error("a format with colours", "distances")
         return self.colours.rgb(self.array(picture))
 
 
@@ -338,11 +338,11 @@ class Compressed(PixelLayout):
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Raise, since brightness needs a codec."""
-        raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
+        raise picture.format_error(f"pixels, which {self.reader} makes", "compressed bytes")
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Raise, since colours need a codec."""
-        raise picture.wrong(f"pixels, which {self.reader} makes", "compressed bytes")
+        raise picture.format_error(f"pixels, which {self.reader} makes", "compressed bytes")
 
 
 @dataclass(frozen=True, slots=True)

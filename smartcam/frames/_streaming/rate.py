@@ -37,9 +37,9 @@ BUSY_SHARE: Final = 0.7
 """Share of the time with frames on the way, above which the link limits the frame rate."""
 
 SLOW_SOURCE_FACTOR: Final = 1.15
-"""Factor by which pauses between frames are longer if the source limits the frame rate."""
+"""The source limits the frame rate if the measured rate is below the allowed one by this factor."""
 
-FREE_SHARE: Final = 0.5
+MAX_BUSY_SHARE_WHEN_FREE: Final = 0.5
 """Share of the time with frames on the way, below which a lower frame rate does not reduce
 latency."""
 
@@ -58,9 +58,9 @@ class RateStatistics:
     Attributes:
         quality: JPEG quality for the next frames.
         fps: largest frame rate, frames per second.
-        why: reason for these values: "bit rate", "latency" or "the best quality"; "" before the
-            first frame. "at the lowest quality" is appended if the frame rate is lowered, too, and
-            "no frame may be smaller, nor fewer" if all limits are reached.
+        why: reason for these values: "bit rate", "latency" or "at the highest quality"; "" before
+            the first frame. "at the lowest quality" is appended if the frame rate is lowered, too,
+            and "at the lowest quality and frame rate" if both limits are reached.
         bitrate: recent bit rate, bits per second.
         latency: recent time from capture to arrival, seconds.
     """
@@ -108,7 +108,7 @@ class RateControl:
 
         control = RateControl(bitrate=4e6)
         ...  # send a frame of control.quality, control.pause seconds after the last one at least
-        control.sent(size, went, took)
+        control.sent(size, sent_at, transit_time)
 
     The control lowers the quality to its limit, and only then the frame rate; it raises the frame
     rate first. It follows a drop within a second, and rises by at most 30 % per second to avoid
@@ -138,13 +138,13 @@ class RateControl:
         self._rise = MAX_FIRST_RISE_PER_SECOND
         self._why: str = ""
         self._logged_fps = self._fps
-        self._went: float | None = None
+        self._last_sent_at: float | None = None
         # frame rate of the source, frames per second; 0: unknown
-        self._comes = 0.0
+        self._source_fps = 0.0
         self._flow = _Flow()
-        self._weight = _Mean()  # size of a frame with quantization steps of 1, bytes
-        self._transit = _Mean()  # seconds per byte on the way
-        self._age, self._took = _Mean(), _Mean()
+        self._unit_size = _Mean()  # size of a frame with quantization steps of 1, bytes
+        self._time_per_byte = _Mean()  # seconds per byte on the way
+        self._age, self._transit_time = _Mean(), _Mean()
 
     @property
     def quality(self) -> int:
@@ -169,36 +169,42 @@ class RateControl:
             self._fps,
             self._why,
             8 * flow.bytes / flow.seconds if flow.seconds else 0.0,
-            self._age.value + self._took.value,
+            self._age.value + self._transit_time.value,
         )
 
     def sent(
-        self, size: int, went: float, took: float, *, age: float = 0.0, quality: int | None = None
+        self,
+        size: int,
+        sent_at: float,
+        transit_time: float,
+        *,
+        age: float = 0.0,
+        quality: int | None = None,
     ) -> None:
         """Record a frame that has arrived, and adjust quality and frame rate.
 
         Args:
             size: bytes of the frame.
-            went: time at which the frame was sent, in seconds of any clock.
-            took: time until the frame arrived, seconds.
+            sent_at: time at which the frame was sent, in seconds of any clock.
+            transit_time: time until the frame arrived, seconds.
             age: time from the frame's capture until it was sent, seconds.
             quality: quality of the frame; None: the current quality.
         """
-        size, took = max(1, size), max(1e-6, took)
-        if self._went is None or went <= self._went:
+        size, transit_time = max(1, size), max(1e-6, transit_time)
+        if self._last_sent_at is None or sent_at <= self._last_sent_at:
             seconds = self.pause
         else:
-            seconds = went - self._went
+            seconds = sent_at - self._last_sent_at
             self._flow.add(size, seconds)
-            self._learn(took / seconds)
-        self._went = went
-        had = self.quality if quality is None else quality
-        # a frame that is long on its way is counted only once
-        of_late = max(seconds, took)
-        self._weight.add(size * _steps(had) ** SIZE_EXPONENT, of_late)
-        self._transit.add(took / size, of_late)
-        self._age.add(age, of_late)
-        self._took.add(took, of_late)
+            self._learn(transit_time / seconds)
+        self._last_sent_at = sent_at
+        frame_quality = self.quality if quality is None else quality
+        # a frame counts for the time since the last one, or for its transit if that is longer
+        duration = max(seconds, transit_time)
+        self._unit_size.add(size * _steps(frame_quality) ** SIZE_EXPONENT, duration)
+        self._time_per_byte.add(transit_time / size, duration)
+        self._age.add(age, duration)
+        self._transit_time.add(transit_time, duration)
         self._follow(seconds)
 
     def _learn(self, busy: float) -> None:
@@ -207,29 +213,29 @@ class RateControl:
         if busy < BUSY_SHARE and (
             self._fps >= self._rates[1] or rate * SLOW_SOURCE_FACTOR < self._fps
         ):
-            self._comes = rate
+            self._source_fps = rate
 
     def _follow(self, seconds: float) -> None:
         """Move towards the target values: down at once, up slowly."""
         least, best = self._qualities
-        wanted, wanted_fps, why = self._wanted()
-        quality = min(best, max(least, _quality(self._weight.value / wanted)))
+        wanted_size, wanted_fps, why = self._wanted()
+        quality = min(best, max(least, _quality(self._unit_size.value / wanted_size)))
         grows = self._rise ** min(seconds, STEADY_AVERAGING_TIME)
         if wanted_fps < self._fps * (1 - MIN_DEVIATION_SHARE):
             self._fps, self._rise = wanted_fps, MAX_RISE_PER_SECOND
         elif wanted_fps > self._fps:
             self._fps = min(wanted_fps, self._fps * grows)
-        has = self._bytes(self._quality)
-        if wanted < has * (1 - MIN_DEVIATION_SHARE) and quality < self._quality:
+        current_size = self._bytes(self._quality)
+        if wanted_size < current_size * (1 - MIN_DEVIATION_SHARE) and quality < self._quality:
             self._quality, self._rise = quality, MAX_RISE_PER_SECOND
-        elif wanted > has * (1 + MIN_DEVIATION_SHARE) and self._fps >= self._rates[1]:
-            slowly = _quality(self._weight.value / (has * grows))
+        elif wanted_size > current_size * (1 + MIN_DEVIATION_SHARE) and self._fps >= self._rates[1]:
+            slowly = _quality(self._unit_size.value / (current_size * grows))
             self._quality = max(self._quality, min(quality, slowly))
         if why in {"bit rate", "latency"}:
             if self._fps < self._rates[1]:  # while the frame rate recovers
                 why = f"{why}, at the lowest quality"
             elif self._quality >= best:
-                why = "the best quality"
+                why = "at the highest quality"
         self._why = why
         self._log_change()
 
@@ -239,28 +245,36 @@ class RateControl:
         smallest = self._bytes(self._qualities[0])
         limits: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
-            comes = min(most, max(fewest, self._comes or most))
-            limits.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
-        if self._latency is not None:
-            size = max(1.0, (self._latency - self._age.value) / self._transit.value)
+            source_fps = min(most, max(fewest, self._source_fps or most))
             limits.append(
-                (size, max(most * size / smallest, FREE_SHARE / self._took.value), "latency")
+                (self._bitrate / 8 / source_fps, self._bitrate / 8 / smallest, "bit rate")
+            )
+        if self._latency is not None:
+            size = max(1.0, (self._latency - self._age.value) / self._time_per_byte.value)
+            limits.append(
+                (
+                    size,
+                    max(
+                        most * size / smallest, MAX_BUSY_SHARE_WHEN_FREE / self._transit_time.value
+                    ),
+                    "latency",
+                )
             )
         size, _, name = min(limits)
         if size >= smallest:
             return size, most, name
         fps = min(fps for limit, fps, _ in limits if limit < smallest)
         if fps < fewest:
-            return size, fewest, f"{name}: no frame may be smaller, nor fewer"
+            return size, fewest, f"{name}, at the lowest quality and frame rate"
         return size, min(most, fps), f"{name}, at the lowest quality"
 
     def _bytes(self, quality: float) -> float:
-        return self._weight.value / float(_steps(quality) ** SIZE_EXPONENT)
+        return self._unit_size.value / float(_steps(quality) ** SIZE_EXPONENT)
 
     def _log_change(self) -> None:
-        back = self._fps == self._rates[1] != self._logged_fps
+        recovered = self._fps == self._rates[1] != self._logged_fps
         change = self._fps / self._logged_fps
-        if back or not 1 / LOGGED_CHANGE_FACTOR < change < LOGGED_CHANGE_FACTOR:
+        if recovered or not 1 / LOGGED_CHANGE_FACTOR < change < LOGGED_CHANGE_FACTOR:
             self._logged_fps = self._fps
             logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
 
@@ -270,9 +284,9 @@ def _steps(quality: float) -> float:
     return 50 / quality if quality < 50 else max(0.02, (100 - quality) / 50)
 
 
-def _quality(weight: float) -> float:
-    """Return the quality whose steps, to the power ``SIZE_EXPONENT``, are ``weight``."""
-    steps = float(max(1e-3, weight) ** (1 / SIZE_EXPONENT))
+def _quality(size_ratio: float) -> float:
+    """Return the quality whose frames are smaller than those with steps of 1 by this ratio."""
+    steps = float(max(1e-3, size_ratio) ** (1 / SIZE_EXPONENT))
     return 50 / steps if steps > 1 else 100 - 50 * steps
 
 

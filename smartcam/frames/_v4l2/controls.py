@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFeatureError
 from smartcam.frames._v4l2 import abi
-from smartcam.frames._v4l2.device import failure
+from smartcam.frames._v4l2.device import device_error
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -127,21 +127,21 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
     """
     answer = _described(device).get(simple(name))
     if answer is None:
-        raise _unknown(device, name)
+        raise _unknown_control_error(device, name)
     control = _control(device, answer)
     number = control.number_of(value)
     if number is None or control.flags & abi.CTRL_READ_ONLY:
         expected = control.range if number is None else "nothing, since it is read-only"
-        raise _refusal(device, control, f"expected {expected}, got {value!r}")
+        raise _refused_error(device, control, f"expected {expected}, got {value!r}")
     try:
         device.try_to(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
     except OSError as exc:
-        raise failure(device.path, f"setting {control.name} to {value!r}", exc) from exc
+        raise device_error(device.path, f"setting {control.name} to {value!r}", exc) from exc
     actual = _value(device, control.number, control.flags)
     if actual is None or control.kind == "button":
         return number
     if actual != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
-        raise _refusal(device, control, f"set to {number}, the device has it at {actual}")
+        raise _refused_error(device, control, f"set to {number}, the device has it at {actual}")
     return actual
 
 
@@ -155,7 +155,7 @@ def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
         except OSError as exc:
             if exc.errno in (errno.EINVAL, errno.ENOTTY):  # end of the list
                 return described
-            raise failure(device.path, "listing its controls", exc) from exc
+            raise device_error(device.path, "listing its controls", exc) from exc
         if answer[0] <= number:  # the driver repeats controls
             return described
         number = answer[0]
@@ -163,7 +163,7 @@ def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
             described.setdefault(simple(abi.text(answer[2])), answer)
 
 
-def _unknown(device: CaptureDevice, name: str) -> FrameFeatureError:
+def _unknown_control_error(device: CaptureDevice, name: str) -> FrameFeatureError:
     controls = list_controls(device)
     return FrameFeatureError(
         f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
@@ -173,7 +173,7 @@ def _unknown(device: CaptureDevice, name: str) -> FrameFeatureError:
     )
 
 
-def _refusal(device: CaptureDevice, control: DeviceControl, text: str) -> FrameFeatureError:
+def _refused_error(device: CaptureDevice, control: DeviceControl, text: str) -> FrameFeatureError:
     return FrameFeatureError(
         f"{device.path}: control {control.name}: {text}",
         source=device.path,
@@ -208,7 +208,7 @@ def _menu(device: CaptureDevice, number: int, kind: int, places: range) -> dict[
         except OSError as exc:
             if exc.errno == errno.EINVAL:  # a menu may have gaps
                 continue
-            raise failure(device.path, "listing a menu", exc) from exc
+            raise device_error(device.path, "listing a menu", exc) from exc
         value = int.from_bytes(raw[:8], sys.byteorder, signed=True)
         items[place] = abi.text(raw) if kind == abi.CTRL_MENU else str(value)
     return items
@@ -221,6 +221,6 @@ def _value(device: CaptureDevice, number: int, flags: int) -> int | None:
         value: int = device.try_to(abi.G_CTRL, number)[1]
     except OSError as exc:
         if exc.errno == errno.ENODEV:
-            raise failure(device.path, "reading a control", exc) from exc
+            raise device_error(device.path, "reading a control", exc) from exc
         return None
     return value

@@ -48,7 +48,7 @@ REASONS: Final = {
 }
 
 
-def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
+def device_error(path: str, tried: str, error: OSError) -> FrameSourceError:
     """Return the error for a failed system call; its text lists the existing devices."""
     number = error.errno or 0
     devices = tuple(f"{path} ({name})" for path, name in system.nodes().items())
@@ -101,7 +101,7 @@ class CaptureDevice:
         try:
             number = system.open(path)
         except OSError as exc:
-            raise failure(path, "opening it", exc) from exc
+            raise device_error(path, "opening it", exc) from exc
         try:
             device = cls(path, number)
             device._check()
@@ -128,7 +128,7 @@ class CaptureDevice:
         try:
             return self.try_to(request, *fields)
         except OSError as exc:
-            raise failure(self.path, tried or request.name, exc) from exc
+            raise device_error(self.path, tried or request.name, exc) from exc
 
     def try_to(self, request: Ioctl, *fields: object) -> tuple[Any, ...]:
         """Return the driver's answer, or raise its OSError."""
@@ -147,7 +147,7 @@ class CaptureDevice:
             except OSError as exc:
                 if exc.errno in (errno.EINVAL, errno.ENOTTY):
                     return
-                raise failure(self.path, request.name, exc) from exc
+                raise device_error(self.path, request.name, exc) from exc
 
     # capabilities
 
@@ -271,10 +271,10 @@ class CaptureDevice:
         else:
             known = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
         if not known:
-            raise self._no_format("a supported format" if wanted is None else wanted.name)
+            raise self._no_format_error("a supported format" if wanted is None else wanted.name)
         return known[0]
 
-    def _no_format(self, expected: str) -> FrameFormatError:
+    def _no_format_error(self, expected: str) -> FrameFormatError:
         offered = tuple(_named(code) for code in self.formats())
         return FrameFormatError(
             f"{self.path}: expected {expected}, it has {', '.join(offered) or 'none'}",
@@ -285,7 +285,7 @@ class CaptureDevice:
     def _compare(self, code: int, size: tuple[int, int] | None, actual: BufferLayout) -> None:
         """Check that the device applied the setting."""
         if actual.fourcc != code:
-            raise self._no_format(_named(code))
+            raise self._no_format_error(_named(code))
         if size is not None and size != (actual.width, actual.height):
             offered = tuple(self.size_texts(code))
             raise FrameFormatError(
@@ -313,7 +313,7 @@ class CaptureDevice:
                 )
         except OSError as exc:
             if exc.errno not in (errno.ENOTTY, errno.EINVAL):
-                raise failure(self.path, "setting its rate", exc) from exc
+                raise device_error(self.path, "setting its rate", exc) from exc
             can = over = under = 0
         actual = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
         if wanted is not None and (

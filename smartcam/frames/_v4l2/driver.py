@@ -199,7 +199,7 @@ class V4L2Driver(FrameDriver):
         device = CaptureDevice.open(self._path)
         try:
             if device.identity != self._identity:
-                raise self._another(device)
+                raise self._other_device_error(device)
             setting = self._set(device)
             self._stream = CaptureStream(device, setting, self._buffers, self.name)
         except BaseException:
@@ -223,7 +223,7 @@ class V4L2Driver(FrameDriver):
         with closing(CaptureDevice.open(self._path)) as device:
             return job(device)
 
-    def _another(self, device: CaptureDevice) -> FrameSourceError:
+    def _other_device_error(self, device: CaptureDevice) -> FrameSourceError:
         expected, actual = (
             "nothing" if identity is None else " at ".join(identity)
             for identity in (self._identity, device.identity)

@@ -180,17 +180,19 @@ class V4L2Features(DeviceFeatures):
         feature = await self._feature_named(name)
         value = feature.value(feature.control.value)
         if value is None:
-            raise self._wrong(feature, "it has no value that can be read")
+            raise self._feature_error(feature, "it has no value that can be read")
         return value
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a feature; return the device's new value."""
         feature = await self._feature_named(name)
         if feature.control.kind == "button":
-            raise self._wrong(feature, "it is a command: it is executed")
+            raise self._feature_error(feature, "it is a command: it is executed")
         number = feature.number(value)
         if number is None:
-            raise self._wrong(feature, f"expected {feature.described().range}, got {value!r}")
+            raise self._feature_error(
+                feature, f"expected {feature.described().range}, got {value!r}"
+            )
         has = await self._driver.set_control(feature.control.name, number)
         actual = feature.value(has)
         return value if actual is None else actual
@@ -199,7 +201,7 @@ class V4L2Features(DeviceFeatures):
         """Execute a command."""
         feature = await self._feature_named(name)
         if feature.control.kind != "button":
-            raise self._wrong(feature, "it is no command: it is set")
+            raise self._feature_error(feature, "it is no command: it is set")
         await self._driver.set_control(feature.control.name, 1)
 
     async def _feature_named(self, name: str) -> ControlFeature:
@@ -216,7 +218,7 @@ class V4L2Features(DeviceFeatures):
             available=tuple(names),
         )
 
-    def _wrong(self, feature: ControlFeature, text: str) -> FrameFeatureError:
+    def _feature_error(self, feature: ControlFeature, text: str) -> FrameFeatureError:
         return FrameFeatureError(
             f"{self._driver.name}: feature {feature.name}: {text}",
             source=self._driver.name,

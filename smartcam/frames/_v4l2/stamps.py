@@ -46,10 +46,10 @@ class BufferStamps:
         self._began = self._empty = began
         # stamp and number of the frame before; at first, from before the stream
         self._last: tuple[float, int | None] = (began - 2 * (period or DEFAULT_DURATION), None)
-        self.is_newest = False  # whether no later frame can be waiting
+        self.is_newest = False  # whether the last frame is so young that no later one can wait
         self._doubted = False
 
-    def queue_is_empty(self, now: float) -> None:
+    def note_queue_empty(self, now: float) -> None:
         """Note that no filled buffer waits."""
         self._empty = now
 

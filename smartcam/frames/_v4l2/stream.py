@@ -9,7 +9,7 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames._frame import Frame
 from smartcam.frames._v4l2 import abi, system
 from smartcam.frames._v4l2.buffers import Buffers
-from smartcam.frames._v4l2.device import failure
+from smartcam.frames._v4l2.device import device_error
 from smartcam.frames._v4l2.stamps import BufferStamps
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class CaptureStream:
         period = None if setting.rate is None else 1 / setting.rate
         self._format, self._width, self._height = setting.format, layout.width, layout.height
         self._stride = 0 if setting.format.compressed else layout.stride
-        self._least = (
+        self._min_bytes = (
             1
             if setting.format.compressed
             else setting.format.size(layout.width, layout.height, layout.stride)
@@ -55,7 +55,7 @@ class CaptureStream:
         self._stamps = BufferStamps(name, period, system.now())
         self._buffers = Buffers(device, buffers)
         self._sequence: int | None = None  # driver's number of the last frame
-        self._number = 0
+        self._unwrapped_sequence = 0
         self._bad = self._empty = 0
 
     def close(self) -> None:
@@ -73,11 +73,11 @@ class CaptureStream:
             try:
                 full = self._buffers.take()
             except BlockingIOError:
-                self._stamps.queue_is_empty(system.now())
+                self._stamps.note_queue_empty(system.now())
                 self._none_was_there()
                 return
             except OSError as exc:
-                raise failure(self._name, "taking a picture", exc) from exc
+                raise device_error(self._name, "taking a picture", exc) from exc
             self._empty = 0
             frame = self._frame(full, sink)
             if frame is not None:
@@ -88,15 +88,15 @@ class CaptureStream:
     def _frame(self, full: FilledBuffer, sink: FrameSink) -> Frame | None:
         """Return the frame in a buffer; count a buffer without a whole picture as lost."""
         steps = self._steps(full.sequence)
-        if len(full.data) < self._least:
+        if len(full.data) < self._min_bytes:
             sink.lost(steps)
             self._bad += 1
             if self._bad >= MAX_BAD_IN_A_ROW:
-                raise self._no_pictures(full)
+                raise self._no_pictures_error(full)
             return None
         self._bad = 0
         now, utc = system.now(), time.time()
-        stamp = self._stamps.read(full.seconds, full.flags, self._number, now)
+        stamp = self._stamps.read(full.seconds, full.flags, self._unwrapped_sequence, now)
         return Frame(
             data=full.data,
             format=self._format,
@@ -108,7 +108,7 @@ class CaptureStream:
             moment=stamp.moment,
             duration=stamp.duration,
             device_time=stamp.device_time,
-            sequence=self._number,
+            sequence=self._unwrapped_sequence,
             lost=steps - 1,
             source=self._name,
         )
@@ -125,17 +125,17 @@ class CaptureStream:
         """Return the step of the frame number; 1 for a driver that does not count."""
         last, self._sequence = self._sequence, sequence
         if last is None:
-            self._number = sequence
+            self._unwrapped_sequence = sequence
             return 1
         steps = (sequence - last) % (2 * HALF_OF_NUMBERS)
         steps = steps if 0 < steps < HALF_OF_NUMBERS else 1
-        self._number += steps
+        self._unwrapped_sequence += steps
         return steps
 
-    def _no_pictures(self, full: FilledBuffer) -> FrameFormatError:
+    def _no_pictures_error(self, full: FilledBuffer) -> FrameFormatError:
         content = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
         return FrameFormatError(
             f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
-            f"{self._least} bytes or more, got {content} {self._bad} times in a row",
+            f"{self._min_bytes} bytes or more, got {content} {self._bad} times in a row",
             source=self._name,
         )

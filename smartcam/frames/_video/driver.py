@@ -71,22 +71,23 @@ class VideoDriver(FrameDriver):
     ``belt.mp4#pace=none``, ``shots/*.png#fps=5``.
 
     ================= =============================================================================
-    ``transport``     of RTSP: ``tcp`` (usual), without losses, or ``udp``, where a loss may spoil
+    ``transport``     of RTSP: ``tcp`` (default), without losses, or ``udp``, where a loss may spoil
                       pictures until the next key frame
-    ``timeout``       seconds to connect, and without data until the source counts as dead; usual 5
+    ``timeout``       seconds to connect, and without data until the source counts as dead; default
+                      5
     ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
-                      passes such bytes on unchanged; usual: the decoder's format
-    ``delay``         of a live stream: longest time from exposure to arrival, seconds; usual 1
-    ``pace``          of a recording: ``real`` (usual) by its time stamps, or ``none``: each picture
-                      as soon as the readers have taken the last one, without skips
-    ``fps``           of a recording: pictures per second instead of its time stamps; usual 10 of
+                      passes such bytes on unchanged; default: the decoder's format
+    ``delay``         of a live stream: longest time from exposure to arrival, seconds; default 1
+    ``pace``          of a recording: ``real`` (default) by its time stamps, or ``none``: each
+                      picture as soon as the readers have taken the last one, without skips
+    ``fps``           of a recording: pictures per second instead of its time stamps; default 10 of
                       files in a folder
     ``mixed``         of files: ``yes`` also accepts pictures with other sizes and formats than the
-                      first one's, and counts damaged ones as lost; usual ``no``
+                      first one's, and counts damaged ones as lost; default ``no``
     ``verify``        of TLS: ``no`` trusts any certificate
-    ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
+    ``ca``            of TLS: file with the certificates that are trusted; default: the system's
     ``elsewhere``     of a server: ``yes`` follows a redirect to another host or port, and a
-                      playlist (HLS, DASH); usual ``no``
+                      playlist (HLS, DASH); default ``no``
     ``name``          of the camera
     ================= =============================================================================
 
@@ -225,7 +226,7 @@ class VideoDriver(FrameDriver):
         if self._stream is not None and comes != self._stream[:3] and not self._mixed:
             raise FrameFormatError(
                 f"{self.name}: expected {StreamFormat(*self._stream[:3])}, as it was opened, got "
-                f"{StreamFormat(*comes)}: open it anew",
+                f"{StreamFormat(*comes)}: open it again",
                 source=self.name,
                 available=(str(StreamFormat(*comes)),),
             )

@@ -97,7 +97,7 @@ class VideoPlan:
     tls: ssl.SSLContext | None = None
     skips_damaged: bool = False
 
-    def wrong(self, text: str) -> FrameFormatError:
+    def format_error(self, text: str) -> FrameFormatError:
         """Return an error of the video's content."""
         return FrameFormatError(f"{self.name}: {text}", source=self.name)
 
@@ -225,7 +225,7 @@ class VideoReading(PictureReading):
             cause = error.__cause__
             if isinstance(cause, OSError) and cause.errno == errno.EINVAL:
                 cure = "; #elsewhere=yes follows a playlist" if self.plan.network else ""
-                raise self.plan.wrong(
+                raise self.plan.format_error(
                     "expected a format with the pictures in it, got one that is not supported, or "
                     f"a playlist{cure}"
                 ) from cause
@@ -243,16 +243,16 @@ class VideoReading(PictureReading):
         if isinstance(failure, EOFError) and self._given_any:
             return None
         # raised outside of the handler, since FFmpeg's error text has the URL with the password
-        raise self._error(failure, time.monotonic() - begun) from _plain(failure)
+        raise self._error(failure, time.monotonic() - begun) from _plain_error(failure)
 
     def _first_stream(self) -> Any:
         streams = self._container.streams.video
         if not streams:
-            raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
+            raise self.plan.format_error(f"expected video, got {self._container.format.long_name}")
         stream = streams[0]
         if stream.codec_context is None:
             actual = self._container.format.long_name
-            raise self.plan.wrong(f"expected video that FFmpeg decodes here, got {actual}")
+            raise self.plan.format_error(f"expected video that FFmpeg decodes here, got {actual}")
         stream.codec_context.thread_count = 1  # more threads delay frames
         if stream.codec_context.name not in _EXPLODES_AT_TAGS:
             stream.codec_context.options = {"err_detect": "explode"}  # refuse incomplete pictures
@@ -260,7 +260,7 @@ class VideoReading(PictureReading):
         if wanted is not None and wanted.compressed:
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
             if comes != wanted.name:
-                raise self.plan.wrong(f"expected {wanted.name}, got {comes}")
+                raise self.plan.format_error(f"expected {wanted.name}, got {comes}")
             if comes == "H264":  # files have lengths in place of start codes
                 bitstream = load("av.bitstream").BitStreamFilterContext
                 self._start_codes = bitstream("h264_mp4toannexb", stream)
@@ -281,7 +281,7 @@ class VideoReading(PictureReading):
         begun = time.monotonic()
         while not self._pictures and not self.stopped.is_set():
             if self.plan.network and time.monotonic() - begun > self.plan.timeout:
-                raise self.plan.wrong(
+                raise self.plan.format_error(
                     "expected a picture, got bytes that make no picture for "
                     f"{self.plan.timeout:g} s"
                 )
@@ -315,7 +315,7 @@ class VideoReading(PictureReading):
             )
         if not self._given_any:
             why = f": {self._failed}" if self._failed else ""
-            raise self.plan.wrong(f"expected pictures, the video ended without one{why}")
+            raise self.plan.format_error(f"expected pictures, the video ended without one{why}")
 
     def _take(self, packet: Any, arrived: float) -> None:
         """Decode a packet, or pass it on."""
@@ -349,7 +349,7 @@ class VideoReading(PictureReading):
                 picture = converted(picture, CONVERTIBLE[wanted.name])
             return from_video(picture)
         except FrameFormatError as exc:
-            raise self.plan.wrong(f"{exc}; #format=RGB8 converts") from exc
+            raise self.plan.format_error(f"{exc}; #format=RGB8 converts") from exc
 
     def close(self) -> None:
         """Close the video."""
@@ -370,7 +370,7 @@ def _reason(failure: Exception) -> str:
     return getattr(failure, "strerror", None) or type(failure).__name__
 
 
-def _plain(failure: Exception) -> OSError:
+def _plain_error(failure: Exception) -> OSError:
     """Return an error's cause without the URL, which may have a password."""
     return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
 

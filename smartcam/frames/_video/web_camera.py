@@ -72,7 +72,7 @@ class WebDriver(VideoDriver):
             await super().start(sink)
         elif not await self._begin_parts(sink):
             raise FrameFormatError(
-                f"{self.name}: expected parts as at the opening, got another answer: open it anew",
+                f"{self.name}: expected parts as at the opening, got another answer: open it again",
                 source=self.name,
             )
 
@@ -99,9 +99,11 @@ class WebDriver(VideoDriver):
         except FrameSourceError:
             raise
         except TimeoutError:
-            raise self._wrong(f"expected an answer, got none within {self._timeout:g} s") from None
+            raise self._source_error(
+                f"expected an answer, got none within {self._timeout:g} s"
+            ) from None
         except (OSError, ValueError) as exc:
-            raise self._wrong(f"cannot be read: {why(exc)}") from None
+            raise self._source_error(f"cannot be read: {why(exc)}") from None
         finally:
             if self._playing is None:
                 stream.close()
@@ -111,12 +113,12 @@ class WebDriver(VideoDriver):
         answer = stream.answer
         if answer.status not in STREAM_STATUSES:
             shown = f"{answer.status} {answer.reason}".strip()
-            raise self._wrong(f"cannot be read: {shown}")
+            raise self._source_error(f"cannot be read: {shown}")
         coding = answer.header("content-encoding").lower()
         if answer.is_pictures and coding not in ("", "identity"):
-            raise self._wrong(f"expected no encoding, got Content-Encoding: {coding[:40]}")
+            raise self._source_error(f"expected no encoding, got Content-Encoding: {coding[:40]}")
         if answer.is_pictures and self._format is not None and self._format.name == "H264":
-            raise self._wrong("expected H264, got MJPEG")
+            raise self._source_error("expected H264, got MJPEG")
 
     def _plan(self) -> DecodingPlan:
         wanted = "" if self._format is None else self._format.name
@@ -125,7 +127,7 @@ class WebDriver(VideoDriver):
         coding = JPEG._replace(size_in=_size_in)
         return DecodingPlan(self.name, coding, self._delay, self._size, b"", to, passed_on)
 
-    def _wrong(self, text: str) -> FrameSourceError:
+    def _source_error(self, text: str) -> FrameSourceError:
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 
 

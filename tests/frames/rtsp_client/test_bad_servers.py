@@ -403,7 +403,7 @@ async def test_server_of_another_size_is_reported(encoded: list[bytes]) -> None:
 
     while_playing(change)(camera)
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
-        with pytest.raises(FrameFormatError, match="got 256x64: open it anew"):
+        with pytest.raises(FrameFormatError, match="got 256x64: open it again"):
             await read_all(f"rtsp://{where}")
 
 

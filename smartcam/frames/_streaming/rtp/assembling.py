@@ -77,9 +77,9 @@ class OpenUnit(ABC):
 
 
 class UnitKind(Protocol):
-    """The kind of access units in a stream's payloads."""
+    """How the access units in a stream's payloads begin and are assembled."""
 
-    def open(self, timestamp: int, unbroken: bool, arrived: float, /) -> OpenUnit:
+    def new_unit(self, timestamp: int, unbroken: bool, arrived: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
@@ -91,11 +91,11 @@ class UnitKind(Protocol):
 class NalUnit(OpenUnit):
     """An access unit of NAL units, several in a packet or one in fragments."""
 
-    HEAD: ClassVar[int]
+    HEADER_SIZE: ClassVar[int]
     """Number of bytes of a unit's header."""
-    SEVERAL: ClassVar[int]
+    AGGREGATION: ClassVar[int]
     """Kind of a packet with several units."""
-    PART: ClassVar[int]
+    FRAGMENT: ClassVar[int]
     """Kind of a packet with a fragment of a unit."""
 
     def __init__(self, timestamp: int, unbroken: bool, arrived: float) -> None:
@@ -122,8 +122,8 @@ class NalUnit(OpenUnit):
         """Yield the units before a frame's picture, without start codes, and its header."""
         place = access_unit.find(b"\0\0\1")
         while place >= 0:
-            head = access_unit[place + 3 : place + 3 + cls.HEAD]
-            kind = cls.kind_of(head[0]) if len(head) == cls.HEAD else -1
+            head = access_unit[place + 3 : place + 3 + cls.HEADER_SIZE]
+            kind = cls.kind_of(head[0]) if len(head) == cls.HEADER_SIZE else -1
             if cls.is_picture(kind):  # the search for its end would be long and is not needed
                 yield head
                 return
@@ -139,44 +139,44 @@ class NalUnit(OpenUnit):
 
     def _added(self, payload: bytes) -> bool:
         kind = self.kind_of(payload[0])
-        if kind == self.PART:
+        if kind == self.FRAGMENT:
             return self._part(payload)
         if self._part_of >= 0:
             return False
-        if kind == self.SEVERAL:
+        if kind == self.AGGREGATION:
             return self._several(payload)
         return self._unit(payload)
 
     def _unit(self, unit: bytes) -> bool:
-        kind = self.kind_of(unit[0]) if len(unit) >= self.HEAD else -1
-        if not 0 <= kind < self.SEVERAL:
+        kind = self.kind_of(unit[0]) if len(unit) >= self.HEADER_SIZE else -1
+        if not 0 <= kind < self.AGGREGATION:
             return False
         self.has_picture |= self.is_picture(kind)
         self.parts += (START_CODE, unit)
         return True
 
     def _several(self, payload: bytes) -> bool:
-        place = self.HEAD
+        place = self.HEADER_SIZE
         while place < len(payload):
             end = place + 2 + int.from_bytes(payload[place : place + 2], "big")
             if end > len(payload) or not self._unit(payload[place + 2 : end]):
                 return False
             place = end
-        return len(payload) > self.HEAD
+        return len(payload) > self.HEADER_SIZE
 
     def _part(self, payload: bytes) -> bool:
-        if len(payload) < self.HEAD + 2:
+        if len(payload) < self.HEADER_SIZE + 2:
             return False
         head = self.whole_head(payload)
-        second, kind = payload[self.HEAD], self.kind_of(head[0])
+        second, kind = payload[self.HEADER_SIZE], self.kind_of(head[0])
         start = bool(second & START)
         if start != (self._part_of < 0) or (start and second & END):
             return False
-        if not 0 <= kind < self.SEVERAL or (not start and kind != self._part_of):
+        if not 0 <= kind < self.AGGREGATION or (not start and kind != self._part_of):
             return False
         if start:
             self.has_picture |= self.is_picture(kind)
             self.parts += (START_CODE, head)
-        self.parts.append(payload[self.HEAD + 1 :])
+        self.parts.append(payload[self.HEADER_SIZE + 1 :])
         self._part_of = -1 if second & END else kind
         return True

@@ -235,7 +235,7 @@ class UnitDecoding:
         if self._plan.size not in (None, size):
             raise FrameFormatError(
                 f"{self._name}: expected {_shown(self._plan.size)}, the size at the opening, "
-                f"got {_shown(size)}: open it anew",
+                f"got {_shown(size)}: open it again",
                 available=(_shown(size),),
             )
         passed = self._loop.time() - unit.arrived

@@ -194,7 +194,7 @@ class Depacketizer:
         if again and self._unbroken and packet.payload:
             self._marks_lie, self.proofs = True, 0
         unbroken = (self._unbroken or self._kind.begins(packet.payload)) and not again
-        opened = self._kind.open(packet.timestamp, unbroken, now)
+        opened = self._kind.new_unit(packet.timestamp, unbroken, now)
         before, self._parameters = self._parameters, None
         if before is not None and self._unbroken:
             opened.parts, opened.size, opened.arrived = before.parts, before.size, before.arrived

@@ -20,7 +20,8 @@ MAX_KEPT_PACKETS: Final = 1024
 """Largest number of packets that are kept for requests to send them again."""
 
 MAX_RESEND_AGE: Final = 0.2
-"""Largest age, seconds, of a packet that is sent again: its picture would be late."""
+"""Largest age, seconds, of a packet that is sent again: an older one would come too late for its
+picture."""
 
 MAX_RESENDS: Final = 5
 """Largest number of repetitions of one packet."""
@@ -62,10 +63,10 @@ class Audience:
     """
 
     def __init__(self, ssrc: int) -> None:
-        self._nothing = ReportBlock(ssrc, 0, 0, 0, 0)
+        self._ssrc, self._no_report = ssrc, ReportBlock(ssrc, 0, 0, 0, 0)
         self._receivers: dict[int, _ReportingReceiver] = {}
 
-    def report(self, report: ReceiverReport, address: str) -> bool:
+    def record(self, report: ReceiverReport, address: str) -> bool:
         """Record a report; return True if it is the first of its receiver."""
         now = time.monotonic()
         self._forget(now)
@@ -73,15 +74,15 @@ class Audience:
         if new and len(self._receivers) >= MAX_RECEIVERS:
             return False
         known = self._receivers.get(
-            report.ssrc, _ReportingReceiver(address, self._nothing, None, now)
+            report.ssrc, _ReportingReceiver(address, self._no_report, None, now)
         )
-        block = next((block for block in report.blocks if block.ssrc == self._nothing.ssrc), None)
-        if block is not None:  # urgent requests have no report block
+        block = next((block for block in report.blocks if block.ssrc == self._ssrc), None)
+        if block is not None:  # feedback packets have no report block
             known = _ReportingReceiver(address, block, _round_trip(block), now)
         self._receivers[report.ssrc] = known._replace(at=now)
         return new
 
-    def left(self, ssrc: int) -> None:
+    def remove(self, ssrc: int) -> None:
         """Forget a receiver that said goodbye."""
         self._receivers.pop(ssrc, None)
 
@@ -118,10 +119,10 @@ def _round_trip(block: ReportBlock) -> float | None:
 
 
 class _SentPacket:
-    __slots__ = ("at", "data", "times")
+    __slots__ = ("at", "data", "resends")
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.times, self.at = data, 0, time.monotonic()
+        self.data, self.resends, self.at = data, 0, time.monotonic()
 
 
 class PacketHistory:
@@ -130,20 +131,20 @@ class PacketHistory:
     def __init__(self) -> None:
         self._sent: collections.OrderedDict[int, _SentPacket] = collections.OrderedDict()
 
-    def sent(self, sequence: int, data: bytes) -> None:
+    def store(self, sequence: int, data: bytes) -> None:
         """Store a packet."""
         self._sent[sequence] = _SentPacket(data)
         if len(self._sent) > MAX_KEPT_PACKETS:
             self._sent.popitem(last=False)
 
-    def again(self, sequence: int) -> bytes | None:
+    def packet_to_resend(self, sequence: int) -> bytes | None:
         """Return a packet to send again; None if it is too old or was sent too often."""
         packet = self._sent.get(sequence)
         if (
             packet is None
-            or packet.times >= MAX_RESENDS
+            or packet.resends >= MAX_RESENDS
             or time.monotonic() - packet.at > MAX_RESEND_AGE
         ):
             return None
-        packet.times += 1
+        packet.resends += 1
         return packet.data

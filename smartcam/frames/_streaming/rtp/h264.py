@@ -35,13 +35,13 @@ def units(access_unit: bytes) -> list[bytes]:
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")
     if place < 0 or data[:place].strip(b"\0"):
-        raise _wrong("a start code first", data)
+        raise _format_error("a start code first", data)
     nal_units = []
     while place >= 0:
         after = data.find(b"\0\0\1", place + 3)
         unit = data[place + 3 : after if after >= 0 else len(data)].rstrip(b"\0")
         if not unit or unit[0] & 0x80 or not 1 <= unit[0] & 0x1F < STAP_A:
-            raise _wrong("units of kinds 1 to 23", unit)
+            raise _format_error("units of kinds 1 to 23", unit)
         nal_units.append(unit)
         place = after
     return nal_units
@@ -160,7 +160,9 @@ class H264Packetizer:
 class H264Unit(NalUnit):
     """An access unit of H.264."""
 
-    HEAD, SEVERAL, PART = 1, 24, 28
+    HEADER_SIZE = 1
+    AGGREGATION = 24
+    FRAGMENT = 28
 
     @staticmethod
     def kind_of(head: int) -> int:
@@ -181,7 +183,7 @@ class H264Unit(NalUnit):
 class H264Units:
     """The kind of access units of H.264."""
 
-    open = H264Unit
+    new_unit = H264Unit
 
     @staticmethod
     def begins(payload: bytes) -> bool:
@@ -198,7 +200,7 @@ class H264Units:
         return kind in (SPS, DELIMITER)
 
 
-def _wrong(expected: str, actual: bytes) -> FrameFormatError:
+def _format_error(expected: str, actual: bytes) -> FrameFormatError:
     return FrameFormatError(
         f"H264: expected {expected} (annex B), got {len(actual)} bytes that begin with "
         f"{actual[:8].hex(' ') or 'nothing'}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from smartcam.frames._streaming.rtp.assembling import NalUnit
-from smartcam.frames._streaming.rtp.parameters import FieldBits, checked_size
+from smartcam.frames._streaming.rtp.parameters import SUBSAMPLING, FieldBits, checked_size
 
 VPS, SPS, PPS, DELIMITER = 32, 33, 34, 35
 """Types of NAL units (ITU-T H.265, table 7-1)."""
@@ -13,13 +13,13 @@ VPS, SPS, PPS, DELIMITER = 32, 33, 34, 35
 KEYS: Final = range(16, 24)
 """Types of slices of key frames."""
 
-_SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
-
 
 class H265Unit(NalUnit):
     """An access unit of H.265."""
 
-    HEAD, SEVERAL, PART = 2, 48, 49
+    HEADER_SIZE = 2
+    AGGREGATION = 48
+    FRAGMENT = 49
 
     @staticmethod
     def kind_of(head: int) -> int:
@@ -38,18 +38,18 @@ class H265Unit(NalUnit):
 
 
 class H265Units:
-    """The kind of access units of H.265."""
+    """How access units of H.265 begin and are assembled."""
 
-    open = H265Unit
+    new_unit = H265Unit
 
     @staticmethod
     def begins(payload: bytes) -> bool:
         """Return True if a packet has a unit that can only begin a frame."""
         kind = H265Unit.kind_of(payload[0]) if payload else -1
-        if kind == H265Unit.SEVERAL and len(payload) > 4:
+        if kind == H265Unit.AGGREGATION and len(payload) > 4:
             payload = payload[4:]
             kind = H265Unit.kind_of(payload[0])
-        elif kind == H265Unit.PART and len(payload) > 3 and payload[2] & 0x80:
+        elif kind == H265Unit.FRAGMENT and len(payload) > 3 and payload[2] & 0x80:
             payload = H265Unit.whole_head(payload) + payload[3:]
             kind = H265Unit.kind_of(payload[0])
         if kind in KEYS:  # first_slice_segment_in_pic_flag is the first bit
@@ -78,12 +78,12 @@ def _size(bits: FieldBits) -> tuple[int, int]:
     for profile, level in flags:
         bits.fixed(88 * profile + 8 * level)
     bits.unsigned()
-    colours = bits.unsigned()
-    if colours == 3:
+    chroma_format = bits.unsigned()
+    if chroma_format == 3:
         bits.fixed(1)
     width, height = bits.unsigned(), bits.unsigned()
     crop = [bits.unsigned() for _ in range(4)] if bits.fixed(1) else [0] * 4
-    across, down = _SHARED[colours]
+    across, down = SUBSAMPLING[chroma_format]
     return width - across * (crop[0] + crop[1]), height - down * (crop[2] + crop[3])
 
 

@@ -65,7 +65,7 @@ class JpegUnits:
         self.size = size
         self.tables: dict[int, tuple[bytes, ...]] = {}
 
-    def open(self, timestamp: int, unbroken: bool, arrived: float) -> JpegUnit:
+    def new_unit(self, timestamp: int, unbroken: bool, arrived: float) -> JpegUnit:
         """Return a new picture."""
         return JpegUnit(self, timestamp, unbroken, arrived)
 

@@ -67,10 +67,10 @@ class RtpPacket(NamedTuple):
         begin, end = _HEAD.size + 4 * (first & 0xF), len(data)
         if first & 0x10:
             if begin + 4 > end:
-                raise _cut_off("extension", begin + 4, data)
+                raise _cut_off_error("extension", begin + 4, data)
             begin += 4 + 4 * int.from_bytes(data[begin + 2 : begin + 4], "big")
         if begin > end:
-            raise _cut_off("head", begin, data)
+            raise _cut_off_error("head", begin, data)
         if first & 0x20:
             padding = data[-1]
             if not 1 <= padding <= end - begin:
@@ -245,7 +245,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
     place = 0
     while place < len(data) or not place:
         if len(data) - place < 4:
-            raise _cut_off("RTCP head", place + 4, data)
+            raise _cut_off_error("RTCP head", place + 4, data)
         first, kind = data[place], data[place + 1]
         end = place + 4 + 4 * int.from_bytes(data[place + 2 : place + 4], "big")
         if first >> 6 != VERSION or not 192 <= kind <= 223:
@@ -255,7 +255,7 @@ def parse_rtcp(data: bytes) -> list[Report]:
                 data=data[place:],
             )
         if end > len(data):
-            raise _cut_off("RTCP packet", end, data)
+            raise _cut_off_error("RTCP packet", end, data)
         body = data[place + 4 : end]
         if first & 0x20:
             body = _unpadded(body, end == len(data), place, data)
@@ -371,5 +371,5 @@ def _unpadded(body: bytes, last: bool, place: int, data: bytes) -> bytes:
     return body[:-padding]
 
 
-def _cut_off(label: str, expected: int, data: bytes | memoryview) -> MessageError:
+def _cut_off_error(label: str, expected: int, data: bytes | memoryview) -> MessageError:
     return MessageError(f"{label}: expected {expected} bytes or more, got {len(data)}", data=data)

@@ -20,7 +20,7 @@ CLOCK_RATE: Final = 90_000
 _HIGH: Final = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
 """Profiles whose parameters have a chroma format (ITU-T H.264, 7.3.2.1.1)."""
 
-_SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
+SUBSAMPLING: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
 """Chroma subsampling by chroma format, which is the unit of cropping."""
 
 
@@ -70,9 +70,9 @@ def checked_size(codec: str, sps: bytes, read: Callable[[], tuple[int, int]]) ->
     try:
         width, height = read()
     except (StopIteration, RuntimeError, KeyError):
-        raise _wrong(codec, "whole parameters", sps) from None
+        raise _format_error(codec, "whole parameters", sps) from None
     if not (width > 0 and height > 0 and width * height <= MAX_PICTURE_PIXELS):
-        raise _wrong(
+        raise _format_error(
             codec, f"pictures of up to {MAX_PICTURE_PIXELS} pixels, not {width}x{height}", sps
         )
     return width, height
@@ -82,7 +82,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
     profile = bits.fixed(8)
     bits.fixed(16)
     bits.unsigned()
-    colours = _high(bits) if profile in _HIGH else 1
+    chroma_format = _high(bits) if profile in _HIGH else 1
     bits.unsigned()
     order = bits.unsigned()
     if order == 0:
@@ -99,7 +99,7 @@ def _size(bits: FieldBits) -> tuple[int, int]:
     fields = 2 - bits.fixed(1)
     bits.fixed(2 if fields == 2 else 1)
     crop = [bits.unsigned() for _ in range(4)] if bits.fixed(1) else [0] * 4
-    across, down = _SHARED[colours]
+    across, down = SUBSAMPLING[chroma_format]
     return (
         16 * columns - across * (crop[0] + crop[1]),
         16 * rows * fields - down * fields * (crop[2] + crop[3]),
@@ -108,16 +108,16 @@ def _size(bits: FieldBits) -> tuple[int, int]:
 
 def _high(bits: FieldBits) -> int:
     """Return the chroma format; 0 for separate planes."""
-    colours = bits.unsigned()
-    separate = bits.fixed(1) if colours == 3 else 0
+    chroma_format = bits.unsigned()
+    separate = bits.fixed(1) if chroma_format == 3 else 0
     bits.unsigned()
     bits.unsigned()
     bits.fixed(1)
     if bits.fixed(1):
-        for number in range(12 if colours == 3 else 8):
+        for number in range(12 if chroma_format == 3 else 8):
             if bits.fixed(1):
                 _skip_list(bits, 16 if number < 6 else 64)
-    return 0 if separate else colours
+    return 0 if separate else chroma_format
 
 
 def _skip_list(bits: FieldBits, count: int) -> None:
@@ -191,7 +191,7 @@ def _lines(
     yield f"a=fmtp:{payload_type} {'; '.join(parameters)}"
 
 
-def _wrong(codec: str, expected: str, data: bytes) -> FrameFormatError:
+def _format_error(codec: str, expected: str, data: bytes) -> FrameFormatError:
     return FrameFormatError(
         f"{codec}: expected {expected}, got {len(data)} bytes that begin with {data[:8].hex(' ')}"
     )

@@ -297,7 +297,7 @@ class RtpSender:
                 link.pair.rtp.sendto(packet, to)
             except OSError:  # the socket is full, or there is no route now
                 return False
-            self._history.sent(sequence, packet)
+            self._history.store(sequence, packet)
             sequence = sequence + 1 & 0xFFFF
             self._packets += 1
             self._bytes += len(packet)
@@ -335,14 +335,14 @@ class RtpSender:
             self._wanted = True
         elif isinstance(report, wire.Goodbye):
             for ssrc in report.ssrcs:
-                self._audience.left(ssrc)
-        elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
+                self._audience.remove(ssrc)
+        elif isinstance(report, wire.ReceiverReport) and self._audience.record(report, address):
             self._wanted = True
             self._send_report(link)  # the receiver needs the sender's clock
 
     def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:
-            packet = self._history.again(sequence)
+            packet = self._history.packet_to_resend(sequence)
             if packet is None:
                 continue
             try:

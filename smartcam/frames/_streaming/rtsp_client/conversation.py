@@ -65,7 +65,7 @@ class ConversationPlan(NamedTuple):
     elsewhere: bool = False
     tls: ssl.SSLContext | None = None
 
-    def wrong(self, text: str) -> FrameSourceError:
+    def source_error(self, text: str) -> FrameSourceError:
         """Return an error with the source's name."""
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 
@@ -97,7 +97,7 @@ class RtspConversation:
     def link(self) -> RtspLink:
         """The connection."""
         if self._link is None:
-            raise self._plan.wrong("not connected")
+            raise self._plan.source_error("not connected")
         return self._link
 
     @property
@@ -126,9 +126,9 @@ class RtspConversation:
         except FrameSourceError:
             raise
         except TimeoutError:
-            raise self._silent() from None
+            raise self._silence_error() from None
         except OSError as exc:
-            raise plan.wrong(f"cannot be read: {why(exc)}") from None
+            raise plan.source_error(f"cannot be read: {why(exc)}") from None
 
     async def parameter(self, method: str, body: bytes) -> ServerAnswer:
         """Read or set a parameter, within the session if it plays.
@@ -154,7 +154,7 @@ class RtspConversation:
             text = f"expected an answer to {method}, got none within {plan.timeout:g} s"
             raise FrameTimeoutError(f"{plan.name}: {text}", source=plan.name) from None
         except OSError as exc:
-            raise plan.wrong(f"cannot be asked: {why(exc)}") from None
+            raise plan.source_error(f"cannot be asked: {why(exc)}") from None
 
     async def _introduced(self, method: str, body: bytes) -> ServerAnswer:
         """Connect, and send a request without a session."""
@@ -165,7 +165,7 @@ class RtspConversation:
             if answer.status not in REDIRECTS or not location:
                 return answer
             self._redirected(location)
-        raise self._plan.wrong(f"more than {MAX_REDIRECTS} redirects")
+        raise self._plan.source_error(f"more than {MAX_REDIRECTS} redirects")
 
     async def _parameter(self, method: str, body: bytes, url: str) -> ServerAnswer:
         kind = {"Content-Type": "text/parameters", "Content-Length": str(len(body))}
@@ -181,7 +181,7 @@ class RtspConversation:
             async with asyncio.timeout(self._plan.timeout):
                 await self._begin_to_play()
         except TimeoutError:
-            raise self._silent() from None
+            raise self._silence_error() from None
         keeping = self._keep_alive()
         self._alive = asyncio.create_task(keeping, name=f"session of {self._plan.name}")
 
@@ -206,8 +206,8 @@ class RtspConversation:
         finally:
             link.abort()
 
-    def _silent(self) -> FrameSourceError:
-        return self._plan.wrong(
+    def _silence_error(self) -> FrameSourceError:
+        return self._plan.source_error(
             f"expected an answer to {self._doing}, got none within {self._plan.timeout:g} s"
         )
 
@@ -226,7 +226,7 @@ class RtspConversation:
                 self._take_description(answer)
                 return
             self._redirected(location)
-        raise self._plan.wrong(f"more than {MAX_REDIRECTS} redirects")
+        raise self._plan.source_error(f"more than {MAX_REDIRECTS} redirects")
 
     async def _connect(self) -> None:
         parts = urlsplit(self._url)
@@ -257,7 +257,7 @@ class RtspConversation:
                 raise ValueError(location)
         except ValueError:
             text = f"expected a redirect to rtsp://HOST, got {location[:80]!r}"
-            raise self._plan.wrong(text) from None
+            raise self._plan.source_error(text) from None
         before = urlsplit(self._url)
         if to.hostname == before.hostname and "@" not in to.netloc and before.username:
             user = before.netloc.rpartition("@")[0]
@@ -337,7 +337,7 @@ class RtspConversation:
         actual = given[""].removesuffix("/UDP") or transport
         if actual != transport or "multicast" in given:
             shown = f"{actual}{';multicast' * ('multicast' in given)}"
-            raise self._plan.wrong(
+            raise self._plan.source_error(
                 f"SETUP: expected {transport};unicast, as it was asked for, got {shown[:80]!r}"
             )
 
@@ -401,7 +401,7 @@ class RtspConversation:
 
     def _expect_ok(self, method: str, answer: ServerAnswer) -> None:
         if answer.status != 200:
-            raise self._plan.wrong(f"{method}: {answer.status} {answer.reason}".rstrip())
+            raise self._plan.source_error(f"{method}: {answer.status} {answer.reason}".rstrip())
 
 
 def _address(text: str) -> str:

@@ -40,16 +40,16 @@ class RtspDriver(FrameDriver):
     camera, so smartcam's parameters follow ``#``: ``...#transport=udp&timeout=3``.
 
     ================= =============================================================================
-    ``transport``     ``tcp``, over the connection, or ``udp``; usual: over the connection, or by
+    ``transport``     ``tcp``, over the connection, or ``udp``; default: over the connection, or by
                       UDP if the camera refuses that
     ``timeout``       seconds until PLAY, until the first picture, and without a packet until the
-                      camera counts as lost; usual 5
+                      camera counts as lost; default 5
     ``format``        ``RGB8``, ``BGR8`` or ``Mono8`` converts the pixels; ``MJPEG`` or ``H264``
-                      passes such bytes on unchanged; usual: the decoder's format
-    ``delay``         longest time from exposure to arrival, seconds; usual 1
+                      passes such bytes on unchanged; default: the decoder's format
+    ``delay``         longest time from exposure to arrival, seconds; default 1
     ``verify``        of TLS (``rtsps:``): ``no`` trusts any certificate
-    ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
-    ``elsewhere``     ``yes`` follows a redirect to another host or port; usual ``no``
+    ``ca``            of TLS: file with the certificates that are trusted; default: the system's
+    ``elsewhere``     ``yes`` follows a redirect to another host or port; default ``no``
     ``name``          of the camera
     ================= =============================================================================
 
@@ -134,7 +134,7 @@ class RtspDriver(FrameDriver):
             self._other = VideoDriver(self.address)
             return await self._other.open()
         except TimeoutError:
-            raise self._plan.wrong(
+            raise self._plan.source_error(
                 f"expected a whole picture, got none within {self._plan.timeout:g} s: "
                 f"{self.statistics()}"
             ) from None
@@ -176,7 +176,7 @@ class RtspDriver(FrameDriver):
         passed_on = self._format in ("H264", "MJPEG")
         comes = coding.format if coding.name != "H265" else coding.name
         if passed_on and comes != self._format:
-            raise self._plan.wrong(f"expected {self._format}, got {comes}")
+            raise self._plan.source_error(f"expected {self._format}, got {comes}")
         to = "" if passed_on or not self._format else CONVERTIBLE[self._format]
         name, sets = self._name, track.sets
         return DecodingPlan(name, coding, self._delay, self._size, sets, to, passed_on)
@@ -269,7 +269,7 @@ class _Playing:
         self._over(f"the server ended the stream{f' ({reason})' if reason else ''}")
 
     def _over(self, why: str) -> None:
-        self._decoding.over(self._plan.wrong(why))
+        self._decoding.over(self._plan.source_error(why))
 
     async def _watch(self) -> None:
         loop, longest = asyncio.get_running_loop(), self._plan.timeout

@@ -120,10 +120,10 @@ class RtspLink(asyncio.Protocol):
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
                 if refusals == MAX_REFUSALS or not self._credentials.challenged(challenges):
-                    raise self._refused(method, answer)
+                    raise self._refused_error(method, answer)
             raise AssertionError("MAX_REFUSALS is at least 1")
 
-    def _refused(self, method: str, answer: ServerAnswer) -> FrameSourceError:
+    def _refused_error(self, method: str, answer: ServerAnswer) -> FrameSourceError:
         challenges = answer.headers.get("www-authenticate", ())
         shown = ", ".join(challenges)[:200] or "no challenge"
         cure = f"expected Basic, or Digest with MD5 or SHA-256, got {shown!r}"

@@ -65,7 +65,7 @@ class RtspParameters(DeviceFeatures):
             if body.strip()
             else ("got none: the camera only takes the request for a sign of life")
         )
-        raise self._wrong(name, f"expected its value from {READ}, {actual}")
+        raise self._feature_error(name, f"expected its value from {READ}, {actual}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a parameter; return the camera's new value, or the given value if it reports none.
@@ -75,7 +75,7 @@ class RtspParameters(DeviceFeatures):
         text = as_text(value)
         if re.search(r"[\r\n\0]", text):
             shown = repr(text[:MAX_SHOWN_CHARACTERS])
-            raise self._wrong(name, f"expected a value of one line, got {shown}")
+            raise self._feature_error(name, f"expected a value of one line, got {shown}")
         await self._answered(SET, name, f"{name}: {text}\r\n")
         try:
             return await self.get(name)
@@ -89,7 +89,7 @@ class RtspParameters(DeviceFeatures):
     async def _answered(self, method: str, name: str, body: str) -> ServerAnswer:
         if not re.fullmatch(r"[!-9;-~]+", name):
             text = "expected a name of printable ASCII without blanks and colons"
-            raise self._wrong(name, text)
+            raise self._feature_error(name, text)
         answer = await self._ask(method, body.encode())
         if answer.status == 200:
             return answer
@@ -101,11 +101,11 @@ class RtspParameters(DeviceFeatures):
             READ_ONLY: "it can only be read",
             INVALID: "the camera does not accept the value",
         }.get(answer.status, "it refuses that")
-        raise self._wrong(name, f"{why}: {status}")
+        raise self._feature_error(name, f"{why}: {status}")
 
     def _cannot(self, action: str) -> NoReturn:
         raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {action}")
 
-    def _wrong(self, name: str, text: str) -> FrameFeatureError:
+    def _feature_error(self, name: str, text: str) -> FrameFeatureError:
         shown = name[:MAX_SHOWN_CHARACTERS]
         return FrameFeatureError(f"{self._name}: parameter {shown!r}: {text}", source=self._name)
