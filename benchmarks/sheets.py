@@ -143,7 +143,7 @@ class Rig:
         def found(change: Array) -> Array:
             unknowns = np.concatenate([change, np.zeros(bundle.shared - len(change))])
             moved = bundle.moved(unknowns, np.zeros((bundle.poses.size, 6)))
-            transform = Transform("right", "left", *moved.rig.taken(0))
+            transform = Transform("right", "left", *moved.rig.subset(0))
             each = np.tile(np.eye(2), (len(self.space), 1, 1))
             left, right = moved.cameras
             pair = CameraPair(left, right, transform)

@@ -43,7 +43,7 @@ def metres_of(unit: object, label: str) -> float:
     return METRES_PER_UNIT[unit]
 
 
-def no_unit(label: str) -> CalibrationError:
+def no_unit_error(label: str) -> CalibrationError:
     """Return the error about a file that may be in metres or in millimetres."""
     return Code.UNIT_UNKNOWN.refusal(
         f"{label}: expected to know the unit of its lengths, which neither the file nor its format "

@@ -83,7 +83,9 @@ class TargetView(storage.Stored):
     @classmethod
     def _read(cls, fields: dict[str, Any], context: storage.Context) -> TargetView:
         if context.get("target") is None:
-            raise storage.refused(context["called"], "target: expected the one that it shows", None)
+            raise storage.invalid_data_error(
+                context["called"], "target: expected the one that it shows", None
+            )
         return super()._read({"target": context["target"], **fields}, context)
 
     @property

@@ -244,7 +244,7 @@ def _judged(
     rms, information, covariance, left_open = math.nan, np.zeros((6, 6)), None, np.eye(6)
     if matched >= NEIGHBOURS:
         once, places = np.unique(match.nearest, return_inverse=True)
-        planes = planes_of(goals, tree, NEIGHBOURS, once).taken(places.reshape(-1))
+        planes = planes_of(goals, tree, NEIGHBOURS, once).subset(places.reshape(-1))
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
         reasons += [_described(step, match.moved - centre) for step in steps]

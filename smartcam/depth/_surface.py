@@ -37,7 +37,7 @@ class SurfacePlanes(NamedTuple):
     along: Array
     tilts: Array
 
-    def taken(self, index: Any) -> SurfacePlanes:
+    def subset(self, index: Any) -> SurfacePlanes:
         """Return the planes at an index."""
         return SurfacePlanes(*(column[index] for column in self))
 

@@ -70,7 +70,7 @@ class Rigid(NamedTuple):
         moved: Array = points @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
         return moved
 
-    def taken(self, index: Index) -> Rigid:
+    def subset(self, index: Index) -> Rigid:
         """Return the motions at an index."""
         return Rigid(self.rotation[index], self.translation[index])
 
@@ -91,7 +91,7 @@ class Rigid(NamedTuple):
         turn = log_rotation(np.swapaxes(self.rotation, -1, -2) @ other.rotation)
         return np.concatenate([turn, other.translation - self.translation], axis=-1)
 
-    def after(self, other: Rigid) -> Array:
+    def steps_to(self, other: Rigid) -> Array:
         """Return the steps (..., 6) with which :meth:`turned_after` leads to other motions."""
         turn = log_rotation(other.rotation @ np.swapaxes(self.rotation, -1, -2))
         return np.concatenate([turn, other.translation - self.translation], axis=-1)

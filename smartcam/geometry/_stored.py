@@ -51,7 +51,7 @@ need."""
 Keys: TypeAlias = Mapping[str, str]
 """Keys in a file by the names of fields; empty for a field that is made of other keys."""
 
-Others: TypeAlias = Mapping[str, tuple[Any, Callable[[Any], Any]]]
+ExtraKeys: TypeAlias = Mapping[str, tuple[Any, Callable[[Any], Any]]]
 """Additional keys of a file: the type of each, and the function that reads it from an object."""
 
 
@@ -120,8 +120,8 @@ class Stored:
 
     _keys: ClassVar[Keys] = {}
 
-    _others: ClassVar[Others] = {}
-    """Entries that are written before the fields."""
+    _extra_keys: ClassVar[ExtraKeys] = {}
+    """Keys that are written before the fields."""
 
     _shared: ClassVar[frozenset[str]] = frozenset({"target"})
     """Keys whose values are in the context when later keys are read."""
@@ -156,7 +156,7 @@ class Stored:
         attributes = [field.name for field in dataclasses.fields(kind)]
         names: dict[str, str] = {cls._keys.get(name, name): name for name in attributes}
         names.pop("", None)
-        types = {key: hint for key, (hint, _) in cls._others.items()}
+        types = {key: hint for key, (hint, _) in cls._extra_keys.items()}
         types |= {key: hints[name] for key, name in names.items()}
 
         def field(key: str) -> core_schema.TypedDictField:
@@ -166,7 +166,7 @@ class Stored:
             return core_schema.typed_dict_field(schema, required=key not in cls._later)
 
         def write(instance: Stored) -> dict[str, Any]:
-            others = {key: value(instance) for key, (_, value) in cls._others.items()}
+            others = {key: value(instance) for key, (_, value) in cls._extra_keys.items()}
             return others | {key: getattr(instance, name) for key, name in names.items()}
 
         def read(values: dict[str, Any], context: Context) -> Stored:
@@ -178,16 +178,16 @@ class Stored:
 
     @classmethod
     def _read(cls, fields: dict[str, Any], context: Context) -> Self:
-        """Return an object made of the values found for its fields and ``_others``.
+        """Return an object made of the values found for its fields and ``_extra_keys``.
 
         Raises SHAPE: the fields do not fit together.
         """
-        made = cls(**{name: value for name, value in fields.items() if name not in cls._others})
+        made = cls(**{name: value for name, value in fields.items() if name not in cls._extra_keys})
         made._check(fields, context["called"])
         return made
 
     def _check(self, fields: Mapping[str, Any], called: str) -> None:
-        """Raise if fields do not fit together, or do not fit the values of ``_others``."""
+        """Raise if fields do not fit together, or do not fit the values of ``_extra_keys``."""
 
 
 def _share(key: str) -> Callable[[Any, core_schema.ValidationInfo[Context]], Any]:
@@ -212,10 +212,10 @@ def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
         if isinstance(error, CalibrationError):
             raise error from None
         where = ".".join(map(str, first["loc"]))
-        raise refused(called, f"{where}: {first['msg']}", first["input"]) from exc
+        raise invalid_data_error(called, f"{where}: {first['msg']}", first["input"]) from exc
 
 
-def refused(called: str, text: str, actual: object) -> CalibrationError:
+def invalid_data_error(called: str, text: str, actual: object) -> CalibrationError:
     """Return the error for stored data that are not valid."""
     return Code.SHAPE.refusal(f"stored {called}: {text}", got=actual)
 
@@ -224,13 +224,13 @@ def check_counts(fields: Mapping[str, Any], names: Iterable[str], count: int, ca
     """Raise SHAPE if a field does not have ``count`` items."""
     for name in names:
         if len(fields[name]) != count:
-            raise refused(called, f"{name}: expected {count}", len(fields[name]))
+            raise invalid_data_error(called, f"{name}: expected {count}", len(fields[name]))
 
 
 def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
     """Raise SHAPE if a field's array does not have the given shape."""
     if values.shape != shape:
-        raise refused(called, f"{name}: expected shape {shape}", values.shape)
+        raise invalid_data_error(called, f"{name}: expected shape {shape}", values.shape)
 
 
 # ---------------------------------------------------------------------- numbers
@@ -250,7 +250,7 @@ Positive = Annotated[Number, Field(gt=0)]
 Count = Annotated[int, Field(ge=0)]
 Pair = tuple[Number, Number]
 Triple = tuple[Number, Number, Number]
-OpenTriple = tuple[Number | None, Number | None, Number | None]
+NullableTriple = tuple[Number | None, Number | None, Number | None]
 
 
 def _opened(value: float | None) -> float:
@@ -261,10 +261,10 @@ def _closed(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-Open = Annotated[float, Form(Number | None, lambda value, _: _opened(value), _closed)]
+NumberOrNaN = Annotated[float, Form(Number | None, lambda value, _: _opened(value), _closed)]
 """A number that may be NaN, which is stored as null."""
 
-OpenPair = Annotated[
+PairOrNaN = Annotated[
     tuple[float, float],
     Form(
         tuple[Number | None, Number | None],

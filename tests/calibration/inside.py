@@ -47,7 +47,7 @@ from smartcam.calibration._hand_eye.equations import (
     Solution,
     adjust,
     bends,
-    carried,
+    predicted_views,
     sums,
     without_each,
 )

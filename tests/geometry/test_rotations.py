@@ -129,7 +129,7 @@ def test_right_jacobian_moves_the_exponential(length: float) -> None:
 
 
 def test_product_of_motions_maps_points_in_order() -> None:
-    first, second = MANY.taken(0), MANY.taken(1)
+    first, second = MANY.subset(0), MANY.subset(1)
     points = RANDOM.normal(size=(5, 3))
     np.testing.assert_allclose(
         (second @ first).apply(points), second.apply(first.apply(points)), atol=1e-12
@@ -150,7 +150,7 @@ def test_rigid_turned_after_turns_in_the_frame_it_leads_to() -> None:
     moved = MANY.turned_after(STEPS)
     np.testing.assert_allclose(moved.rotation, exp_rotation(STEPS[:, :3]) @ MANY.rotation)
     np.testing.assert_allclose(moved.translation, MANY.translation + STEPS[:, 3:])
-    np.testing.assert_allclose(MANY.after(moved), STEPS, atol=1e-12)
+    np.testing.assert_allclose(MANY.steps_to(moved), STEPS, atol=1e-12)
 
 
 def test_rigid_turned_before_turns_in_the_frame_it_comes_from() -> None:

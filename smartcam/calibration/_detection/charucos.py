@@ -84,7 +84,7 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, points)
     if matrix is None:
-        raise _not_found(target, "all in a line", len(ids))
+        raise _not_found_error(target, "all in a line", len(ids))
     ways = local_steps(partial(apply_homography, matrix), flat, FITTED_SHARE * target.square)
     clear = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
         ways, axis=2
@@ -94,7 +94,7 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)
     seen = corners.fitted & (colours * (colours @ corners.fitted) > 0)
     if seen.sum() < MIN_CORNERS:
-        raise _not_found(target, "clear enough", int(seen.sum()))
+        raise _not_found_error(target, "clear enough", int(seen.sum()))
     return TargetView(
         target=target,
         size=image.size,
@@ -115,7 +115,7 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
     seen = _detect(image, target)
     count = len(seen.ids)
     if seen.otherwise >= max(MIN_CORNERS, seen.agreeing + 1):
-        raise _other_pattern(target, seen)
+        raise _other_pattern_error(target, seen)
     check_one_board(seen.agreeing, seen.contrary, _name(target))
     if 2 * count > max(len(target.points), 4 * MIN_CORNERS):
         return seen
@@ -130,11 +130,11 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
         read = f"beside {seen.markers} markers of its dictionary"
         if seen.markers:
             read += f", of which {seen.agreeing} stand to each other as on such a board"
-        raise _not_found(target, read, count)
+        raise _not_found_error(target, read, count)
     return seen
 
 
-def _other_pattern(target: Charuco, seen: _Sighting) -> CalibrationError:
+def _other_pattern_error(target: Charuco, seen: _Sighting) -> CalibrationError:
     """Return the error for markers that are arranged as in the other ``legacy_pattern``."""
     expected, other = target.legacy_pattern, not target.legacy_pattern
     return Code.WRONG_TARGET.refusal(
@@ -303,7 +303,7 @@ def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
     return max((side for side in sides if side > MIN_MODULE_PIXELS * _modules(board)), default=0.0)
 
 
-def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:
+def _not_found_error(target: Charuco, how: str, count: int) -> CalibrationError:
     return Code.TARGET_NOT_FOUND.refusal(
         f"charuco: expected at least {MIN_CORNERS} corners of a board of {target.columns} x "
         f"{target.rows} squares, found {count} {how}",

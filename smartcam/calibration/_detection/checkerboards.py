@@ -21,9 +21,9 @@ from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.ordering import (
     MIN_ORIGIN_CONTRAST,
     arrangements,
-    leftmost,
     marked,
-    rows_of,
+    most_rightward,
+    places_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import apply_homography, fit_homography
@@ -80,7 +80,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
         if not _looks_right(corners, part):
             continue
         corners = _without_strays(image, corners, candidate.seen, part)
-        ways = arrangements(corners.points, rows_of(part.columns, part.rows), part)
+        ways = arrangements(corners.points, places_row_by_row(part.columns, part.rows), part)
         if part == target:
             arrangement, margin = _number(image, target, corners, ways)
         else:
@@ -90,7 +90,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
             arrangement, margin = numbered
         break
     else:
-        raise _not_found(target, seen)
+        raise _not_found_error(target, seen)
     order = arrangement.order.ravel()
     shown = np.flatnonzero((candidate.seen | corners.fitted)[order])
     row, column = np.divmod(shown, part.columns)
@@ -207,7 +207,7 @@ def _without_strays(
     The second search starts from the place that the other corners predict. A corner that cannot be
     fitted there either, or is far off again, gets a covariance as large as its distance from there.
     """
-    flat = rows_of(target.columns, target.rows).astype(np.float64)
+    flat = places_row_by_row(target.columns, target.rows).astype(np.float64)
     good = corners.fitted
     expected = GridMap(flat[good], corners.points[good])(flat)
     distances = np.linalg.norm(corners.points - expected, axis=1)
@@ -229,11 +229,15 @@ def _without_strays(
 
 
 def _looks_right(corners: Corners, target: Checkerboard) -> bool:
-    colours = parity(rows_of(target.columns, target.rows)) * np.sign(corners.gains) * corners.fitted
+    colours = (
+        parity(places_row_by_row(target.columns, target.rows))
+        * np.sign(corners.gains)
+        * corners.fitted
+    )
     return bool(abs(colours.mean()) >= MIN_FITTED_SHARE)
 
 
-def _not_found(target: Checkerboard, seen: _Search) -> CalibrationError:
+def _not_found_error(target: Checkerboard, seen: _Search) -> CalibrationError:
     """Return an error that says which board is seen instead, if there is one."""
     shape = seen.shape
     instead = "found none" if shape is None else f"found one of about {shape[0]} x {shape[1]}"
@@ -268,11 +272,11 @@ def _number(
     proper = [arrangement for arrangement in ways if arrangement.proper]
     black = [arrangement for arrangement in proper if _blackness(target, corners, arrangement) > 0]
     if proper and not black and target.columns % 2 == target.rows % 2 == 1:
-        raise _white_origin(target, name)
-    return leftmost(black or ways, name), None
+        raise _white_origin_error(target, name)
+    return most_rightward(black or ways, name), None
 
 
-def _white_origin(target: Checkerboard, label: str) -> CalibrationError:
+def _white_origin_error(target: Checkerboard, label: str) -> CalibrationError:
     """Return the error for a board whose black corners are where the target has white ones.
 
     If the counts of columns and rows are both odd and differ, two corners that lie opposite each
@@ -324,7 +328,7 @@ def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
         [(at + 0.5, low) for at in range(columns - 1)],
         [(low, at + 0.5) for at in range(rows - 1)],
     )
-    flat = rows_of(columns, rows).astype(np.float64)
+    flat = places_row_by_row(columns, rows).astype(np.float64)
     seen = GridMap(flat, grid.reshape(-1, 2))(np.concatenate([around, *along]))
     last = np.array(image.size) - 1
     for place in seen:
@@ -362,7 +366,7 @@ def _blackness(target: Checkerboard, corners: Corners, arrangement: Arrangement)
     # gains refer to the found grid's columns and rows, which may run against the target's
     against = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
     signs = np.sign(corners.gains[order.ravel()])
-    return against * float(parity(rows_of(target.columns, target.rows)) @ signs)
+    return against * float(parity(places_row_by_row(target.columns, target.rows)) @ signs)
 
 
 def _mapped_near(grid: Array, at: Array) -> Array:
@@ -370,7 +374,7 @@ def _mapped_near(grid: Array, at: Array) -> Array:
 
     A place is given from this corner, in sides of a square.
     """
-    places = rows_of(3, 3).astype(np.float64)
+    places = places_row_by_row(3, 3).astype(np.float64)
     nearest = grid[:3, :3].reshape(-1, 2)
     matrix = fit_homography(places, nearest)
     return np.full_like(at, nearest[0]) if matrix is None else apply_homography(matrix, at)

@@ -17,7 +17,7 @@ from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
-from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
+from smartcam.calibration._detection.ordering import arrangements, marked, most_rightward
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import local_steps
 from smartcam.calibration._views import TargetView
@@ -76,7 +76,7 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
         if _is_whole(inked, target, points[ways[0].order.ravel()]):
             return _view(inked, target, points, ways, name)
         seen.largest = len(points) + 1
-    raise _not_found(target, seen)
+    raise _not_found_error(target, seen)
 
 
 @dataclass
@@ -274,7 +274,7 @@ def _number(
 ) -> tuple[Arrangement, float | None]:
     name = f"{target.columns} x {target.rows} dots"
     if target.origin_diameter is None:
-        return leftmost(ways, name), None
+        return most_rightward(ways, name), None
     flat = target.points[:, :2]
     rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
     between = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
@@ -294,7 +294,7 @@ def _number(
     return marked(ways, level, f"{name}, of which the larger one is the origin")
 
 
-def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
+def _not_found_error(target: CircleGrid, seen: _Counted) -> CalibrationError:
     """Return an error that reports the dots seen instead."""
     count = target.columns * target.rows
     if seen.largest > count:

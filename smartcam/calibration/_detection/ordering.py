@@ -32,7 +32,7 @@ _TURNS: Final = [
     for entries in itertools.product((-1, 0, 1), repeat=4)
     if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
 ]
-"""Matrices that may turn the steps a grid was grown by into those to the next column and row:
+"""Matrices from the steps by which a grid was found to the steps to the next column and row:
 turns, mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its
 sides."""
 
@@ -53,7 +53,7 @@ def arrangements(
 
     ``points`` (N, 2), pixels, are all points of the target in any order; ``places`` (N, 2) the
     column and the row of each, with arbitrary origin and directions; in a grid with shifted rows
-    they count steps to the two nearest neighbours.
+    they count the steps along the two diagonals, to the nearest points.
     """
     wanted = _places(target)
     ways: list[Arrangement] = []
@@ -61,8 +61,8 @@ def arrangements(
         return ways
     for turn in _TURNS:
         turned = places @ turn
-        number = {place: index for index, place in enumerate(_from_zero(turned))}
-        order = [number.get(place) for place in wanted]
+        index_at = {place: index for index, place in enumerate(_from_zero(turned))}
+        order = [index_at.get(place) for place in wanted]
         if None not in order:
             shaped = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
             ways.append(_arrangement(points, shaped))
@@ -82,20 +82,22 @@ def _places(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
     return _from_zero(np.stack([column, row], axis=1))
 
 
-def rows_of(columns: int, rows: int) -> NDArray[np.intp]:
+def places_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
     """Return the places (N, 2) of points that come row by row."""
     row, column = np.divmod(np.arange(columns * rows), columns)
     return np.stack([column, row], axis=1)
 
 
 def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
-    origin, right, up = points[order[0, 0]], points[order[0, -1]], points[order[-1, 0]]
-    x, y = right - origin, up - origin
-    turn = float(x[0] * y[1] - x[1] * y[0])  # v points down: negative where y is left of x
+    origin, x_end, y_end = points[order[0, 0]], points[order[0, -1]], points[order[-1, 0]]
+    x, y = x_end - origin, y_end - origin
+    turn = float(
+        x[0] * y[1] - x[1] * y[0]
+    )  # v points down: negative where y is counter-clockwise of x
     return Arrangement(order, turn < 0, float(x[0] / np.hypot(*x)))
 
 
-def leftmost(ways: Sequence[Arrangement], label: str) -> Arrangement:
+def most_rightward(ways: Sequence[Arrangement], label: str) -> Arrangement:
     """Return the proper arrangement whose x points most to the image's right, which is unique.
 
     Raises MIRRORED if no arrangement is proper; ``label`` names the target.
@@ -129,6 +131,6 @@ def marked(
             MIN_ORIGIN_CONTRAST,
             margin,
         )
-    return leftmost(
+    return most_rightward(
         [arrangement for arrangement in ways if arrangement.order[0, 0] == origin], label
     ), margin

@@ -91,7 +91,9 @@ def draw_uncertainty(
         points = np.concatenate([fit.view.points for fit in shown.views if fit.used])
         shown = shown.uncertainty(distance=distance)
     if not isinstance(shown, ProjectionUncertainty):
-        raise _wrong("draw_uncertainty", "a calibration of a lens, its map or a comparison", shown)
+        raise _argument_error(
+            "draw_uncertainty", "a calibration of a lens, its map or a comparison", shown
+        )
     where = "infinity" if shown.distance is None else f"{shown.distance:g} m"
     name = f"standard deviation of the projection of a point at {where}"
     caption = _figures_text(shown.figures)
@@ -105,12 +107,14 @@ def _of(calibration: object, table: Mapping[type, Any], label: str) -> Callable[
         (drawing for kind, drawing in table.items() if isinstance(calibration, kind)), None
     )
     if drawing is None:
-        raise _wrong(label, "a calibration of a lens, a pair, or a camera on a robot", calibration)
+        raise _argument_error(
+            label, "a calibration of a lens, a pair, or a camera on a robot", calibration
+        )
     chosen: Callable[[Any], Any] = drawing
     return chosen
 
 
-def _wrong(label: str, expected: str, actual: object) -> CalibrationError:
+def _argument_error(label: str, expected: str, actual: object) -> CalibrationError:
     return Code.WRONG_KIND.unexpected(
         f"{label}: expected {expected}", expected, type(actual).__name__
     )

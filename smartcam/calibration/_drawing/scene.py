@@ -41,7 +41,7 @@ LETTER_PX: Final = (7.5, 15.0)
 LABEL_OFFSET_PX: Final = np.array([0.0, 14.0])
 """Offset of a label from its object, pixels."""
 
-LABEL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
+LABEL_TRIAL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
     (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
@@ -186,7 +186,7 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
         width, height = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
-        for offset in LABEL_OFFSETS_PX:
+        for offset in LABEL_TRIAL_OFFSETS_PX:
             x, y = at + offset
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]

@@ -99,7 +99,7 @@ class Folder:
         target = target.removeprefix(f"{EXPORTS}/")
         stem, dot, suffix = target.rpartition(".")
         if f"{dot}{suffix}" not in _SUFFIXES:
-            raise _bad(target, f"a name that ends in one of {', '.join(_SUFFIXES)}")
+            raise _bad_name_error(target, f"a name that ends in one of {', '.join(_SUFFIXES)}")
         path = self._within(EXPORTS, f"{_checked(stem)}.{suffix}")
         path.parent.mkdir(exist_ok=True)
         return path
@@ -118,7 +118,7 @@ class Folder:
         elif name_or_path.startswith(f"{EXPORTS}/"):
             path = self.export(name_or_path)
         else:
-            raise _bad(name_or_path, f"a name, or {EXPORTS}/NAME.json")
+            raise _bad_name_error(name_or_path, f"a name, or {EXPORTS}/NAME.json")
         if not path.is_file():
             known = ", ".join(self.names()[:20]) or "none: the folder is empty"
             raise Code.NOT_FOUND.refusal(
@@ -131,7 +131,7 @@ class Folder:
         for part in parts:
             path /= part
             if path.is_symlink():
-                raise _bad(part, "no symbolic link")
+                raise _bad_name_error(part, "no symbolic link")
         return path
 
 
@@ -143,11 +143,11 @@ def _is_name(text: str) -> bool:
 
 def _checked(name: str) -> str:
     if not _is_name(name):
-        raise _bad(name, f"1 to {MAX_NAME_LENGTH} letters, digits, '-' and '_'")
+        raise _bad_name_error(name, f"1 to {MAX_NAME_LENGTH} letters, digits, '-' and '_'")
     return name
 
 
-def _bad(name: str, expected: str) -> CalibrationError:
+def _bad_name_error(name: str, expected: str) -> CalibrationError:
     shown = repr(name) if len(name) <= MAX_NAME_LENGTH else f"{name[:MAX_NAME_LENGTH]!r}..."
     return Code.BAD_NAME.refusal(
         f"the name {shown} cannot be used: expected {expected}", expected, name

@@ -1,4 +1,4 @@
-"""Base of the calibrations that have files of their own, and the forms of their fields.
+"""Write calibrations to files of their own, and name the forms of their fields.
 
 The forms are those of ``smartcam/geometry/_stored.py``, which explains them. This module repeats
 their names, since ``storage.rows`` reads better in a list of fields than ``rows``.
@@ -21,6 +21,9 @@ from smartcam.geometry._inside import (
     Count as Count,
 )
 from smartcam.geometry._inside import (
+    ExtraKeys as ExtraKeys,
+)
+from smartcam.geometry._inside import (
     Form as Form,
 )
 from smartcam.geometry._inside import (
@@ -36,22 +39,19 @@ from smartcam.geometry._inside import (
     NonNegative as NonNegative,
 )
 from smartcam.geometry._inside import (
+    NullableTriple as NullableTriple,
+)
+from smartcam.geometry._inside import (
     Number as Number,
 )
 from smartcam.geometry._inside import (
-    Open as Open,
-)
-from smartcam.geometry._inside import (
-    OpenPair as OpenPair,
-)
-from smartcam.geometry._inside import (
-    OpenTriple as OpenTriple,
-)
-from smartcam.geometry._inside import (
-    Others as Others,
+    NumberOrNaN as NumberOrNaN,
 )
 from smartcam.geometry._inside import (
     Pair as Pair,
+)
+from smartcam.geometry._inside import (
+    PairOrNaN as PairOrNaN,
 )
 from smartcam.geometry._inside import (
     Positive as Positive,
@@ -87,13 +87,13 @@ from smartcam.geometry._inside import (
     check_shape as check_shape,
 )
 from smartcam.geometry._inside import (
+    invalid_data_error as invalid_data_error,
+)
+from smartcam.geometry._inside import (
     matrix as matrix,
 )
 from smartcam.geometry._inside import (
     motion as motion,
-)
-from smartcam.geometry._inside import (
-    refused as refused,
 )
 from smartcam.geometry._inside import (
     row as row,

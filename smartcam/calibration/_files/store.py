@@ -136,20 +136,22 @@ def read_document(path: StrPath) -> Document:
     with Path(path).open("rb") as stream:
         body = stream.read(MAX_FILE_BYTES + 1)
     if len(body) > MAX_FILE_BYTES:
-        raise _broken(path, f"more than {MAX_FILE_BYTES} bytes")
+        raise _broken_file_error(path, f"more than {MAX_FILE_BYTES} bytes")
     try:
         parsed: Any = json.loads(body)
     except (ValueError, RecursionError) as exc:
-        raise _broken(path, f"no JSON: {exc}") from exc
+        raise _broken_file_error(path, f"no JSON: {exc}") from exc
     if not isinstance(parsed, dict):
-        raise _broken(path, "no JSON object")
+        raise _broken_file_error(path, "no JSON object")
     content = cast("dict[str, Any]", parsed)
     if content.get("schema") != SCHEMA:
-        raise _broken(path, f"schema {content.get('schema')!r}, expected {SCHEMA!r}")
+        raise _broken_file_error(path, f"schema {content.get('schema')!r}, expected {SCHEMA!r}")
     version = _version(path, content.get("schema_version"))
     stated = content.pop("sha256", None)
     if stated != _digest(content):
-        raise _broken(path, "its hash does not match: it was damaged, or changed by hand")
+        raise _broken_file_error(
+            path, "its hash does not match: it was damaged, or changed by hand"
+        )
     for major in range(version[0], SCHEMA_VERSION[0]):
         content = MIGRATIONS[major](content)
     try:
@@ -162,17 +164,17 @@ def read_document(path: StrPath) -> Document:
             version=version,
         )
     except (KeyError, TypeError, ValueError) as exc:
-        raise _broken(path, f"{exc!r}") from exc
+        raise _broken_file_error(path, f"{exc!r}") from exc
 
 
-def _broken(path: StrPath, why: str) -> CalibrationError:
+def _broken_file_error(path: StrPath, why: str) -> CalibrationError:
     return Code.BROKEN_FILE.refusal(f"{path}: {why}; expected a calibration as smartcam writes it")
 
 
 def _version(path: StrPath, text: object) -> tuple[int, int]:
     major, dot, minor = str(text).partition(".")
     if not (dot and major.isdecimal() and minor.isdecimal() and len(str(text)) < 20):
-        raise _broken(path, f"schema_version {text!r}")
+        raise _broken_file_error(path, f"schema_version {text!r}")
     version = int(major), int(minor)
     if version[0] > SCHEMA_VERSION[0]:
         raise Code.NEWER_VERSION.refusal(
@@ -182,7 +184,7 @@ def _version(path: StrPath, text: object) -> tuple[int, int]:
             text,
         )
     if any(major not in MIGRATIONS for major in range(version[0], SCHEMA_VERSION[0])):
-        raise _broken(path, f"schema_version {text!r}, which does not exist")
+        raise _broken_file_error(path, f"schema_version {text!r}, which does not exist")
     return version
 
 

@@ -49,9 +49,9 @@ from smartcam.calibration._hand_eye.result import HandEyeCalibration, as_transfo
 from smartcam.calibration._hand_eye.validation import (
     check_poses,
     expected_error,
-    most_error,
+    max_plausible_error,
     other_numbering,
-    poor_fit,
+    poor_fit_error,
     seen_poses,
 )
 from smartcam.calibration._jackknife import jackknife, weighed_jackknife
@@ -377,8 +377,8 @@ def _numbered_alike(
     """Return views with one origin, for a target that looks the same after half a turn."""
     target = views[0].target
     poses = Rigid.stacked(view.transform.rigid for view in located)
-    arm = float(np.ptp(target.points, axis=0).max())
-    other = other_numbering(robot, poses, half_turn(target), arm).tolist()
+    lever = float(np.ptp(target.points, axis=0).max())
+    other = other_numbering(robot, poses, half_turn(target), lever).tolist()
     return [
         half_turned(view) if turned else view for view, turned in zip(views, other, strict=True)
     ]
@@ -437,7 +437,7 @@ def _without_bad(
     """
     robot_poses = [transforms[i] for i in request.order]
     used, remarks = _start_poses(problem, request, named)
-    result = _solved(problem.taken(used), request, robot_poses[0])
+    result = _solved(problem.subset(used), request, robot_poses[0])
     while len(bad := _bad(result)) and request.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
         worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
@@ -446,13 +446,13 @@ def _without_bad(
         if len(fewer) < MIN_ADVISED_POSES or problem.count - len(fewer) > most:
             break
         try:
-            check_motion(problem.robot.taken(fewer))
+            check_motion(problem.robot.subset(fewer))
         except CalibrationError:  # too few are left without it
             break
         for index in worst:
             number = int(used[index])
             remarks[number] = _bad_view(result, index, named[number], "was not used")
-        used, result = fewer, _solved(problem.taken(fewer), request, robot_poses[0])
+        used, result = fewer, _solved(problem.subset(fewer), request, robot_poses[0])
     for index in bad:
         number = int(used[index])
         remark = _bad_view(result, index, named[number], "is used all the same")
@@ -465,7 +465,7 @@ def _without_bad(
         if np.isfinite(errors_of_pose).all():
             errors[number] = left_out[number] = math.sqrt(float((errors_of_pose**2).mean()))
     errors[used], left_out[used] = result.errors, result.leave_one_out
-    sampled, back = problem.taken(used), np.argsort(request.order)
+    sampled, back = problem.subset(used), np.argsort(request.order)
     _check_fit(sampled, result)
     _check_scale(result.target_scale, request.most_scale)
     return dataclasses.replace(
@@ -477,7 +477,7 @@ def _without_bad(
         warnings=(
             *_size_remark(sampled, request),
             *_remarks(sampled, result),
-            *_moved_remark(problem.taken(unused), result, [named[i] for i in left]),
+            *_moved_remark(problem.subset(unused), result, [named[i] for i in left]),
             *remarks.values(),
         ),
     )
@@ -491,11 +491,11 @@ def _moved_remark(
         return
     between, seen = unused.robot.between, unused.poses.scaled(result.target_scale)
     camera, target = result.camera_pose.rigid, result.target_pose.rigid
-    arm = float(np.linalg.norm(seen.translation, axis=1).mean())
+    lever = float(np.linalg.norm(seen.translation, axis=1).mean())
     places = {"target": target.before(between.inverse() @ (camera @ seen))}
     places["camera"] = camera.before(between @ (target @ seen.inverse()))
     for thing, steps in places.items():
-        if (move := common_move(steps * np.repeat([arm, 1.0], 3))) is not None:
+        if (move := common_move(steps * np.repeat([lever, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
                 f"the {thing} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
                 f"{', '.join(named)} were left out, and agree on another place of it than all "
@@ -512,7 +512,7 @@ def _start_poses(
     Raises ``WRONG_FRAME`` or ``POOR_FIT``.
     """
     agreed, everything = check_poses(problem), np.arange(problem.count)
-    gross = agreed.gross(most_error(problem))
+    gross = agreed.gross(max_plausible_error(problem))
     left = problem.count - len(gross)
     drop = (
         request.drop_bad
@@ -521,7 +521,7 @@ def _start_poses(
     )
     used = np.setdiff1d(everything, gross) if drop else everything
     try:
-        check_motion(problem.robot.taken(used))
+        check_motion(problem.robot.subset(used))
     except CalibrationError:  # too few are left without them
         drop, used = False, everything
     done = "was not used" if drop else "is used all the same"
@@ -559,16 +559,18 @@ def _solved(problem: Problem, request: _Asked, pose: Transform) -> HandEyeCalibr
     check_choice(request.method, ["auto", *METHODS], "method")
     chosen, candidates_ = candidates(problem, request.free, request.method)
     if chosen is None:
-        raise poor_fit(f"none at all {problem.count} poses", None)
+        raise poor_fit_error(f"none at all {problem.count} poses", None)
     return _result(problem, chosen, candidates_, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
     """Raise ``POOR_FIT`` if poses and views do not belong together."""
     errors = result.errors if result.held_out_error is None else result.leave_one_out
-    error, most = float(np.median(errors)), most_error(problem)
+    error, most = float(np.median(errors)), max_plausible_error(problem)
     if error > most:
-        raise poor_fit(f"one {1e3 * error:.3g} mm off, {1e3 * most:.3g} mm at most expected", error)
+        raise poor_fit_error(
+            f"one {1e3 * error:.3g} mm off, {1e3 * most:.3g} mm at most expected", error
+        )
 
 
 def _result(
@@ -660,7 +662,7 @@ def _size_remark(problem: Problem, request: _Asked) -> Iterator[Remark]:
         return
     numbers = np.arange(problem.count)
     scale = scale_of(problem.robot, problem.poses)
-    parts = [problem.taken(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
+    parts = [problem.subset(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
     others = [scale_of(part.robot, part.poses) for part in parts]
     if scale is None or not others or None in others:
         return

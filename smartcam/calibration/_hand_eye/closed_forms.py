@@ -175,7 +175,7 @@ def solve_linear(
     """
     if name in HAND_EYE and not exactly and seen.size > MAX_POSES_PAIRED:
         sampled = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
-        robot, seen = robot.taken(sampled), seen.taken(sampled)
+        robot, seen = robot.subset(sampled), seen.subset(sampled)
     try:
         solution = LINEAR[name](name, robot, seen)
     except (load("cv2").error, np.linalg.LinAlgError):

@@ -99,12 +99,12 @@ class RobotPoses:
         """``A`` of each view: from the target's carrier to the camera's."""
         return self.poses.inverse() if self.in_hand else self.poses
 
-    def taken(self, index: Index) -> RobotPoses:
+    def subset(self, index: Index) -> RobotPoses:
         """Return some of the poses."""
-        return dataclasses.replace(self, poses=self.poses.taken(index))
+        return dataclasses.replace(self, poses=self.poses.subset(index))
 
 
-def carried(camera: Rigid, robot: RobotPoses, target: Rigid) -> Rigid:
+def predicted_views(camera: Rigid, robot: RobotPoses, target: Rigid) -> Rigid:
     """Return ``T_camera_target`` of each view."""
     return camera.inverse() @ (robot.between @ target)
 
@@ -125,7 +125,7 @@ def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Arra
     #     camera on the hand, A = T^-1:       w = -R_X^T a,      d = w x arm - R_X^T R_T^T b,
     #         arm = R_X^T R_T^T (t_Z - t_T) = t_S + R_X^T t_X
     # Source of the conventions: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537).
-    seen = carried(camera, robot, target)
+    seen = predicted_views(camera, robot, target)
     back = camera.rotation.T
     count, turn = seen.size, robot.poses.rotation
     outer = np.zeros((count, 6, 12))
@@ -158,7 +158,7 @@ class Observations(ABC):
     free: tuple[int, ...] = field(default=(), kw_only=True)
 
     @property
-    def extra(self) -> int:
+    def extra_count(self) -> int:
         """Number of parameters that are adjusted beside the poses."""
         return len(self.free)
 
@@ -171,7 +171,7 @@ class Observations(ABC):
         return 1.0 + float(change[0]) if 0 in self.free else 1.0
 
     @abstractmethod
-    def taken(self, index: Index) -> Self:
+    def subset(self, index: Index) -> Self:
         """Return some of the views."""
 
     @abstractmethod
@@ -204,7 +204,7 @@ class PixelObservations(Observations):
     pixels: Array
     heights: Array
 
-    def taken(self, index: Index) -> PixelObservations:
+    def subset(self, index: Index) -> PixelObservations:
         """Return some of the views."""
         return dataclasses.replace(
             self,
@@ -235,7 +235,7 @@ class PixelObservations(Observations):
         full = self._full(change)
         if min(1.0 + full[0], *(np.diag(self.model.matrix)[:2] + full[1:3])) <= 0:
             nothing = np.full((views, 2 * count), np.nan)
-            return nothing, np.full((*nothing.shape, 6 + self.extra), np.nan)
+            return nothing, np.full((*nothing.shape, 6 + self.extra_count), np.nan)
         # A point of a target of size s is at p = s R m + t: dp/ds = R m. Poses move p as
         # pose_changes has it, lenses move the pixel as the projection says, and a bend b moves m by
         # b h along the target's normal n: dp/db = s h R n.
@@ -305,10 +305,10 @@ class PoseObservations(Observations):
 
     poses: Rigid
 
-    def taken(self, index: Index) -> PoseObservations:
+    def subset(self, index: Index) -> PoseObservations:
         """Return some of the views."""
         return dataclasses.replace(
-            self, poses=self.poses.taken(index), whitening=self.whitening[index]
+            self, poses=self.poses.subset(index), whitening=self.whitening[index]
         )
 
     def settled(self, change: Array) -> PoseObservations:
@@ -320,11 +320,11 @@ class PoseObservations(Observations):
         # The turn e = log(R_S R_m^T) becomes log(exp([w]x) exp([e]x)), to first order e +
         # J_l(e)^-1 w, and the left Jacobian is J_l(e) = J_r(-e).
         # Source: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537), appendix B.
-        residuals = self.poses.scaled(self.scale(change)).after(seen)
-        slopes = np.zeros((len(residuals), 6, 6 + self.extra))
+        residuals = self.poses.scaled(self.scale(change)).steps_to(seen)
+        slopes = np.zeros((len(residuals), 6, 6 + self.extra_count))
         slopes[:, :3, :3] = np.linalg.inv(right_jacobian(-residuals[:, :3]))
         slopes[:, 3:, 3:6] = np.eye(3)
-        slopes[:, 3:, 6:] = -self.poses.translation[..., None][..., : self.extra]
+        slopes[:, 3:, 6:] = -self.poses.translation[..., None][..., : self.extra_count]
         whitened = (self.whitening @ residuals[..., None])[..., 0]
         return whitened, self.whitening @ slopes
 
@@ -361,7 +361,7 @@ def sums(
     pose of the view can change.
     """
     moved = dataclasses.replace(robot, poses=robot.poses.turned_before(at.corrections))
-    residuals, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
+    residuals, slopes = seen.evaluate(predicted_views(at.camera, moved, at.target), at.change)
     outer, inner = _chain(at.camera, moved, at.target)
     # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
     # it the equations are linearised at v; the residuals at v = 0 are, to first order, r - J v.
@@ -427,7 +427,7 @@ def adjust(
     samples leave only rounding errors to gain.
     """
     spread = seen if noise is None else seen.spread(noise.shared)
-    change = start.change if start.change.size else np.zeros(seen.extra)
+    change = start.change if start.change.size else np.zeros(seen.extra_count)
     none = np.zeros((robot.poses.size, 6))
     at, normal = minimize(
         Solution(start.camera, start.target, change, none, noise=noise),
@@ -489,12 +489,12 @@ def pull(robot: RobotPoses, seen: Observations, at: Solution, numbers: tuple[int
     # The gradient g(x, l) of a least-squares solution is 0 for any l, such as a lens:
     # dx/dl = -(dg/dx)^-1 dg/dl.
     freed = dataclasses.replace(seen, free=(*seen.free, *numbers))
-    change, none = np.zeros(freed.extra), np.zeros((robot.poses.size, 6))
-    change[: seen.extra] = at.change
+    change, none = np.zeros(freed.extra_count), np.zeros((robot.poses.size, 6))
+    change[: seen.extra_count] = at.change
     spread = freed if at.noise is None else freed.spread(at.noise.shared)
     corrections = at.corrections if at.corrections.size else none
     begin = dataclasses.replace(at, change=change, corrections=corrections)
-    matrix, fitted = _normal(robot, spread, begin).reduced()[0], 12 + seen.extra
+    matrix, fitted = _normal(robot, spread, begin).reduced()[0], 12 + seen.extra_count
     slopes: Array = -solve_scaled(matrix[:fitted, :fitted], matrix[:fitted, fitted:])[:12]
     return slopes
 

@@ -33,7 +33,7 @@ from smartcam.calibration._hand_eye.equations import (
     RobotNoise,
     Solution,
     adjust,
-    carried,
+    predicted_views,
     pull,
     without_each,
 )
@@ -103,13 +103,13 @@ class Problem:
         """True for points with an error, (V, N); without views, for the target's origin."""
         return np.ones((self.count, 1), dtype=bool) if self.given is None else self.given
 
-    def taken(self, index: NDArray[np.intp]) -> Problem:
+    def subset(self, index: NDArray[np.intp]) -> Problem:
         """Return some of the poses."""
         given = None if self.given is None else self.given[index]
         return Problem(
-            self.robot.taken(index),
-            self.seen.taken(index),
-            self.poses.taken(index),
+            self.robot.subset(index),
+            self.seen.subset(index),
+            self.poses.subset(index),
             given,
             self.sigmas,
             self.lens,
@@ -129,7 +129,7 @@ class Problem:
 
         ``solution`` is one, or one for each view.
         """
-        expected = carried(solution.camera, self.robot, solution.target)
+        expected = predicted_views(solution.camera, self.robot, solution.target)
         change = solution.change
         each = change.ndim > 1
         scales = [self.seen.scale(step) for step in (change if each else change[None])]
@@ -381,7 +381,7 @@ def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
 
 def _closed(problem: Problem, name: str, *, exactly: bool = True) -> Solution | None:
     solution = solve_linear(name, problem.robot, problem.poses, exactly=exactly)
-    return None if solution is None else Solution(*solution, np.zeros(problem.seen.extra))
+    return None if solution is None else Solution(*solution, np.zeros(problem.seen.extra_count))
 
 
 def _begin(problem: Problem) -> Solution | None:
@@ -433,7 +433,7 @@ def _by_closed_form(problem: Problem, name: str, solution: Solution) -> Candidat
     numbers = np.arange(count)
     part, others = numbers % MAX_FOLDS, [solution] * count
     for fold in range(min(count, MAX_FOLDS)):
-        other = _closed(problem.taken(numbers[part != fold]), name)
+        other = _closed(problem.subset(numbers[part != fold]), name)
         if other is None:
             return candidate
         others = [other if part[i] == fold else before for i, before in enumerate(others)]

@@ -102,7 +102,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     kind: ClassVar[str] = KIND
     _called: ClassVar[str] = "hand-eye calibration"
-    _others: ClassVar[storage.Others] = {
+    _extra_keys: ClassVar[storage.ExtraKeys] = {
         "frames": (
             FRAMES,
             lambda result: (result.robot_poses[0].target, result.robot_poses[0].source),
@@ -144,12 +144,12 @@ class HandEyeCalibration(storage.SavedCalibration):
         names = ("errors", "leave_one_out", "used", "target_poses")
         storage.check_counts(fields, names, count, called)
         if self.views and (fields["target"] is None or len(self.views) != count):
-            raise storage.refused(
+            raise storage.invalid_data_error(
                 called, f"views: expected {count}, and their target", len(self.views)
             )
         if self.covariance.shape != (12, 12):
             rows = len(self.covariance)
-            raise storage.refused(called, "covariance: expected 12 rows of 12", rows)
+            raise storage.invalid_data_error(called, "covariance: expected 12 rows of 12", rows)
 
     @property
     def target(self) -> Target | None:

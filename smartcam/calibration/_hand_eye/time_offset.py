@@ -16,7 +16,7 @@ import numpy as np
 from smartcam._argument_checks import a_number, of_class, takes
 from smartcam._extras import load
 from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
-from smartcam.calibration._hand_eye.equations import RobotPoses, carried, is_in_hand
+from smartcam.calibration._hand_eye.equations import RobotPoses, is_in_hand, predicted_views
 from smartcam.calibration._hand_eye.validation import seen_poses
 from smartcam.calibration._jackknife import jackknife
 from smartcam.calibration._plane.validation import check_positive
@@ -134,11 +134,13 @@ class _Moving:
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
-        robot, seen = self._robot(offset, index), self._views.taken(index)
+        robot, seen = self._robot(offset, index), self._views.subset(index)
         solution = solve_linear("shah", robot, seen)
         if solution is None:
             return math.inf
-        turn, shift = np.split(seen.after(carried(solution[0], robot, solution[1])), 2, axis=1)
+        turn, shift = np.split(
+            seen.steps_to(predicted_views(solution[0], robot, solution[1])), 2, axis=1
+        )
         squares = (shift**2).sum(axis=1) + self._arm**2 * (turn**2).sum(axis=1)
         return math.sqrt(float(squares.mean()))
 

@@ -1,7 +1,7 @@
 """Check whether a robot's poses and the views belong together, and find those that do not.
 
-A closed form finds camera and target from each of many small groups of poses. The answer that most
-of all poses agree with is taken, so a few poses that belong to other views do not spoil the rest.
+A closed form finds camera and target from each of many small groups of poses. The answer that fits
+most of all poses is used, so a few poses that belong to other views do not spoil the rest.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from smartcam.calibration._hand_eye.equations import (
     RobotPoses,
     RobotSigmas,
     Solution,
-    carried,
+    predicted_views,
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._views import as_list
@@ -101,46 +101,51 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     return poses_seen
 
 
-def extent(problem: Problem) -> float:
+def _target_extent(views: PixelObservations) -> float:
+    """Return the largest extent of the seen points along an axis of the target, metres."""
+    return float(np.ptp(views.points.reshape(-1, 3), axis=0).max())
+
+
+def meaningless_error(problem: Problem) -> float:
     """Return the error above which a calibration is meaningless, metres.
 
     It is the target's extent; without views it is half of the target's distance.
     """
     if isinstance(problem.seen, PixelObservations):
-        return float(np.ptp(problem.seen.points.reshape(-1, 3), axis=0).max())
+        return _target_extent(problem.seen)
     return 0.5 * float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
 
 
 def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
     """Return the RMS error on the target that a robot's noise causes, metres.
 
-    A turn is taken to move the target in proportion to its distance from the camera.
+    Assumes that a rotation moves the target in proportion to its distance from the camera.
     """
     distance = float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
     return math.sqrt(2.0) * math.hypot(sigmas.translation, sigmas.rotation * distance)
 
 
-def most_error(problem: Problem) -> float:
+def max_plausible_error(problem: Problem) -> float:
     """Return the error above which poses and views do not belong together, metres."""
-    return min(extent(problem), expected_error(problem, WORST_USABLE_ROBOT))
+    return min(meaningless_error(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
 def agreement(problem: Problem) -> Agreed | None:
-    """Return the motion that most of the poses agree with; None if no closed form finds one."""
-    # Least median over proposals of small parts: right as long as most of the poses are.
+    """Return camera and target that fit most of the poses; None if no closed form finds them."""
+    # Least median over proposals of small groups: right as long as most of the poses are.
     # Source: Rousseeuw, Least Median of Squares Regression (1984).
-    arm = extent(problem) if isinstance(problem.seen, PixelObservations) else 0.0
+    lever = _target_extent(problem.seen) if isinstance(problem.seen, PixelObservations) else 0.0
     best: Agreed | None = None
-    for numbers in _parts(problem.count):
-        best = _better(problem, numbers, arm, best)
+    for indices in _groups(problem.count):
+        best = _better(problem, indices, lever, best)
     if best is not None:
         agreeing = np.flatnonzero(best.off <= 3.0 * best.median)
-        best = _better(problem, agreeing, arm, best)
+        best = _better(problem, agreeing, lever, best)
     return best
 
 
-def _parts(count: int) -> Iterator[NDArray[np.intp]]:
-    """Yield the indices of all poses, then those of groups of poses, which are always the same."""
+def _groups(count: int) -> Iterator[NDArray[np.intp]]:
+    """Yield the indices of all poses, then those of groups, the same in every call."""
     yield np.arange(count)
     if count > POSES_PER_GROUP:
         random = np.random.default_rng(count)
@@ -149,40 +154,42 @@ def _parts(count: int) -> Iterator[NDArray[np.intp]]:
 
 
 def _better(
-    problem: Problem, numbers: NDArray[np.intp], arm: float, best: Agreed | None
+    problem: Problem, indices: NDArray[np.intp], lever: float, best: Agreed | None
 ) -> Agreed | None:
-    """Return the motion of some poses if all poses agree with it better than with ``best``."""
+    """Return camera and target from some poses if they fit all poses better than ``best``."""
     for name in CLOSED_FORMS:
-        motion = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
+        motion = solve_linear(name, problem.robot.subset(indices), problem.poses.subset(indices))
         if motion is None:
             continue
-        expected = carried(motion[0], problem.robot, motion[1])
-        tried = Agreed(*motion, _apart(problem.poses, expected, arm))
+        expected = predicted_views(motion[0], problem.robot, motion[1])
+        tried = Agreed(*motion, _apart(problem.poses, expected, lever))
         if best is None or tried.median < best.median:
             best = tried
     return best
 
 
-def _apart(poses: Rigid, expected: Rigid, arm: float) -> Array:
-    """Return the distances (V,) of poses from the expected ones, metres at an arm's length."""
-    turn, shift = np.split(poses.after(expected), 2, axis=1)
-    apart: Array = np.hypot(np.linalg.norm(shift, axis=1), arm * np.linalg.norm(turn, axis=1))
+def _apart(poses: Rigid, expected: Rigid, lever: float) -> Array:
+    """Return the distances (V,) of poses from the expected ones, metres at the lever's length."""
+    turn, shift = np.split(poses.steps_to(expected), 2, axis=1)
+    apart: Array = np.hypot(np.linalg.norm(shift, axis=1), lever * np.linalg.norm(turn, axis=1))
     return apart
 
 
-def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) -> NDArray[np.bool_]:
+def other_numbering(
+    robot: RobotPoses, poses: Rigid, turn: Rigid, lever: float
+) -> NDArray[np.bool_]:
     """Return a mask of views that number a target from its other end: at most half of them.
 
     The target looks the same after a half ``turn``, and each view alone may take either end for the
-    origin: the robot's motions show which one. ``arm``: the target's extent, metres.
+    origin: the robot's motions show which one. ``lever``: the target's extent, metres.
     """
     least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
-    for numbers, name in itertools.product(_parts(poses.size), CLOSED_FORMS):
-        solution = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
+    for indices, name in itertools.product(_groups(poses.size), CLOSED_FORMS):
+        solution = solve_linear(name, robot.subset(indices), poses.subset(indices))
         if solution is None:
             continue
-        expected = carried(solution[0], robot, solution[1])
-        as_is, turned = (_apart(seen, expected, arm) for seen in (poses, poses @ turn))
+        expected = predicted_views(solution[0], robot, solution[1])
+        as_is, turned = (_apart(seen, expected, lever) for seen in (poses, poses @ turn))
         middle = float(np.median(np.minimum(as_is, turned)))
         if middle < least:
             least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
@@ -190,7 +197,7 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
 
 
 def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
-    """Yield the poses in each other way that they may have been meant.
+    """Yield the poses in every other way that they may have been meant.
 
     Each item has the changed poses, the factor by which they must fit better, the error's code, and
     words for what they are then taken for, and for the mistake.
@@ -198,9 +205,9 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
     poses, in_hand = robot.poses, robot.in_hand
     how = "the other way round: they are inverted, or the camera is on the other side"
     yield RobotPoses(poses, not in_hand), MIN_INVERTED_FIT_RATIO, Code.WRONG_FRAME, how
-    turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
-    how = "with rotations transposed: their matrices or quaternions are those of the way back"
-    yield RobotPoses(turned, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how
+    transposed = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
+    how = "with rotations transposed: their matrices or quaternions are inverted rotations"
+    yield RobotPoses(transposed, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how
     mirrored = Rigid(X_MIRROR @ poses.rotation @ X_MIRROR, poses.translation @ X_MIRROR)
     how = "in a left-handed base: expected axes x, y, z of a right hand"
     yield RobotPoses(mirrored, in_hand), MIN_OTHER_FIT_RATIO, Code.MIRRORED, how
@@ -218,28 +225,28 @@ def check_poses(problem: Problem) -> Agreed:
     """
     as_given = agreement(problem)
     error = math.inf if as_given is None else _on_target(problem, as_given)
-    for robot, clear, code, how in _readings(problem.robot):
+    for robot, min_ratio, code, how in _readings(problem.robot):
         other = dataclasses.replace(problem, robot=robot)
         agreed = agreement(other)
         if agreed is None:
             continue
         less = _on_target(other, agreed)
-        if less < most_error(other) and error > clear * less:
-            so = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
+        if less < max_plausible_error(other) and error > min_ratio * less:
+            off = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
             raise code.refusal(
                 "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
-                f"poses that are {so} so, but {1e3 * less:.3g} mm when read {how}",
+                f"poses that are {off} as given, but {1e3 * less:.3g} mm when read {how}",
                 "T_base_flange",
                 less,
             )
-    most = most_error(problem)
+    most = max_plausible_error(problem)
     if as_given is None or error > most:
-        so = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
-        raise poor_fit(f"{so}, {1e3 * most:.3g} mm at most expected", error)
+        off = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
+        raise poor_fit_error(f"{off}, {1e3 * most:.3g} mm at most expected", error)
     return as_given
 
 
-def poor_fit(actual: str, error: float | None) -> CalibrationError:
+def poor_fit_error(actual: str, error: float | None) -> CalibrationError:
     """Return the error for poses and views that do not belong together.
 
     ``actual``: what was got instead. ``error``: error of the target, metres; None if
@@ -256,5 +263,5 @@ def poor_fit(actual: str, error: float | None) -> CalibrationError:
 
 def _on_target(problem: Problem, agreed: Agreed) -> float:
     """Return the median error of the points on the target, metres."""
-    solution = Solution(agreed.camera, agreed.target, np.zeros(problem.seen.extra))
+    solution = Solution(agreed.camera, agreed.target, np.zeros(problem.seen.extra_count))
     return float(np.median(np.concatenate(problem.errors(solution))))

@@ -121,7 +121,7 @@ class Bundle:
 
     def from_first(self, camera: int) -> Rigid:
         """Return the motion from the first camera's frame into that of a camera."""
-        return self.rig.taken(camera - 1) if camera else IDENTITY
+        return self.rig.subset(camera - 1) if camera else IDENTITY
 
     def moved(self, shared: Array, poses: Array) -> Bundle:
         """Return the bundle after steps of the shared unknowns (S,) and of the poses (P, 6)."""
@@ -145,7 +145,7 @@ class Bundle:
             np.linalg.pinv(basis) @ (lens_values(to) - lens_values(camera))
             for camera, to, basis in zip(self.cameras, other.cameras, self.basis, strict=True)
         ]
-        return np.concatenate([*lenses, *([] if self.rigid else self.rig.after(other.rig))])
+        return np.concatenate([*lenses, *([] if self.rigid else self.rig.steps_to(other.rig))])
 
 
 def known_lens(camera: CameraModel) -> Array:
@@ -268,7 +268,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
     poses = sorted({sight.pose for sight in sights})
     for pose in poses:
         sights_of_pose = [sight._replace(pose=0) for sight in sights if sight.pose == pose]
-        bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
+        bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.subset([pose]))
         equations = BundleEquations(bundle, sights_of_pose, adjusted.more, prior=False)
         at = equations.normal(bundle)
         part = at.reduced()
@@ -295,7 +295,7 @@ def _fitted_without(
     """Fit the cameras to all views but those of one pose, then this pose to its views."""
     others = [sight for sight in sights if sight.pose != pose]
     anew = adjust(adjusted.bundle, others, adjusted.more, SETTLED_REFIT_RATIO).bundle
-    without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
+    without = dataclasses.replace(anew, poses=adjusted.bundle.poses.subset([pose]))
     at = adjust(without.known(), sights_of_pose, adjusted.more).bundle.poses
     return dataclasses.replace(without, poses=at)
 
@@ -430,7 +430,7 @@ def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
     per_view = []
     for number, pose, view in sights:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]
-        in_camera = (bundle.from_first(number) @ bundle.poses.taken(pose)).apply(points)
+        in_camera = (bundle.from_first(number) @ bundle.poses.subset(pose)).apply(points)
         per_view.append(view.points - bundle.cameras[number].project(in_camera))
     return per_view
 

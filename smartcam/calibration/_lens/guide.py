@@ -136,7 +136,7 @@ def suggest_views(
     return [
         NextView(
             suggestions.texts[number],
-            Transform(CAMERA, TARGET, *suggestions.poses.taken(number)),
+            Transform(CAMERA, TARGET, *suggestions.poses.subset(number)),
             suggestions.outlines[number],
             float(means[number]),
             present,
@@ -234,7 +234,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     corners = (turned[good, :4] + shifts[good, None]).reshape(-1, 3)
     return CandidateViews(
         [_words(*ways[number], roll) for number in chosen],
-        poses.taken(chosen),
+        poses.subset(chosen),
         camera.project(corners).reshape(-1, 4, 2),
     )
 

@@ -102,7 +102,7 @@ class ViewFit(storage.Stored):
     transform: PoseInCamera
     residuals: Annotated[Array, storage.rows(storage.Pair, 2)]
     rms: storage.NonNegative
-    held_out: storage.Open
+    held_out: storage.NumberOrNaN
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,7 +132,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
 
     kind: ClassVar[str] = "camera"
     _called: ClassVar[str] = "calibration of cameras"
-    _others: ClassVar[storage.Others] = {
+    _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: calibration.views[0].view.target)
     }
 
@@ -141,7 +141,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     views: Annotated[tuple[ViewFit, ...], storage.AsList(1)]
     rms: storage.NonNegative
     sigma: storage.NonNegative
-    held_out: storage.Open
+    held_out: storage.NumberOrNaN
     coverage: Annotated[Coverage, BARS]
     sheet: storage.SheetOffsets | None
     warnings: storage.Remarks
@@ -506,7 +506,7 @@ def _view_fit(
         pose = locate(view, camera)
         transform, residuals, held_out = pose.transform, pose.residuals, pose.rms
     else:
-        transform = Transform(CAMERA, TARGET, *adjusted.bundle.poses.taken(place))
+        transform = Transform(CAMERA, TARGET, *adjusted.bundle.poses.subset(place))
         residuals = adjusted.residuals[place]
     return ViewFit(
         view=view,

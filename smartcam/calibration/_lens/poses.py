@@ -133,7 +133,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
 
 
 def _transform(fit: AdjustedBundle) -> Transform:
-    return Transform(CAMERA, TARGET, *fit.bundle.poses.taken(0))
+    return Transform(CAMERA, TARGET, *fit.bundle.poses.subset(0))
 
 
 def view_rms(residuals: Array) -> float:
@@ -247,7 +247,7 @@ def likeliest_poses(views: Sequence[TargetView], camera: CameraModel) -> Rigid:
 
 
 def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
-    poses = [pose.taken(0) for pose in plane_poses(view, camera)]
+    poses = [pose.subset(0) for pose in plane_poses(view, camera)]
     residuals = (camera.project(pose.apply(view.object_points)) - view.points for pose in poses)
     squares = [float(np.nan_to_num((pixels**2).sum(), nan=math.inf)) for pixels in residuals]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]

@@ -157,7 +157,7 @@ class PlaneCalibration(storage.SavedCalibration):
     place: Normalization
     unit_covariance: Annotated[Array, storage.matrix(12)]
     residuals: Annotated[Array, storage.rows(storage.Triple, 3, least=3)]
-    leave_one_out: Annotated[Array, storage.rows(storage.OpenTriple, 3, least=3, nulls=True)]
+    leave_one_out: Annotated[Array, storage.rows(storage.NullableTriple, 3, least=3, nulls=True)]
     freedom: storage.Count
     touch_sigma: storage.NonNegative | None
     sigma_given: bool
@@ -484,11 +484,11 @@ class PlaneCalibration(storage.SavedCalibration):
         names = ("robot_points", "weights", "residuals", "leave_one_out")
         storage.check_counts(fields, names, len(self.camera_points), called)
         if np.count_nonzero(self.weights) < 3:
-            raise storage.refused(
+            raise storage.invalid_data_error(
                 called, "weights: expected 3 that are not 0", self.weights.tolist()
             )
         if self.unit_covariance.shape != (12, 12):
-            raise storage.refused(called, "unit_covariance: expected rows of 12", None)
+            raise storage.invalid_data_error(called, "unit_covariance: expected rows of 12", None)
         _ = self._map  # refused here, not only when the first part comes
 
 

@@ -141,7 +141,7 @@ class PlaneMap:
             return
         w = points[:, :2] @ self.matrix[3, :2] + self.matrix[3, 2]
         if (w <= 0).any():
-            raise _behind_horizon(points[int(np.argmin(w)), :2].tolist())
+            raise _behind_horizon_error(points[int(np.argmin(w)), :2].tolist())
 
     def inverse(self, points: ArrayLike) -> Array:
         """Map robot points (N, 3), projected onto the plane, to the camera's (N, 2)."""
@@ -149,7 +149,7 @@ class PlaneMap:
         inside = (given - self.origin) @ self.frame[:, :2]
         seen = inside @ self._back[:, :2].T + self._back[:, 2]
         if (seen[:, 2] <= 0).any():
-            raise _behind_horizon(given[int(np.argmin(seen[:, 2]))].tolist())
+            raise _behind_horizon_error(given[int(np.argmin(seen[:, 2]))].tolist())
         with np.errstate(all="ignore"):
             image: Array = seen[:, :2] / seen[:, 2:]
         check_finite(image, "inverse")
@@ -176,7 +176,7 @@ class PlaneMap:
         for feature_id, quality, photo_index, pose in localizations:
             seen, (u, v, height), (qx, qy, qz, qw) = pose
             if height or qx or qy:
-                raise _out_of_plane(pose)
+                raise _out_of_plane_error(pose)
             if seen is not last:
                 header = _header(seen, robot_frame, camera_frame)
                 last = seen
@@ -187,7 +187,7 @@ class PlaneMap:
             if projective:
                 w = p * u + q * v + constant
                 if w <= 0:
-                    raise _behind_horizon([u, v])
+                    raise _behind_horizon_error([u, v])
                 x, y = x / w, y / w
                 turned = p * direction_u + q * direction_v
                 along, across = along - x * turned, across - y * turned
@@ -267,7 +267,7 @@ def _header(seen: Header, robot_frame: str, camera_frame: str | None) -> Header:
     return header
 
 
-def _out_of_plane(pose: Pose) -> CalibrationError:
+def _out_of_plane_error(pose: Pose) -> CalibrationError:
     return Code.OUT_OF_PLANE.refusal(
         "expected a pose in the camera's plane (z = 0, turned about z only), "
         f"got {tuple(pose.position)} turned by {tuple(pose.orientation)}",
@@ -276,7 +276,7 @@ def _out_of_plane(pose: Pose) -> CalibrationError:
     )
 
 
-def _behind_horizon(point: list[float]) -> CalibrationError:
+def _behind_horizon_error(point: list[float]) -> CalibrationError:
     return Code.OUT_OF_FIELD.refusal(
         f"expected points that the camera can see of the plane, got {point}: behind its horizon",
         "a point before the horizon",

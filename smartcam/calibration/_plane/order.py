@@ -74,7 +74,7 @@ class Reordered(NamedTuple):
         moved = [int(numbers[i]) for i in self.moved]
         which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
         how = "exchanged" if len(moved) == 2 else "in the wrong order"
-        several = "" if self.sure else "; more than one order does as well: touch them anew"
+        several = "" if self.sure else "; more than one order does as well: touch them again"
         return Code.WRONG_ORDER.remark(
             f"the touches of points {which} look {how}: as given they speak of a touch with a "
             f"sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{several}"

@@ -189,7 +189,7 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     ]
     layout = min(layouts, key=lambda layout: layout.excess)
     if layout.excess > 0:
-        raise _too_small(target, page, layout)
+        raise _page_too_small_error(target, page, layout)
     moved = (_moved(shape, *layout.origin) for shape in pattern)
     return Sheet(
         target=target,
@@ -200,7 +200,7 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     )
 
 
-def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> CalibrationError:
+def _page_too_small_error(target: Target | Rays, page: str, layout: PageLayout) -> CalibrationError:
     needed = (layout.needed_width, layout.needed_height)
     size = (layout.width, layout.height)
     over = [

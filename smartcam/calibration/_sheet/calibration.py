@@ -87,7 +87,7 @@ class SheetCalibration(storage.SavedCalibration):
     _called: ClassVar[str] = "sheet's calibration"
     _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
     _later: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
-    _others: ClassVar[storage.Others] = {
+    _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: calibration.view.target),
         "camera": (CameraModel | None, lambda calibration: calibration.sheet.camera),
         "matrix": (storage.Matrix3, lambda calibration: calibration.sheet.matrix),
@@ -109,12 +109,12 @@ class SheetCalibration(storage.SavedCalibration):
     def _read(cls, fields: dict[str, Any], context: storage.Context) -> SheetCalibration:
         matrix, covariance = fields["matrix"], fields["covariance"]
         if covariance.shape != (9, 9):
-            raise storage.refused(
+            raise storage.invalid_data_error(
                 context["called"], "covariance: expected 9 rows of 9", len(covariance)
             )
         if abs(np.linalg.det(matrix)) == 0.0:
             text = "matrix: expected one that can be inverted"
-            raise storage.refused(context["called"], text, matrix.tolist())
+            raise storage.invalid_data_error(context["called"], text, matrix.tolist())
         fields["sheet"] = SheetPlane(fields["view"].size, matrix, covariance, fields["camera"])
         return super()._read(fields, context)
 

@@ -218,7 +218,7 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     flat = view.object_points[:, :2]
     start = fit_homography(flat, view.points)
     if start is None or not math.isfinite(float(np.abs(start).sum())):
-        raise _no_fit(view)
+        raise _no_fit_error(view)
     if camera is None:
         return _by_homography(view, start)
     pose = locate(view, camera)
@@ -292,7 +292,7 @@ def _scaling(points: Array) -> Array:
     return np.array([[factor, 0, -factor * middle[0]], [0, factor, -factor * middle[1]], [0, 0, 1]])
 
 
-def _no_fit(view: TargetView) -> CalibrationError:
+def _no_fit_error(view: TargetView) -> CalibrationError:
     return Code.POOR_FIT.refusal(
         f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
         "a plane in front of the camera",

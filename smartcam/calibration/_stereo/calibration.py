@@ -83,9 +83,9 @@ class PairFit(storage.Stored):
     right: TargetView | None
     used: Annotated[tuple[bool, bool], storage.row(tuple[bool, bool])]
     transform: PoseInLeft | None
-    rms: storage.OpenPair
-    held_out: storage.Open
-    epipolar: storage.Open
+    rms: storage.PairOrNaN
+    held_out: storage.NumberOrNaN
+    epipolar: storage.NumberOrNaN
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,7 +117,7 @@ class StereoCalibration(storage.SavedCalibration):
 
     kind: ClassVar[str] = "stereo"
     _called: ClassVar[str] = "calibration of cameras"
-    _others: ClassVar[storage.Others] = {
+    _extra_keys: ClassVar[storage.ExtraKeys] = {
         "target": (storage.StoredTarget, lambda calibration: _target(calibration))
     }
 
@@ -129,8 +129,8 @@ class StereoCalibration(storage.SavedCalibration):
     rms: storage.NonNegative
     sigma: storage.NonNegative
     epipolar: storage.NonNegative
-    held_out: storage.Open
-    held_out_epipolar: storage.Open
+    held_out: storage.NumberOrNaN
+    held_out_epipolar: storage.NumberOrNaN
     sheet: storage.SheetOffsets | None
     warnings: storage.Remarks
 
@@ -436,7 +436,7 @@ def _held_out(solution: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairEr
 
 def _cameras(bundle: Bundle) -> CameraPair:
     left, right = bundle.cameras
-    return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.taken(0)))
+    return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.subset(0)))
 
 
 def _summary(solution: _Found, sheet: Sheet) -> StereoCalibration:
@@ -473,7 +473,7 @@ def _pair(solution: _Found, number: int, without: Mapping[int, PairErrors]) -> P
         for sight, residuals in zip(solution.sights, solution.adjusted.residuals, strict=True)
         if sight.pose == number
     }
-    pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.taken(number))
+    pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.subset(number))
     left, right = solution.moments[number]
     errors = without.get(number)
     return PairFit(

@@ -140,9 +140,9 @@ def _checked(
 ) -> tuple[int, int]:
     """Return the size of the output."""
     if not (math.isfinite(alpha) and 0.0 <= alpha <= 1.0):
-        raise _shape("alpha", "0 to 1", alpha)
+        raise _shape_error("alpha", "0 to 1", alpha)
     if left.distortion_model != right.distortion_model:
-        raise _shape("lenses", f"two of {left.distortion_model}", right.distortion_model)
+        raise _shape_error("lenses", f"two of {left.distortion_model}", right.distortion_model)
     if tuple(left.size) != tuple(right.size):
         raise Code.WRONG_SIZE.refusal(
             f"rectify: expected images of one size, {left.size[0]} x {left.size[1]}, got "
@@ -152,11 +152,11 @@ def _checked(
         )
     width, height = size or left.size
     if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
-        raise _shape("size", f"1 to {MAX_PIXELS} pixels", (width, height))
+        raise _shape_error("size", f"1 to {MAX_PIXELS} pixels", (width, height))
     return int(width), int(height)
 
 
-def _shape(label: str, expected: str, actual: object) -> CalibrationError:
+def _shape_error(label: str, expected: str, actual: object) -> CalibrationError:
     return Code.SHAPE.unexpected(f"rectify: {label}: expected {expected}", expected, actual)
 
 

@@ -149,7 +149,7 @@ def _side(
         adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
     poses: list[Rigid | None] = [None] * len(moments)
     for place, number in enumerate(seen):
-        poses[number] = adjusted.bundle.poses.taken(place)
+        poses[number] = adjusted.bundle.poses.subset(place)
     return adjusted.bundle.cameras[0], poses
 
 

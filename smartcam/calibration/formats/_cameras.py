@@ -32,7 +32,7 @@ from smartcam.calibration.formats._plain import (
     known,
     lens_matrix,
     load_yaml,
-    malformed,
+    malformed_error,
     mapping,
     matrix_rows,
     quoted,
@@ -154,7 +154,7 @@ def read_cameras(
     if extrinsics is None:
         return wanted.read(path, size, unit=unit)
     if form != "opencv":
-        raise _cannot(form, "one file", "extrinsics as well")
+        raise _unsupported_error(form, "one file", "extrinsics as well")
     with Path(extrinsics).open("rb") as stream:
         more = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
     return wanted.read(path, size, more, unit=unit)
@@ -253,13 +253,13 @@ def parse_camera_info(text: str, size: tuple[int, int] | None = None) -> CameraI
     camera = _camera(_size(stated, size), matrix, coefficients, model)
     name = data.get("camera_name", "camera")
     if not isinstance(name, str):
-        raise malformed("camera_name", "a text", name)
+        raise malformed_error("camera_name", "a text", name)
     return CameraInfo(camera, name, rectification, projection)
 
 
 def _compose_one(chain: CameraChain) -> str:
     if len(chain.cameras) != 1:
-        raise _cannot("camera_info", "one camera", f"{len(chain.cameras)}")
+        raise _unsupported_error("camera_info", "one camera", f"{len(chain.cameras)}")
     return compose_camera_info(chain.cameras[0], chain.names[0])
 
 
@@ -301,9 +301,11 @@ def compose_camchain(chain: CameraChain) -> str:
 def _of_kalibr(camera: CameraModel) -> Array:
     """Return the coefficients that Kalibr has."""
     if camera.distortion_model not in _KALIBR:
-        raise _cannot("kalibr", " or ".join(_KALIBR), camera.distortion_model)
+        raise _unsupported_error("kalibr", " or ".join(_KALIBR), camera.distortion_model)
     if camera.distortion[_RADTAN:].any():
-        raise _cannot("kalibr", "k3 = 0 (calibrate with fixed=['k3'])", f"{camera.distortion[4]:g}")
+        raise _unsupported_error(
+            "kalibr", "k3 = 0 (calibrate with fixed=['k3'])", f"{camera.distortion[4]:g}"
+        )
     return camera.distortion[:_RADTAN]
 
 
@@ -334,12 +336,12 @@ def compose_opencv(chain: CameraChain) -> str:
             + storage_matrix("distortion_coefficients", first.distortion[:, None])
         )
     if len(chain.cameras) > len(_MATRICES):
-        raise _cannot("opencv", "one camera or two", f"{len(chain.cameras)}")
+        raise _unsupported_error("opencv", "one camera or two", f"{len(chain.cameras)}")
     alike, *others = (
         f"{camera.size} pixels and {camera.distortion_model}" for camera in chain.cameras
     )
     if any(other != alike for other in others):
-        raise _cannot("opencv", f"cameras of {alike}", others[0])
+        raise _unsupported_error("opencv", f"cameras of {alike}", others[0])
     motion = chain.transforms[0]
     return (
         head
@@ -379,7 +381,7 @@ def parse_opencv(
         return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")
     cameras = tuple(_opencv_camera(data, size, end) for end in sides)
     if not {"r", "t"} <= data.keys():
-        raise malformed(
+        raise malformed_error(
             "file",
             "R and T from the first camera to the second; where they are in a file of their own, "
             'as OpenCV\'s extrinsics.yml, give it as extrinsics="extrinsics.yml"',
@@ -387,7 +389,7 @@ def parse_opencv(
         )
     rotation, shift = stored_matrix(data["r"], "R", (3, 3)), stored_matrix(data["t"], "T").ravel()
     if len(shift) != 3:
-        raise malformed("T", "3 numbers", str(len(shift)))
+        raise malformed_error("T", "3 numbers", str(len(shift)))
     rows = [*np.column_stack([rotation, shift]), [0.0, 0.0, 0.0, 1.0]]
     motion = rigid("right", "left", rows, "R")
     chain = CameraChain(cameras=cameras, transforms=(motion,), names=("left", "right"))
@@ -406,7 +408,7 @@ def _normal(data: Plain) -> dict[str, Plain]:
     for name, value in mapping(data, "file").items():
         key = name.lower().replace("_", "")
         if key in normal:
-            raise malformed("file", "each name once", name)
+            raise malformed_error("file", "each name once", name)
         normal[key] = value
     return normal
 
@@ -420,7 +422,7 @@ def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> C
     for names in (_MATRIX, _BENT):
         if _first(data, names, end) is None:
             expected = f"{names[0]}{end} (or {', '.join(f'{name}{end}' for name in names[1:])})"
-            raise malformed("file", expected, ", ".join(data))
+            raise malformed_error("file", expected, ", ".join(data))
     matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
     coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()
     name = data.get("distortionmodel")
@@ -455,9 +457,9 @@ def _foreign(
     ) -> CameraChain | Measured[CameraChain]:
         lenses, transforms, unit = parse(text)
         if not 1 <= len(lenses) <= foreign.MAX_CAMERAS:
-            raise malformed("file", f"1 to {foreign.MAX_CAMERAS} cameras", str(len(lenses)))
+            raise malformed_error("file", f"1 to {foreign.MAX_CAMERAS} cameras", str(len(lenses)))
         if len(transforms) != len(lenses) - 1:
-            raise malformed("file", "one camera, since it has no poses", str(len(lenses)))
+            raise malformed_error("file", "one camera, since it has no poses", str(len(lenses)))
         cameras = []
         for lens in lenses:
             matrix, size = lens_matrix(*lens.focal), _size(lens.size or [], given)
@@ -483,7 +485,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
 """Formats of cameras by their names."""
 
 
-def _cannot(form: str, expected: str, actual: str) -> CalibrationError:
+def _unsupported_error(form: str, expected: str, actual: str) -> CalibrationError:
     return Code.SHAPE.unexpected(
         f"{form}: expected {expected}, which is all it can hold", expected, actual
     )
@@ -517,7 +519,7 @@ def _model(name: Plain, coefficients: Array) -> DistortionModel:
             return model
     if not len(coefficients) and name in {"", "none"}:
         return "plumb_bob"
-    raise malformed("distortion_model", ", ".join(COEFFICIENTS), name)
+    raise malformed_error("distortion_model", ", ".join(COEFFICIENTS), name)
 
 
 def _camera(

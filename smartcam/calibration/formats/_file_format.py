@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 import numpy as np
 
 from smartcam.calibration._files.store import replace_file
-from smartcam.calibration._units import check_length, metres_of, no_unit
-from smartcam.calibration.formats._plain import malformed
+from smartcam.calibration._units import check_length, metres_of, no_unit_error
+from smartcam.calibration.formats._plain import malformed_error
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Code
@@ -72,11 +72,11 @@ class Format(Generic[T]):
             body = stream.read(self.most + 1)
         try:
             if len(body) > self.most:
-                raise malformed("file", f"{self.most} bytes at most")
+                raise malformed_error("file", f"{self.most} bytes at most")
             try:
                 text = body.decode("utf-8-sig")
             except UnicodeDecodeError as exc:
-                raise malformed("file", f"UTF-8 ({exc.reason} at byte {exc.start})") from exc
+                raise malformed_error("file", f"UTF-8 ({exc.reason} at byte {exc.start})") from exc
             return self._in_metres(self.parse(text, *given), unit)
         except CalibrationError as exc:
             raise CalibrationError(
@@ -91,7 +91,7 @@ class Format(Generic[T]):
         if not motions:
             return value
         if unit is None and stated is None:
-            raise no_unit("lengths")
+            raise no_unit_error("lengths")
         factor = metres_of(unit or stated or "m", "lengths")
         if unit is None and not by_file:
             for motion in motions:

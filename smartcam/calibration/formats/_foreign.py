@@ -25,7 +25,7 @@ from smartcam.calibration.formats._plain import (
     lens_matrix,
     load_json,
     load_yaml,
-    malformed,
+    malformed_error,
     mapping,
     matrix_of,
     number,
@@ -119,12 +119,12 @@ def _lens(
     """Return a lens from its parameters, which are in the order of the program's model."""
     models = MODELS[program]
     if not (isinstance(name, str) and name in models):
-        raise malformed(f"{where}: lens model", f"one of {', '.join(models)}", name)
+        raise malformed_error(f"{where}: lens model", f"one of {', '.join(models)}", name)
     wanted = models[name]
     names = [*wanted.focal.split(), *wanted.coefficients.split()]
     if len(values) != len(names):
         expected = f"{len(names)} parameters of {name} ({', '.join(names)})"
-        raise malformed(where, expected, f"{len(values)}")
+        raise malformed_error(where, expected, f"{len(values)}")
     given = dict(zip(names, values, strict=True))
     fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
     coefficients = {name: given[name] for name in wanted.coefficients.split()}
@@ -155,7 +155,7 @@ def parse_camchain(text: str) -> Found:
     data = mapping(load_yaml(text), "file", ["cam0"])
     names = [f"cam{place}" for place in range(sum(key.startswith("cam") for key in data))]
     if len(names) > MAX_CAMERAS:
-        raise malformed("file", f"{MAX_CAMERAS} cameras at most", str(len(names)))
+        raise malformed_error("file", f"{MAX_CAMERAS} cameras at most", str(len(names)))
     lenses, motions = [], []
     for name, before in zip(names, ["", *names], strict=False):
         part = mapping(mapping(data, "file", names)[name], name, _PINHOLE_OF_KALIBR)
@@ -173,7 +173,7 @@ _PINHOLE_OF_KALIBR: Final = ("camera_model", "intrinsics", "distortion_model", "
 def _pinhole(program: str, part: dict[str, Plain], where: str, coefficients: str) -> ForeignLens:
     """Return a lens from Kalibr's keys; EuRoC's are the same except for one."""
     if part["camera_model"] != "pinhole":
-        raise malformed(f"{where}.camera_model", "pinhole", part["camera_model"])
+        raise malformed_error(f"{where}.camera_model", "pinhole", part["camera_model"])
     values = reals(part["intrinsics"], f"{where}.intrinsics", 4)
     values += reals(part[coefficients], f"{where}.{coefficients}")
     size = sequence(part["resolution"], "resolution", 2) if "resolution" in part else None
@@ -188,7 +188,7 @@ def parse_colmap(text: str) -> Found:
         if not words or words[0].startswith("#"):
             continue
         if len(words) < 5:
-            raise malformed("camera", "an id, a model, width, height and parameters", line)
+            raise malformed_error("camera", "an id, a model, width, height and parameters", line)
         values = [number(word, f"camera {words[0]}") for word in words[4:]]
         lens = _lens("colmap", words[1], values, f"camera {words[0]}", words[2:4])
         fx, fy, cx, cy = lens.focal
@@ -203,7 +203,7 @@ def parse_mrcal(text: str) -> Found:
     """
     text = re.sub(r"^ *'optimization_inputs': b'.*$", "", text, flags=re.MULTILINE)
     if len(text) > MAX_YAML_BYTES:
-        raise malformed("file", f"{MAX_YAML_BYTES} bytes at most beside the solver's inputs")
+        raise malformed_error("file", f"{MAX_YAML_BYTES} bytes at most beside the solver's inputs")
     data = mapping(load_yaml(text), "file", ["lensmodel", "intrinsics", "imagersize"])
     values = reals(data["intrinsics"], "intrinsics")
     size = sequence(data["imagersize"], "imagersize", 2)
@@ -223,7 +223,7 @@ def parse_ros_ini(text: str) -> Found:
         elif re.fullmatch(r"[a-z ]+", line):
             title = line
             if title in sections:
-                raise malformed("file", "one camera", f"{title!r} twice")
+                raise malformed_error("file", "one camera", f"{title!r} twice")
             sections[title] = []
         else:
             sections.setdefault(title, []).extend(line.split())
@@ -239,7 +239,9 @@ def _focal(matrix: np.ndarray[Any, Any]) -> list[float]:
     """Return fx, fy, cx and cy of a (3, 3) matrix; raise MALFORMED if it is no lens' matrix."""
     focal = [float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
     if (matrix != lens_matrix(*focal)).any():
-        raise malformed("camera matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist())
+        raise malformed_error(
+            "camera matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", matrix.tolist()
+        )
     return focal
 
 
@@ -305,7 +307,9 @@ def parse_multical(text: str) -> Found:
         seen[camera] = rigid(camera, "rig", [*rows, [0.0, 0.0, 0.0, 1.0]], name)
     missing = [lens.name for lens in lenses if lens.name not in seen]
     if missing:
-        raise malformed("camera_poses", "a pose of each camera", f"none of {', '.join(missing)}")
+        raise malformed_error(
+            "camera_poses", "a pose of each camera", f"none of {', '.join(missing)}"
+        )
     order = [seen[lens.name] for lens in lenses]
     return lenses, [b @ a.inverse() for a, b in itertools.pairwise(order)], None
 
@@ -322,7 +326,7 @@ def parse_bare(text: str, target: str, source: str) -> Measured[Transform]:
     lines = [line.partition("#")[0] for line in text.splitlines()]
     words = re.sub(r"[\[\],;]", " ", " ".join(lines)).split()
     if len(words) != 16:
-        raise malformed("matrix", "16 numbers: four rows of four", f"{len(words)}")
+        raise malformed_error("matrix", "16 numbers: four rows of four", f"{len(words)}")
     values = np.reshape([number(word, "matrix") for word in words], (4, 4))
     return Measured(rigid(target, source, values, "matrix"))
 

@@ -19,7 +19,7 @@ from smartcam.calibration.formats._plain import (
     flag,
     frame_name,
     load_yaml,
-    malformed,
+    malformed_error,
     mapping,
     numbers,
     placed,
@@ -56,7 +56,7 @@ def parse_easy_handeye2(text: str) -> Transform:
     ]
     kind = parameters["calibration_type"]
     if kind not in _TYPES:
-        raise malformed("parameters.calibration_type", " or ".join(_TYPES), kind)
+        raise malformed_error("parameters.calibration_type", " or ".join(_TYPES), kind)
     return _camera(parameters, pose, in_hand=_TYPES[kind])
 
 

@@ -16,7 +16,7 @@ from smartcam.calibration.formats._plain import (
     flow,
     frame_name,
     load_yaml,
-    malformed,
+    malformed_error,
     mapping,
     matrix_rows,
     quoted,
@@ -42,7 +42,7 @@ def load_storage(text: str) -> Plain:
         return load_yaml(text)
     root = load_xml(text.strip())
     if root.tag != "opencv_storage":
-        raise malformed("file", "<opencv_storage>", f"<{root.tag}>")
+        raise malformed_error("file", "<opencv_storage>", f"<{root.tag}>")
     return storage_data(root)
 
 
@@ -98,7 +98,7 @@ def parse_matrix(text: str) -> PlaneMatrix:
     data = mapping(load_yaml(text), "file", [*names, "rows", "cols", "data"])
     for name in names:
         if not isinstance(data[name], str):
-            raise malformed(name, "a text", data[name])
+            raise malformed_error(name, "a text", data[name])
     matrix = stored_matrix(data, "matrix", (4, 3))
     if np.linalg.matrix_rank(matrix) < 3:
         raise Code.COLLINEAR.unexpected("matrix: expected one of rank 3", got=matrix.tolist())
@@ -134,7 +134,7 @@ def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
         if isinstance(entry, dict) and (entry.get("rows"), entry.get("cols")) == ("4", "4")
     ]
     if len(names) != 1:
-        raise malformed("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")
+        raise malformed_error("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")
     rows = stored_matrix(data[names[0]], names[0], (4, 4))
     frames = [
         frame_name(data.get(key, given), key)

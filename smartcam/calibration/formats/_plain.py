@@ -56,7 +56,7 @@ _MAX_EXACT_DEVIATION = 1e-6
 same bound."""
 
 
-def malformed(label: str, expected: str, actual: object = None) -> CalibrationError:
+def malformed_error(label: str, expected: str, actual: object = None) -> CalibrationError:
     """Return the error for a text that does not have its format; ``actual`` is shortened."""
     shown = None if actual is None else _cut(actual)
     text = f"{label}: expected {expected}" + ("" if shown is None else f", got {shown}")
@@ -96,7 +96,7 @@ def load_json(text: str) -> Plain:
     try:
         return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as exc:
-        raise malformed("file", f"JSON ({exc})") from exc
+        raise malformed_error("file", f"JSON ({exc})") from exc
 
 
 def load_yaml(text: str) -> Plain:
@@ -111,7 +111,7 @@ def load_yaml(text: str) -> Plain:
         root = compose(text, label="reading YAML")
         return None if root is None else _plain(root, set(), 0)
     except BadYamlError as exc:
-        raise malformed("file", f"YAML ({_cut(str(exc))})") from exc
+        raise malformed_error("file", f"YAML ({_cut(str(exc))})") from exc
 
 
 def _plain(node: Any, seen: set[int], depth: int) -> Plain:
@@ -119,7 +119,7 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
     if node.id == "scalar":
         return str(node.value)
     if id(node) in seen or depth >= MAX_DEPTH:
-        raise malformed(line, f"no alias, and at most {MAX_DEPTH} lists in lists")
+        raise malformed_error(line, f"no alias, and at most {MAX_DEPTH} lists in lists")
     seen.add(id(node))
     if node.id == "sequence":
         return [_plain(item, seen, depth + 1) for item in node.value]
@@ -127,7 +127,7 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
     for key, value in node.value:
         name = str(key.value) if key.id == "scalar" else ""
         if not name or name in plain:
-            raise malformed(line, "keys that are texts, each once", name)
+            raise malformed_error(line, "keys that are texts, each once", name)
         plain[name] = _plain(value, seen, depth + 1)
     return plain
 
@@ -135,11 +135,11 @@ def _plain(node: Any, seen: set[int], depth: int) -> Plain:
 def mapping(value: Plain, where: str, keys: Sequence[str] = ()) -> dict[str, Plain]:
     """Return a value that must be a mapping with these keys; it may have others."""
     if not isinstance(value, dict):
-        raise malformed(where, "a mapping", value)
+        raise malformed_error(where, "a mapping", value)
     fields = cast("dict[str, Plain]", value)
     missing = [key for key in keys if key not in fields]
     if missing:
-        raise malformed(where, f"the keys {', '.join(keys)}", ", ".join(fields) or "none")
+        raise malformed_error(where, f"the keys {', '.join(keys)}", ", ".join(fields) or "none")
     return fields
 
 
@@ -147,7 +147,7 @@ def sequence(value: Plain, where: str, count: int | None = None) -> list[Plain]:
     """Return a value that must be a list, of ``count`` items if that is given."""
     items: list[Plain] | None = value if isinstance(value, list) else None
     if items is None or count not in {None, len(items)}:
-        raise malformed(where, "a list" if count is None else f"a list of {count}", value)
+        raise malformed_error(where, "a list" if count is None else f"a list of {count}", value)
     return items
 
 
@@ -161,7 +161,7 @@ def number(value: Plain, where: str) -> float:
     if len(text) <= _MAX_SHOWN and _NUMBER.fullmatch(text):
         read = float(text)
     if read is None:
-        raise malformed(where, "a number", value)
+        raise malformed_error(where, "a number", value)
     if not abs(read) <= MAX_NUMBER:
         raise Code.NOT_FINITE.refusal(
             f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_cut(text)}",
@@ -187,16 +187,16 @@ def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None
     data = mapping(value, where, ["rows", "cols", "data"])
     rows, cols = (whole(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
     if shape is not None and shape != (rows, cols):
-        raise malformed(where, f"{shape[0]} rows and {shape[1]} cols", f"{rows} {cols}")
+        raise malformed_error(where, f"{shape[0]} rows and {shape[1]} cols", f"{rows} {cols}")
     return np.array(reals(data["data"], where, rows * cols)).reshape(rows, cols)
 
 
 def whole(value: Plain, where: str, least: int = 1) -> int:
     """Return a whole number of pixels, rows or columns."""
     if not (isinstance(value, str) and value.isdecimal() and len(value) < 8):
-        raise malformed(where, "a whole number", value)
+        raise malformed_error(where, "a whole number", value)
     if not least <= int(value) <= MAX_SIDE:
-        raise malformed(where, f"{least} to {MAX_SIDE}", value)
+        raise malformed_error(where, f"{least} to {MAX_SIDE}", value)
     return int(value)
 
 
@@ -212,7 +212,7 @@ def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
     """
     fields = mapping(value, where, keys)
     if len(fields) != len(keys):
-        raise malformed(where, f"the keys {', '.join(keys)} alone", ", ".join(fields))
+        raise malformed_error(where, f"the keys {', '.join(keys)} alone", ", ".join(fields))
     return [number(fields[key], f"{where}.{key}") for key in keys]
 
 
@@ -220,7 +220,7 @@ def flag(value: Plain, where: str) -> bool:
     """Return a truth value."""
     truth = _FLAGS.get(value.lower()) if isinstance(value, str) else None
     if truth is None:
-        raise malformed(where, "true or false", value)
+        raise malformed_error(where, "true or false", value)
     return truth
 
 
@@ -248,7 +248,9 @@ def rigid(
     """
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
-        raise malformed(where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3]))
+        raise malformed_error(
+            where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3])
+        )
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if _MAX_EXACT_DEVIATION <= error < _MAX_PRINTED_DEVIATION:

@@ -25,7 +25,7 @@ from smartcam.calibration.formats._plain import (
     block,
     frame_name,
     load_yaml,
-    malformed,
+    malformed_error,
     mapping,
     number,
     numbers,
@@ -67,7 +67,7 @@ def parse_arguments(text: str) -> Transform:
     try:
         words = shlex.split(text, comments=True)
     except ValueError as exc:
-        raise malformed("arguments", f"words as on a command line ({exc})") from exc
+        raise malformed_error("arguments", f"words as on a command line ({exc})") from exc
     return _from_words(words)
 
 
@@ -88,7 +88,7 @@ def _from_launch(text: str) -> str:
         if _COMMAND in (node.get("type"), node.get("exec")) and "args" in node
     ]
     if len(arguments) != 1:
-        raise malformed("launch file", f"one node of type {_COMMAND}", str(len(arguments)))
+        raise malformed_error("launch file", f"one node of type {_COMMAND}", str(len(arguments)))
     return arguments[0]
 
 
@@ -97,7 +97,7 @@ def _from_python(text: str) -> list[str]:
     try:
         tree = ast.parse(text)
     except (SyntaxError, ValueError, MemoryError, RecursionError) as exc:
-        raise malformed("launch file", f"Python ({exc})") from exc
+        raise malformed_error("launch file", f"Python ({exc})") from exc
     calls = [
         {keyword.arg: keyword.value for keyword in node.keywords}
         for node in ast.walk(tree)
@@ -111,11 +111,15 @@ def _from_python(text: str) -> list[str]:
         and getattr(call["executable"], "value", None) == _COMMAND
     ]
     if len(arguments) != 1:
-        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(arguments)))
+        raise malformed_error(
+            "launch file", f"one Node of executable {_COMMAND}", str(len(arguments))
+        )
     try:
         words = ast.literal_eval(arguments[0])
     except (ValueError, TypeError, MemoryError, RecursionError) as exc:
-        raise malformed("arguments", "texts and numbers, no variables or calls", "others") from exc
+        raise malformed_error(
+            "arguments", "texts and numbers, no variables or calls", "others"
+        ) from exc
     return [str(word) for word in sequence(words, "arguments")]
 
 
@@ -134,7 +138,7 @@ def parse_urdf(text: str, target: str, source: str) -> Transform:
         (names,) = joints
     if names not in joints:
         joints_text = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
-        raise malformed("file", f"a joint of parent {target} and child {source}", joints_text)
+        raise malformed_error("file", f"a joint of parent {target} and child {source}", joints_text)
     given = next((origin.attrib for origin in joints[names].iter("origin")), {})
     place, turn = (
         reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
@@ -147,11 +151,11 @@ def _from_options(words: Sequence[str]) -> Transform:
     given: dict[str, str] = {}
     for option, value in zip(words[::2], [*words[1::2], None], strict=False):
         if option not in options or option in given or value is None:
-            raise malformed("arguments", f"options {', '.join(options)}, each once", option)
+            raise malformed_error("arguments", f"options {', '.join(options)}, each once", option)
         given[option] = value
     missing = [frame for frame in _FRAMES if frame not in given]
     if missing or (given.keys() & _QUATERNION and given.keys() & _ANGLES):
-        raise malformed(
+        raise malformed_error(
             "arguments",
             f"{' and '.join(_FRAMES)}, and a quaternion or angles, not both",
             " ".join(given),
@@ -173,7 +177,7 @@ def _values(defaults: dict[str, float], given: dict[str, str]) -> list[float]:
 def _from_positions(words: Sequence[str]) -> Transform:
     count = len(words)
     if count not in {8, 9, 10}:
-        raise malformed(
+        raise malformed_error(
             "arguments",
             "x y z, qx qy qz qw or yaw pitch roll, frame, child, and perhaps a period",
             f"{count} words",
@@ -183,7 +187,7 @@ def _from_positions(words: Sequence[str]) -> Transform:
     if count == 9:
         angles = not _is_number(words[6])
         if angles != _is_number(words[8]):
-            raise malformed(
+            raise malformed_error(
                 "arguments",
                 "a quaternion and two frames, or three angles, two frames and a period",
                 " ".join(words[6:]),
@@ -251,7 +255,7 @@ def parse_pose(text: str, target: str, source: str) -> Transform:
     where = "pose"
     if not data.keys() & set(POSE):
         if len(data) != 1:
-            raise malformed("file", "one pose", ", ".join(data) or "none")
+            raise malformed_error("file", "one pose", ", ".join(data) or "none")
         ((where, data),) = data.items()
     pose = numbers(data, where, POSE)
     return placed(target, source, pose)

@@ -1,7 +1,7 @@
 """Read and write MoveIt's samples of a hand-eye calibration: poses of hand and object.
 
 The tests of MoveIt's solver have JSON, a list of pairs of (4, 4) matrices; its panel saves YAML, a
-list of mappings to 16 numbers, row by row.
+list of mappings, each value a list of the 16 numbers of a matrix, row by row.
 
 Source: github.com/moveit/moveit_calibration, ``pose_samples.json`` and
 ``handeye_control_widget.cpp`` (published).
@@ -93,16 +93,19 @@ def compose_yaml(samples: Sequence[HandEyeSample]) -> str:
 
 
 def _check(samples: Sequence[HandEyeSample]) -> None:
-    same_frames([sample.hand for sample in samples])
-    same_frames([sample.seen for sample in samples])
+    for name in HandEyeSample._fields:
+        check_same_frames([getattr(sample, name) for sample in samples], f"sample {{}}, {name}")
 
 
-def same_frames(transforms: Sequence[Transform]) -> None:
-    """Raise ``WRONG_FRAME`` unless all are between the same frames, which the file cannot name."""
+def check_same_frames(transforms: Sequence[Transform], label: str) -> None:
+    """Raise ``WRONG_FRAME`` unless all are between the same frames, which the file cannot name.
+
+    ``label``: a transform's name in the error, with ``{}`` for its number.
+    """
     for index, transform in enumerate(transforms):
         if (transform.target, transform.source) != (transforms[0].target, transforms[0].source):
             raise Code.WRONG_FRAME.unexpected(
-                f"number {index}: expected {transforms[0].label} as the first is",
+                f"{label.format(index)}: expected {transforms[0].label}, like {label.format(0)}",
                 transforms[0].label,
                 transform.label,
             )

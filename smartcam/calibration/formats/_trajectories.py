@@ -16,8 +16,8 @@ from decimal import Decimal
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.calibration.formats._file_format import Measured
-from smartcam.calibration.formats._plain import POSE, malformed, number, row
-from smartcam.calibration.formats._samples import same_frames
+from smartcam.calibration.formats._plain import POSE, malformed_error, number, row
+from smartcam.calibration.formats._samples import check_same_frames
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Code
@@ -80,7 +80,9 @@ def parse_csv(
     poses: list[Transform] = []
     for index, line in enumerate(map(str.strip, text.splitlines()), 1):
         if len(line) > MAX_LINE_LENGTH:
-            raise malformed(f"line {index}", f"{MAX_LINE_LENGTH} characters at most", len(line))
+            raise malformed_error(
+                f"line {index}", f"{MAX_LINE_LENGTH} characters at most", len(line)
+            )
         if not line or (header is not None and line.startswith("#")):
             continue
         if header is not None:
@@ -88,15 +90,15 @@ def parse_csv(
             continue
         header = _header(line)
         if header is None and not line.startswith("#"):
-            raise _no_header(line)
+            raise _no_header_error(line)
     if header is None:
-        raise _no_header("")
+        raise _no_header_error("")
     return poses if header.metres is None else Measured(poses, header.metres)
 
 
-def _no_header(line: str) -> CalibrationError:
+def _no_header_error(line: str) -> CalibrationError:
     expected = f"{_ASL_HEAD.strip()} or {_EUROC_HEAD.strip()}"
-    return malformed("header", f"{expected}, the unit of time among them", line)
+    return malformed_error("header", f"{expected}, the unit of time among them", line)
 
 
 def _header(line: str) -> _Columns | None:
@@ -111,7 +113,7 @@ def _header(line: str) -> _Columns | None:
             if seconds is not None:
                 units_found = {units[place] for place in places[1:4]}
                 if len(units_found) > 1:
-                    raise malformed("header", "one unit of x, y and z", line)
+                    raise malformed_error("header", "one unit of x, y and z", line)
                 return _Columns(places, len(cells), seconds, units_found.pop() or None)
     return None
 
@@ -119,7 +121,7 @@ def _header(line: str) -> _Columns | None:
 def _pose(line: str, header: _Columns, where: str, target: str, source: str) -> Transform:
     cells = line.rstrip(" ,").split(",")
     if len(cells) != header.width:
-        raise malformed(where, f"{header.width} columns as in the header", f"{len(cells)}")
+        raise malformed_error(where, f"{header.width} columns as in the header", f"{len(cells)}")
     time, *pose = (cells[place].strip() for place in header.places)
     values = [number(cell, where) for cell in pose]
     at = _EPOCH + timedelta(microseconds=_microseconds(time, header.seconds, where))
@@ -163,12 +165,12 @@ def compose_euroc(transforms: Sequence[Transform]) -> str:
 
 
 def _timed(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
-    same_frames(transforms)
+    check_same_frames(transforms, "pose {}")
     timed: list[tuple[int, Transform]] = []
     for index, transform in enumerate(transforms):
         if transform.at is None or transform.at < _EPOCH:
             raise Code.BAD_TIME.unexpected(
-                f"number {index}: expected a time since 1970", got=transform.at
+                f"pose {index}: expected a time since 1970", got=transform.at
             )
         timed.append(((transform.at - _EPOCH) // timedelta(microseconds=1), transform))
     return timed

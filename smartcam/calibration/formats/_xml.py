@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 from xml.etree import ElementTree
 
-from smartcam.calibration.formats._plain import MAX_DEPTH, Plain, malformed
+from smartcam.calibration.formats._plain import MAX_DEPTH, Plain, malformed_error
 from smartcam.exceptions import CalibrationError
 
 MAX_XML_ELEMENTS: Final = 20_000
@@ -22,7 +22,7 @@ class _Bounded(ElementTree.TreeBuilder):
     def start(self, tag: str, attributes: dict[str, str], /) -> ElementTree.Element:
         self._count, self._depth = self._count + 1, self._depth + 1
         if self._count > MAX_XML_ELEMENTS or self._depth > MAX_DEPTH:
-            raise malformed(
+            raise malformed_error(
                 "file", f"{MAX_XML_ELEMENTS} elements at most, {MAX_DEPTH} in each other"
             )
         return super().start(tag.rpartition("}")[2], attributes)
@@ -32,7 +32,7 @@ class _Bounded(ElementTree.TreeBuilder):
         return super().end(tag.rpartition("}")[2])
 
     def doctype(self, *_: object) -> None:
-        raise malformed("file", "XML without a document type")
+        raise malformed_error("file", "XML without a document type")
 
 
 def load_xml(text: str) -> ElementTree.Element:
@@ -47,7 +47,7 @@ def load_xml(text: str) -> ElementTree.Element:
     except CalibrationError:  # also a ValueError
         raise
     except (ElementTree.ParseError, ValueError) as exc:
-        raise malformed("file", f"XML ({exc})") from exc
+        raise malformed_error("file", f"XML ({exc})") from exc
 
 
 def storage_data(element: ElementTree.Element) -> Plain:
@@ -61,6 +61,6 @@ def storage_data(element: ElementTree.Element) -> Plain:
     data: dict[str, Plain] = {}
     for child in element:
         if child.tag in data:
-            raise malformed(element.tag, "each name once", child.tag)
+            raise malformed_error(element.tag, "each name once", child.tag)
         data[child.tag] = storage_data(child)
     return data

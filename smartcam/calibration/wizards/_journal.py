@@ -103,16 +103,16 @@ class Journal:
 
     def _load(self) -> None:
         if os.fstat(self._stream.fileno()).st_size > _MAX_FILE:
-            raise self._broken(f"more than {_MAX_FILE} bytes")
+            raise self._broken_journal_error(f"more than {_MAX_FILE} bytes")
         data = self._stream.read() or b""
         complete = data.rfind(b"\n") + 1
         for number, line in enumerate(data[:complete].splitlines(), 1):
             try:
                 value = json.loads(line)
             except ValueError as exc:
-                raise self._broken(f"line {number} is no JSON: {exc}") from exc
+                raise self._broken_journal_error(f"line {number} is no JSON: {exc}") from exc
             if not isinstance(value, dict):
-                raise self._broken(f"line {number} is no object")
+                raise self._broken_journal_error(f"line {number} is no object")
             if number == 1:
                 self.header = value
             else:
@@ -149,5 +149,5 @@ class Journal:
         self._stream.truncate(self._size)
         self._stream.seek(self._size)
 
-    def _broken(self, why: str) -> CalibrationError:
+    def _broken_journal_error(self, why: str) -> CalibrationError:
         return Code.BROKEN_FILE.refusal(f"{self.path}: {why}; expected the journal of a sequence")

@@ -86,7 +86,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     OpenCV is not installed.
     """
     if len(data) > MAX_PICTURE_BYTES:
-        raise _bad(name, f"{MAX_PICTURE_BYTES} bytes at most", f"{len(data)}")
+        raise _picture_error(name, f"{MAX_PICTURE_BYTES} bytes at most", f"{len(data)}")
     cv2 = load("cv2")
     try:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -94,9 +94,11 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     except cv2.error:  # error for no bytes, and for more pixels than OpenCV allows
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
+        raise _picture_error(
+            name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}"
+        )
     if max(image.shape) > MAX_SIDE_PX:
-        raise _bad(
+        raise _picture_error(
             name, f"{MAX_SIDE_PX} pixels along each side", f"{image.shape[1]}x{image.shape[0]}"
         )
     picture: NDArray[Any] = image
@@ -217,9 +219,9 @@ class PictureFolder:
             with (self.path / name).open("rb") as stream:
                 data = stream.read(MAX_PICTURE_BYTES + 1)
         except OSError as exc:
-            raise _bad(name, "a file that can be read", str(exc.strerror)) from exc
+            raise _picture_error(name, "a file that can be read", str(exc.strerror)) from exc
         return decode_picture(data, name)
 
 
-def _bad(name: str, expected: str, actual: str) -> CalibrationError:
+def _picture_error(name: str, expected: str, actual: str) -> CalibrationError:
     return Code.BAD_PICTURE.unexpected(f"{name}: expected {expected}", expected, actual)

@@ -79,7 +79,7 @@ class PointSource(Touches, ABC):
 
     KIND: ClassVar[str]
     """Kind of the calibration in the store."""
-    FIRST: ClassVar[int] = MIN_TOUCHES
+    MIN_TOUCHES_FOR_RESULT: ClassVar[int] = MIN_TOUCHES
     """Number of points that are touched before the result is shown."""
     POINTS: ClassVar[str]
     """Name of the points, for people."""
@@ -87,7 +87,7 @@ class PointSource(Touches, ABC):
     """Name of the origin of the rays, for people."""
     MORE: ClassVar[str]
     """Text of the option to touch more."""
-    SHOWN: ClassVar[Mapping[str, str]] = {}
+    PREVIEW_EXTRAS: ClassVar[Mapping[str, str]] = {}
     """Further entries of a calibration's preview."""
 
     connect: Mapping[str, Any] | None = None
@@ -185,7 +185,7 @@ class PointSource(Touches, ABC):
         return plane
 
     async def _touch_points(self) -> PlaneCalibration:
-        wanted, robust = self.FIRST, False
+        wanted, robust = self.MIN_TOUCHES_FOR_RESULT, False
         again: set[int] = set()  # numbers of the points that were touched again
         while True:
             while len(self.touches) < wanted:
@@ -320,7 +320,7 @@ class PointSource(Touches, ABC):
             worst=plane.worst,
             left_out=plane.outliers,
         )
-        return {**comparison, **self.SHOWN, "choices": self._choices(comparison["points"])}
+        return {**comparison, **self.PREVIEW_EXTRAS, "choices": self._choices(comparison["points"])}
 
     def _choices(self, points: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
         """Return the touches as clickable choices, at the places where they are drawn."""

@@ -438,7 +438,7 @@ class WizardSession:
             run, last = self._before("repeat", token), self._log.entries[-1]
             request = run.request
             if request is None or request.action is None:
-                raise self._impossible("repeat")
+                raise self._impossible_error("repeat")
             with self._shown():
                 outcome = await self._act(request, last["answers"])
                 self._take(run, self._entry("repeat", request, last["answers"], outcome, None))
@@ -495,10 +495,10 @@ class WizardSession:
         """Return the coroutine as it was before the last step; ``label`` names the call."""
         self._expect(token)
         if label not in self._can():
-            raise self._impossible(label)
+            raise self._impossible_error(label)
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
-    def _impossible(self, label: str) -> CalibrationError:
+    def _impossible_error(self, label: str) -> CalibrationError:
         return Code.NOT_POSSIBLE.refusal(
             f"{label}: not possible here; expected one of {', '.join(self._can())}", got=label
         )

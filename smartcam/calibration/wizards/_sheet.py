@@ -1,9 +1,10 @@
 """The wizard that calibrates a camera's pixels against a robot, by a picture of a printed sheet.
 
 It asks for the target and the lengths of its rulers, takes a picture and finds the target in it.
-Then the robot touches any number of the target's corners, or the origin and the rays A and B. The
-wizard knows no camera and no robot: it is given a function that takes a picture and, if the robot
-can be asked, one that reads its pose.
+Then the robot touches any number of the target's corners, or the origin and a point on each of the
+rays A and B: half-lines from the origin along the sheet's axes. The wizard
+knows no camera and no robot: it is given a function that takes a picture and, if the robot can be
+asked, one that reads its pose.
 
 Source: thesis 3.2.3.2 (published) for the origin that a camera finds in its image.
 """
@@ -78,12 +79,12 @@ def sheet_wizard(
     which is then not asked for.
 
     Its result: that of the plane's wizard, and ``seen`` (number of the target's points in the
-    picture)``, rms_px`` (RMS distance of these points from their fit); ``predicted_mm`` is for the
-    points that were seen.
+    picture), ``rms_px`` (RMS distance of these points from their fit); ``predicted_mm`` is the
+    predicted error, RMS over the points that were seen.
 
     Args:
-        take_picture: function that takes a picture; or an open source of frames, of which the first
-            frame exposed after the button is used.
+        take_picture: function that takes a picture; or an open source of frames, whose first frame
+            after the button was pressed is used.
         save_to: function that returns the file for a name.
         read_robot: function that reads the robot's pose; None: it is typed.
         suggested: default of the target that is asked for.
@@ -115,7 +116,7 @@ def sheet_wizard(
             suggested, known=parameters.get("target"), square=parameters.get("square")
         )
         source = _SheetSource(about, read_robot, target)
-        # v of pixels counts down, y of mapped positions counts up
+        # v of pixels grows downwards, y of mapped positions upwards
         source.connect = None if connect is None else {**connect, "y_down": True}
         await source.ask_picture(taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
@@ -127,11 +128,11 @@ class _SheetSource(PointSource):
     """Points of a sheet that is found in a picture."""
 
     KIND = KIND
-    FIRST = 4
+    MIN_TOUCHES_FOR_RESULT = 4
     POINTS = "corners"
     ORIGIN = "the origin, the filled point in the picture"
     MORE = "touch another point"
-    SHOWN: ClassVar[Mapping[str, str]] = {"of": "sheet"}
+    PREVIEW_EXTRAS: ClassVar[Mapping[str, str]] = {"of": "sheet"}
 
     def __init__(self, about: StepAnswer, read_robot: ReadRobot | None, target: Target) -> None:
         super().__init__(about, read_robot)
@@ -154,8 +155,8 @@ class _SheetSource(PointSource):
         async def look(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
             sighting = await asyncio.to_thread(_sheet_in, image, self._target, lens)
-            known = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
-            return {**sighting, "lens_covariance": known}
+            covariance = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
+            return {**sighting, "lens_covariance": covariance}
 
         step = Step(
             id="picture",
@@ -181,7 +182,7 @@ class _SheetSource(PointSource):
         notes = [f"{len(view.ids)} of {len(self._target.points)} points of the target seen"]
         if view.margin is not None:
             notes.append(
-                f"the origin differs from the others by {view.margin:.0f} of 255 grey levels"
+                f"the origin differs from the other corners by {view.margin:.0f} of 255 grey levels"
             )
         svg, seen = self._svg, np.flatnonzero(view.ids == mark.number)
         if svg and len(seen):
@@ -200,7 +201,7 @@ class _SheetSource(PointSource):
         ]
 
     async def ray_origin(self) -> tuple[Mark, float]:
-        return Mark("", 0.0, 0.0, 0.0, number=0), 1.0
+        return Mark("", 0.0, 0.0, 0.0, number=0), 1.0  # a mark on the sheet is in metres
 
     async def add(self) -> None:
         self.check_count(1, MAX_POINTS, "points")
@@ -252,8 +253,8 @@ class _SheetSource(PointSource):
             if outermost not in self._touched():
                 return outermost
         offsets = places[:, None] - self._target.points[self._touched(), :2]
-        nearest = (offsets**2).sum(axis=2).min(axis=1).round(12)
-        return int(ids[int(np.argmax(nearest))])
+        nearest_squared = (offsets**2).sum(axis=2).min(axis=1).round(12)
+        return int(ids[int(np.argmax(nearest_squared))])
 
     def _touched(self) -> list[int]:
         return [touch.mark.number or 0 for touch in self.touches]
@@ -286,19 +287,26 @@ class _SheetSource(PointSource):
         middle = self._view.points.mean(axis=0)
         ends = calibration.transform(np.add(middle, [[0.0, 0.0], [1.0, 0.0]]))
         right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        _, figures, lines, _ = calibrated_plane(plane, "what is to the right in the picture", right)
+        of_plane = calibrated_plane(plane, "what is to the right in the picture", right)
         seen, predicted = len(self._view.ids), None
-        notes = [*lines, f"{seen} points seen, {calibration.rms:.2g} px beside their plane"]
+        notes = [
+            *of_plane.notes,
+            f"{seen} points seen, {calibration.rms:.2g} px beside their plane",
+        ]
         if plane.touch_sigma is not None:
             errors = calibration.predicted_error(self._view.points)
             predicted = 1e3 * math.sqrt(float((errors**2).mean()))
-            unknown = "; the lens' distortion comes on top"
+            caveat = "; the lens' distortion comes on top"
             if calibration.camera is not None:
-                known = calibration.lens_covariance is not None
-                unknown = "" if known else "; the lens' own error, which is not known, comes on top"
+                has_covariance = calibration.lens_covariance is not None
+                caveat = (
+                    ""
+                    if has_covariance
+                    else "; the lens' own error, which is not known, comes on top"
+                )
             notes.append(
                 f"predicted error from pixel to robot {predicted:.3f} mm rms where the target was "
-                f"seen{unknown}"
+                f"seen{caveat}"
             )
         notes += [f"{remark.code}: {remark.text}" for remark in calibration.remarks]
         remarks = [[warning.code.value, warning.text] for warning in calibration.warnings]
@@ -309,7 +317,9 @@ class _SheetSource(PointSource):
             "rms_px": calibration.rms,
             "remarks": remarks,
         }
-        return Calibrated(calibration, figures | more | judgement.figures, tuple(notes), judgement)
+        return Calibrated(
+            calibration, of_plane.figures | more | judgement.figures, tuple(notes), judgement
+        )
 
     def example(self) -> tuple[float, float]:
         u, v = self._view.points[0].tolist()

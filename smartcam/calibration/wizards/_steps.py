@@ -40,7 +40,7 @@ def _shown(value: object) -> str:
     return text if len(text) <= _MAX_SHOWN_LENGTH else f"{text[:_MAX_SHOWN_LENGTH]}..."
 
 
-def _misfit(value: object, expected: str) -> ValueError:
+def _misfit_error(value: object, expected: str) -> ValueError:
     return ValueError(f"{_shown(value)}: expected {expected}")
 
 
@@ -109,13 +109,13 @@ class Number(Input):
             return None
         expected = "a whole number" if self.integer else "a number"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _misfit(value, expected)
+            raise _misfit_error(value, expected)
         if not self.minimum <= value <= self.maximum:  # NaN is outside of every range
-            raise _misfit(value, f"{expected} from {self.minimum:g} to {self.maximum:g}")
+            raise _misfit_error(value, f"{expected} from {self.minimum:g} to {self.maximum:g}")
         if not self.integer:
             return float(value)
         if value != math.floor(value):
-            raise _misfit(value, expected)
+            raise _misfit_error(value, expected)
         return int(value)
 
 
@@ -142,7 +142,7 @@ class Text(Input):
 
     def _checked(self, value: object) -> Any:
         if not isinstance(value, str) or not re.fullmatch(self.pattern, value):
-            raise _misfit(value, self.expected)
+            raise _misfit_error(value, self.expected)
         if len(value) > self.max_length:
             raise ValueError(
                 f"{len(value)} characters: expected {self.expected}, {self.max_length} at most"
@@ -167,7 +167,7 @@ class Option(Input):
 
     def _checked(self, value: object) -> Any:
         if not isinstance(value, str) or value not in self.options:
-            raise _misfit(value, f"one of {', '.join(self.options)}")
+            raise _misfit_error(value, f"one of {', '.join(self.options)}")
         return value
 
 
@@ -182,7 +182,7 @@ class Flag(Input):
 
     def _checked(self, value: object) -> Any:
         if not isinstance(value, bool):
-            raise _misfit(value, "true or false")
+            raise _misfit_error(value, "true or false")
         return value
 
 
@@ -264,7 +264,9 @@ class Step:
                 ``base`` one for those that belong to no input.
         """
         if not isinstance(answers, Mapping):
-            raise _wrong({"base": f"{_shown(answers)}: expected answers by the names of inputs"})
+            raise _wrong_answers_error(
+                {"base": f"{_shown(answers)}: expected answers by the names of inputs"}
+            )
         given = {**self.defaults(), **cast("Mapping[str, Any]", answers)}
         errors: dict[str, str] = {}
         values: Answers = {}
@@ -279,7 +281,7 @@ class Step:
             names = ", ".join(input_field.name for input_field in self.inputs) or "nothing"
             errors["base"] = f"{_shown(next(iter(given)))} is not asked for, but {names}"
         if errors:
-            raise _wrong(errors)
+            raise _wrong_answers_error(errors)
         return values
 
 
@@ -295,7 +297,7 @@ def _with_default(input_field: Input, parameters: Mapping[str, Any]) -> Input:
         ) from exc
 
 
-def _wrong(errors: dict[str, str]) -> CalibrationError:
+def _wrong_answers_error(errors: dict[str, str]) -> CalibrationError:
     text = "; ".join(text if name == "base" else f"{name}: {text}" for name, text in errors.items())
     return Code.WRONG_ANSWERS.refusal(text, got=errors)
 
@@ -360,7 +362,7 @@ def from_lists(
     for kind, row in given.items():
         count = len(wanted[f"default_needed_{kind}"])
         if len(row) != count:
-            raise _wrong({"base": f"{len(row)} {kind}: expected {count}"})
+            raise _wrong_answers_error({"base": f"{len(row)} {kind}: expected {count}"})
     answers: Answers = {}
     for input_field in step.inputs:
         value = given[_as_listed(input_field, None)[0]].pop(0)

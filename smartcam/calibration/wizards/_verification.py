@@ -241,7 +241,7 @@ class _DriftCheck(Touches):
             id="verdict",
             title=f"{self.name} {'is stale' if stale else 'still holds'}",
             description="Take a touch back if it went wrong. If the next touches say the same, "
-            "calibrate anew."
+            "calibrate again."
             if stale
             else "",
             notes=tuple(_notes(figures)),

@@ -14,9 +14,9 @@ from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection.ordering import (
     Arrangement,
     arrangements,
-    leftmost,
     marked,
-    rows_of,
+    most_rightward,
+    places_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._inside import Target
@@ -339,14 +339,14 @@ def test_arrangements_of_other_counts_are_none() -> None:
 
 def test_arrangements_of_a_grid_with_a_point_too_many_are_none() -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
-    pixels, places = drawn(board).pixels, rows_of(5, 4)
+    pixels, places = drawn(board).pixels, places_row_by_row(5, 4)
     more = np.vstack([pixels, pixels[:1] - 30]), np.vstack([places, [[-1, 0]]])
     assert arrangements(pixels, places, board) != []
     assert arrangements(*more, board) == []
 
 
 def test_rows_of_counts_columns_first() -> None:
-    assert rows_of(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
+    assert places_row_by_row(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
 
 
 def test_leftmost_is_proper_and_points_right() -> None:
@@ -356,16 +356,16 @@ def test_leftmost_is_proper_and_points_right() -> None:
         Arrangement(order, proper=True, rightward=-0.9),
         Arrangement(order, proper=True, rightward=0.9),
     ]
-    assert leftmost(ways, "board") is ways[2]
+    assert most_rightward(ways, "board") is ways[2]
     with refused(Code.MIRRORED, "board: expected an image of the sheet as one reads it"):
-        leftmost(ways[:1], "board")
+        most_rightward(ways[:1], "board")
 
 
 @pytest.mark.parametrize(("levels", "origin"), [([40, 200, 190, 180], 0), ([9, 9, 0, 200], None)])
 def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int | None) -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
     pixels = drawn(board).pixels
-    ways = arrangements(pixels, rows_of(5, 4), board)
+    ways = arrangements(pixels, places_row_by_row(5, 4), board)
     corners = [0, 4, 19, 15]
 
     def level(order: np.ndarray) -> float:

@@ -344,7 +344,7 @@ def test_samples_of_moveit_in_yaml_are_16_numbers_row_by_row(tmp_path: Path) -> 
 
 def test_samples_between_other_frames_are_refused(tmp_path: Path) -> None:
     first, second, *_ = moved()
-    with refused("WRONG_FRAME", "number 1: expected T_base_effector", "got T_camera_object"):
+    with refused("WRONG_FRAME", "sample 1, hand: expected T_base_effector", "got T_camera_object"):
         write_samples(tmp_path / "file", "moveit", [first, HandEyeSample(second.seen, second.hand)])
 
 
@@ -466,7 +466,7 @@ def test_trajectory_with_an_invalid_row_is_refused(
 
 
 def test_trajectory_of_poses_without_a_time_is_refused(tmp_path: Path) -> None:
-    with refused("BAD_TIME", "number 1: expected a time since 1970, got None"):
+    with refused("BAD_TIME", "pose 1: expected a time since 1970, got None"):
         write_trajectory(tmp_path / "t.csv", "asl", [times(1)[0], times(1)[0].undated()])
 
 

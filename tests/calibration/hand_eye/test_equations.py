@@ -25,8 +25,8 @@ from tests.calibration.inside import (
     Solution,
     adjust,
     bends,
-    carried,
     check_motion,
+    predicted_views,
     solve_linear,
     sums,
     without_each,
@@ -41,7 +41,7 @@ def problem(in_hand: bool, seed: int = 5, poses: int = 7) -> tuple[RobotPoses, R
     truth = scene("eye-in-hand" if in_hand else "eye-to-hand", seed=seed, poses=poses)
     robot = RobotPoses(Rigid.stacked(one.rigid for one in truth.robot_poses), in_hand)
     camera, target = truth.camera_pose.rigid, truth.target_pose.rigid
-    return robot, camera, target, carried(camera, robot, target)
+    return robot, camera, target, predicted_views(camera, robot, target)
 
 
 def pixels(
@@ -80,11 +80,11 @@ def test_derivatives_are_those_of_small_steps(
         camera=camera.turned_before(random.normal(scale=2e-3, size=6)),
     )
     total = sums(robot, observed, at)[0]
-    unknown = 12 + observed.extra
+    unknown = 12 + observed.extra_count
 
     def cost(steps: Any, own: Any) -> float:
         corrected = RobotPoses(robot.poses.turned_before(at.corrections + own), in_hand)
-        moved = carried(
+        moved = predicted_views(
             at.camera.turned_before(steps[:6]), corrected, at.target.turned_before(steps[6:12])
         )
         return float((observed.evaluate(moved, at.change + steps[12:])[0] ** 2).sum())
@@ -94,7 +94,7 @@ def test_derivatives_are_those_of_small_steps(
     scale[13:17] = 1e-3
     for index in range(unknown):
         step = np.zeros(unknown)
-        step[index] = scale[index] if observed.extra else 1e-6
+        step[index] = scale[index] if observed.extra_count else 1e-6
         slope = (cost(step, 0.0) - cost(-step, 0.0)) / (4 * step[index])
         assert slope == pytest.approx(right[:, 6 + index].sum(), rel=1e-4, abs=1e-2)
     for index in range(6):
@@ -209,7 +209,7 @@ def test_without_each_view_is_what_the_others_give(
     found = without_each(said, observed, whole)
     for number in (0, 4, 8):
         some = np.delete(np.arange(9), number)
-        again = adjust(said.taken(some), observed.taken(some), whole, noise)
+        again = adjust(said.subset(some), observed.subset(some), whole, noise)
         moved = float(np.linalg.norm(again.camera.translation - whole.camera.translation))
         assert moved > 1e-5
         left = found.camera.translation[number] - again.camera.translation

@@ -78,8 +78,8 @@ def test_second_turns_are_those_without_each_pose() -> None:
     found = second_turns(robot)
     for number in range(len(found)):
         some = np.delete(np.arange(len(found)), number)
-        assert found[number] == pytest.approx(second_turn(robot.taken(some)), rel=1e-9)
-    few = robot.taken(np.arange(3))
+        assert found[number] == pytest.approx(second_turn(robot.subset(some)), rel=1e-9)
+    few = robot.subset(np.arange(3))
     np.testing.assert_allclose(second_turns(few), second_turn(few))
 
 

@@ -22,7 +22,7 @@ from smartcam.calibration._hand_eye.validation import (
     agreement,
     check_poses,
     expected_error,
-    most_error,
+    max_plausible_error,
 )
 from smartcam.calibration.simulation import hand_eye_scene
 from smartcam.geometry._inside import Code, Rigid
@@ -210,7 +210,7 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
     found = agreement(asked)
     assert found is not None
     assert found.median < 1e-9
-    assert found.gross(most_error(asked)).tolist() == [2, 5, 8]
+    assert found.gross(max_plausible_error(asked)).tolist() == [2, 5, 8]
     camera = Transform("x", "camera", *found.camera)
     np.testing.assert_allclose(
         camera.translation, scene(setup, poses=10).camera_pose.translation, atol=1e-9
@@ -220,7 +220,7 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
 @pytest.mark.judged
 def test_check_poses_that_belong_together_tells_no_gross_ones() -> None:
     asked = problem(list(scene("eye-in-hand", poses=8).robot_poses), "eye-in-hand")
-    assert check_poses(asked).gross(most_error(asked)).tolist() == []
+    assert check_poses(asked).gross(max_plausible_error(asked)).tolist() == []
 
 
 def test_expected_error_grows_with_the_distance() -> None:

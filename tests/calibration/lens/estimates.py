@@ -94,7 +94,7 @@ class Bench:
         for _ in range(3):
             off = seen - np.concatenate(
                 [
-                    camera.project(poses.taken(number).apply(view.object_points)).reshape(-1)
+                    camera.project(poses.subset(number).apply(view.object_points)).reshape(-1)
                     for number, view in enumerate(self.views)
                 ]
             )

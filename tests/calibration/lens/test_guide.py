@@ -31,11 +31,11 @@ def test_best_view_comes_first_and_each_view_has_its_gain() -> None:
 
 def test_mean_of_a_view_is_the_uncertainty_after_it() -> None:
     best = suggest_views(CENTRE.calibration(), distance=0.4)[0]
-    taken = Bench(LENS, [*CENTRE.poses, best.transform])
+    subset = Bench(LENS, [*CENTRE.poses, best.transform])
     before = CENTRE.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.present == pytest.approx(before.figures.mean, rel=1e-6)
     # the gauge includes the new view, too, so both differ a little
-    after = taken.calibration().uncertainty(distance=0.4, shape=(9, 12))
+    after = subset.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.mean == pytest.approx(after.figures.mean, rel=0.3)
 
 
@@ -52,7 +52,7 @@ def test_view_at_a_new_place_of_the_target_helps_more() -> None:
 def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target: Target) -> None:
     found = candidates(camera, target, roll=math.pi / 2)
     assert len(found.texts) >= 50
-    for pose in map(found.poses.taken, range(found.poses.size)):
+    for pose in map(found.poses.subset, range(found.poses.size)):
         seen = camera.project(pose.apply(target.points))
         assert ((seen >= 0) & (seen <= np.array(camera.size) - 1)).all()
 
@@ -60,7 +60,7 @@ def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target:
 def test_text_names_the_target_s_place_and_its_far_side() -> None:
     straight = CameraModel(size=(640, 480), matrix=LENS.matrix)
     found = candidates(straight, lenskit.BOARD)
-    poses = dict(zip(found.texts, map(found.poses.taken, range(found.poses.size)), strict=True))
+    poses = dict(zip(found.texts, map(found.poses.subset, range(found.poses.size)), strict=True))
     where = {
         "in the upper left corner of the image": (0, 0),
         "in the lower right corner of the image": (1, 1),

@@ -382,7 +382,7 @@ def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) 
     for one in leave_out(whole, sights):
         others = [sight for sight in sights if sight.pose != one.pose]
         again = adjust(whole.bundle, others, whole.more).bundle
-        only = dataclasses.replace(again, poses=again.poses.taken([one.pose])).known()
+        only = dataclasses.replace(again, poses=again.poses.subset([one.pose])).known()
         (expected,) = adjust(only, [Sight(0, 0, views[one.pose])], whole.more).residuals
         off, rms = (math.sqrt(float((r**2).mean())) for r in (one.residuals[0], expected))
         assert off == pytest.approx(rms, rel=0.01)

@@ -76,7 +76,7 @@ async def test_picture_is_shown_with_the_point_to_touch(tmp_path: Path) -> None:
     assert ">A</text>" in svg
     assert ">B</text>" in svg
     assert view["notes"][0] == "54 of 54 points of the target seen"
-    assert "differs from the others by" in view["notes"][1]
+    assert "differs from the other corners by" in view["notes"][1]
     assert "point 9 of row 6, which has a ring" in view["description"]
     choices = view["preview"]["choices"]
     assert [one["answers"] for one in choices[8:10]] == [
