@@ -167,9 +167,11 @@ class StereoMatcher:
         self.algorithm = algorithm
         self.parameters: Mapping[str, Value] = _merged(algorithm, parameters)
         if left_right is not None and not 0 <= left_right <= MAX_DISPARITIES:
-            raise _wrong("left_right", f"0 to {MAX_DISPARITIES} pixels or None", left_right)
+            raise _argument_error(
+                "left_right", f"0 to {MAX_DISPARITIES} pixels or None", left_right
+            )
         if refine not in WINDOWS:
-            raise _wrong("refine", f"one of {WINDOWS}", refine)
+            raise _argument_error("refine", f"one of {WINDOWS}", refine)
         self._left_right, self._refine = left_right, refine
         self._smooth = None if wls is None else _wls(wls)
         numbers = {
@@ -265,18 +267,18 @@ def _merged(algorithm: str, given: Mapping[str, Value]) -> dict[str, Value]:
                 f"{', '.join(known)}{did_you_mean(name, known)}"
             )
         if known[name].check(value) is None:
-            raise _wrong(f"{algorithm}: {name}", str(known[name]), value)
+            raise _argument_error(f"{algorithm}: {name}", str(known[name]), value)
     merged: dict[str, Value] = {name: spec.default for name, spec in known.items()} | dict(given)
     if algorithm == "sgbm":
         area = int(merged["block_size"]) ** 2
         merged["P1"] = merged["P1"] or 8 * area
         merged["P2"] = merged["P2"] or max(32 * area, 4 * int(merged["P1"]))
         if int(merged["P2"]) <= int(merged["P1"]):
-            raise _wrong("sgbm: P2", f"more than P1, {merged['P1']}", merged["P2"])
+            raise _argument_error("sgbm: P2", f"more than P1, {merged['P1']}", merged["P2"])
     return merged
 
 
-def _wrong(label: str, expected: str, actual: object) -> ConfigurationError:
+def _argument_error(label: str, expected: str, actual: object) -> ConfigurationError:
     return ConfigurationError(f"StereoMatcher: {label}: expected {expected}, got {shown(actual)}")
 
 
@@ -322,7 +324,7 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
     except (TypeError, ValueError, ArithmeticError):
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
-        raise _wrong("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
+        raise _argument_error("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)
     made = cv2.ximgproc.createDisparityWLSFilterGeneric(True)  # True: weights by agreement
     made.setLambda(smoothness)
     made.setSigmaColor(edges)

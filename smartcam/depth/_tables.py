@@ -57,7 +57,7 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
 
 
 def count_of(text: str, label: str) -> int:
-    """Return a count from text; raise BadTableError if the text is no count."""
+    """Return a count from text; raise BadTableError if the text is not a count."""
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
         _fail(f"a number of {label}", text)
     return int(text)
@@ -67,26 +67,27 @@ def _fail(expected: str, actual: bytes | str) -> NoReturn:
     raise BadTableError(expected, shown(actual)) from None
 
 
-def check_row(row: np.dtype[Any]) -> None:
+def check_row(row_type: np.dtype[Any]) -> None:
     """Raise BadTableError if rows are too long."""
-    if row.itemsize > MAX_ROW_BYTES:
-        raise BadTableError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row.itemsize}")
+    if row_type.itemsize > MAX_ROW_BYTES:
+        raise BadTableError(f"rows of up to {MAX_ROW_BYTES} bytes", f"{row_type.itemsize}")
 
 
-def from_bytes(data: bytes, start: int, count: int, row: np.dtype[Any]) -> NDArray[Any]:
+def from_bytes(data: bytes, start: int, count: int, row_type: np.dtype[Any]) -> NDArray[Any]:
     """Return ``count`` rows from the offset ``start``; bytes after them are ignored."""
     available = len(data) - start
-    if count * row.itemsize > available:
+    if count * row_type.itemsize > available:
         raise BadTableError(
-            f"{count} rows of {row.itemsize} bytes, {count * row.itemsize} in all", f"{available}"
+            f"{count} rows of {row_type.itemsize} bytes, {count * row_type.itemsize} in all",
+            f"{available}",
         )
-    return np.frombuffer(data, row, count, start)
+    return np.frombuffer(data, row_type, count, start)
 
 
 def from_text(
-    data: bytes, start: int, skipped: int, count: int, types: Sequence[np.dtype[Any]]
+    data: bytes, start: int, skip: int, count: int, types: Sequence[np.dtype[Any]]
 ) -> tuple[NDArray[Any], ...]:
-    """Return the columns of ``count`` lines of numbers, after ``skipped`` lines.
+    """Return the columns of ``count`` lines of numbers, after ``skip`` other lines.
 
     Numbers for integer types must be whole and in range.
     """
@@ -94,41 +95,41 @@ def from_text(
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
     columns = tuple(np.empty(count, kind) for kind in types)
-    done, place, left = 0, start, skipped
+    done, offset, to_skip = 0, start, skip
     while done < count:
         lines: list[list[bytes]] = []
         while len(lines) < min(NUMBERS_AT_A_TIME // len(types), count - done):
-            if place >= len(data):
+            if offset >= len(data):
                 raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
-            end = data.find(b"\n", place)
+            end = data.find(b"\n", offset)
             end = len(data) if end < 0 else end
-            if end - place > MAX_LINE_BYTES:
-                raise BadTableError(f"lines of up to {MAX_LINE_BYTES} bytes", f"{end - place}")
-            words, place = data[place:end].split(), end + 1
-            if left:
-                left -= 1
+            if end - offset > MAX_LINE_BYTES:
+                raise BadTableError(f"lines of up to {MAX_LINE_BYTES} bytes", f"{end - offset}")
+            words, offset = data[offset:end].split(), end + 1
+            if to_skip:
+                to_skip -= 1
             elif len(words) == len(types):
                 lines.append(words)
             elif words:
                 _fail(f"{len(types)} numbers in line {done + len(lines) + 1}", b" ".join(words))
-        for column, written in zip(columns, zip(*lines, strict=True), strict=True):
-            column[done : done + len(lines)] = _numbers(written, column.dtype)
+        for column, texts in zip(columns, zip(*lines, strict=True), strict=True):
+            column[done : done + len(lines)] = _numbers(texts, column.dtype)
         done += len(lines)
     return columns
 
 
-def _numbers(words: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
+def _numbers(texts: Sequence[bytes], kind: np.dtype[Any]) -> NDArray[Any]:
     """Return a column's numbers."""
     try:
         if kind.kind == "f":
-            values = np.array([float(word) for word in words], np.float64)
+            values = np.array([float(text) for text in texts], np.float64)
             with np.errstate(over="ignore"):
                 return values.astype(kind)
-        numbers = [int(word) for word in words if len(word) <= 20]
+        numbers = [int(text) for text in texts if len(text) <= 20]
     except ValueError as exc:
         raise BadTableError("numbers", shown(str(exc))) from None
     limits = np.iinfo(kind)
-    if len(numbers) < len(words) or not limits.min <= min(numbers) <= max(numbers) <= limits.max:
+    if len(numbers) < len(texts) or not limits.min <= min(numbers) <= max(numbers) <= limits.max:
         raise BadTableError(f"numbers from {limits.min} to {limits.max}", "others")
     return np.array(numbers, kind)
 
@@ -144,10 +145,10 @@ def to_text(columns: Iterable[NDArray[Any]]) -> bytes:
     return "".join(f"{' '.join(row)}\n" for row in zip(*words, strict=True)).encode("ascii")
 
 
-def to_bytes(columns: Mapping[str, NDArray[Any]], row: np.dtype[Any]) -> bytes:
+def to_bytes(columns: Mapping[str, NDArray[Any]], row_type: np.dtype[Any]) -> bytes:
     """Return columns as rows of bytes."""
     count = len(next(iter(columns.values())))
-    rows = np.empty(count, row)
+    rows = np.empty(count, row_type)
     for name, column in columns.items():
         rows[name] = column
     return rows.tobytes()
