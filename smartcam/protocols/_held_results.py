@@ -2,9 +2,8 @@
 
 The client asks the camera for its application after each result, and before each trigger. A result
 is reported when the question after it is answered. If all answers around the result name one
-application, it is the result's; otherwise the result gets a fault, so that it
-counts for no application. All events after a held result wait with it, so that events
-keep their order.
+application, the result is assigned to it; otherwise the result gets an error text, and counts for
+no application. All events after a held result wait with it, so that events keep their order.
 """
 
 from __future__ import annotations
@@ -29,25 +28,25 @@ MAX_HELD_BYTES = 1 << 26
 
 @dataclass(slots=True, eq=False)
 class _Held:
-    """Messages of one answer or one line, with a result among them.
+    """Messages of one answer or one text line, with a result among them.
 
     Attributes:
         messages: the messages to report.
         size: bytes of the results.
-        question: number of the question whose answer names the application.
-        front: number of the question before the trigger, 0 for none.
+        question: number of the first question after the result.
+        before_trigger: number of the question before the trigger, 0 for none.
         seen: applications that the camera has named around the result.
     """
 
     messages: tuple[Event, ...]
     size: int
     question: int
-    front: int
+    before_trigger: int
     seen: set[int]
 
 
 class HeldResults:
-    """The events of one link, in order, up to the first result whose application is not known."""
+    """The events of one link, in order; those from the first unassigned result on wait."""
 
     def __init__(self) -> None:
         self._ready: list[Event] = []
@@ -57,7 +56,8 @@ class HeldResults:
         self._unanswered: set[int] = set()  # numbers of questions without an answer
         self._named: int | None = None  # the application that the camera named last
         self._before_trigger = 0  # number of the question before the last trigger
-        self._applications_seen: set[int] | None = None  # applications named since that question
+        # applications named since that question; None after the trigger's answer
+        self._applications_seen: set[int] | None = None
 
     def ask(self, *, trigger: bool = False) -> int:
         """Return the number of a new question, which may stand before a trigger."""
@@ -76,7 +76,7 @@ class HeldResults:
         results = [message for message in messages if isinstance(message, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
         if answers_trigger and self._applications_seen is not None:
-            seen, self._applications_seen = self._applications_seen, None
+            seen, self._applications_seen = self._applications_since, None
         if results:
             size = sum(len(result.data) for result in results)
             self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
@@ -88,15 +88,15 @@ class HeldResults:
         if len(self._waiting) > MAX_HELD or self._size > MAX_HELD_BYTES:
             raise FrameError(
                 f"{len(self._waiting)} events came, with results of {self._size} bytes, and no "
-                "answer to the question for the application that they are of"
+                "answer to the question which application they belong to"
             )
         return bool(results) and not self._unanswered
 
     def pass_on(self, events: tuple[Event, ...]) -> None:
-        """Add events that need no application."""
+        """Report events at once: the link asks for no application, or has ended."""
         self._ready += events
 
-    def name(self, application: int, question: int = 0) -> bool:
+    def application_named(self, application: int, question: int = 0) -> bool:
         """Note the application that the camera names as active now.
 
         Args:
@@ -104,7 +104,7 @@ class HeldResults:
             question: number of the question that the message answers, 0 for none.
 
         Returns:
-                True if a question is needed now for a result that came since the last one.
+            True if a question is needed now for a result that came since the last question.
         """
         self._named = application
         self._unanswered.discard(question)
@@ -129,7 +129,7 @@ class HeldResults:
             first = self._waiting[0]
             if isinstance(first, _Held):
                 waits = first.question > self._last or not self._unanswered.isdisjoint(
-                    {first.front, first.question}
+                    {first.before_trigger, first.question}
                 )
                 if waits and not ended:
                     return

@@ -585,7 +585,7 @@ class LineMachine:
         for message in reported if isinstance(reported, tuple) else (reported,):
             if not isinstance(message, m.QueryAnswer | m.SwitchAnswer):
                 continue
-            if self._held.name(message.application, question):
+            if self._held.application_named(message.application, question):
                 self._ask_application()
 
     def _ask_application(self, *, trigger: bool = False) -> None:

@@ -205,11 +205,11 @@ def _bitmap_size(data: bytearray) -> int:
 def _number(line: str, expected: str) -> int:
     text = line.strip()
     if not text.removeprefix("-").isdecimal() or not text.isascii() or len(text) > 12:
-        raise unexpected(line, expected)
+        raise unexpected_line_error(line, expected)
     return int(text)
 
 
-def unexpected(line: str, expected: str) -> FrameError:
+def unexpected_line_error(line: str, expected: str) -> FrameError:
     """Return the error of a line in place of the expected one."""
     return FrameError(
         f"{line[:64]!r} came, {expected} was expected", data=line.encode(ENCODING, "replace")

@@ -22,7 +22,7 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Dialect, Role, Transport
-from smartcam.protocols._insight.answers import AnswerReader, CommandAnswer, unexpected
+from smartcam.protocols._insight.answers import AnswerReader, CommandAnswer, unexpected_line_error
 from smartcam.protocols._insight.words import (
     COMMANDS,
     ENCODING,
@@ -336,7 +336,9 @@ class InSightMachine:
             if line is None:
                 yield
             elif line_text and not line_text.startswith(WELCOME):
-                raise unexpected(line_text, "the greeting or the login of an In-Sight camera")
+                raise unexpected_line_error(
+                    line_text, "the greeting or the login of an In-Sight camera"
+                )
 
     # ------------------------------------------------------------------ scripts
 
@@ -362,7 +364,7 @@ class InSightMachine:
     def _get_status(self, _message: m.Message | None = None) -> Script:
         online = (yield "GO").text.strip()
         if online not in {"0", "1"}:
-            raise unexpected(online, "0 (offline) or 1 (online)")
+            raise unexpected_line_error(online, "0 (offline) or 1 (online)")
         self._report(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
 
     def _name_job(self) -> Generator[str, CommandAnswer, int]:
@@ -375,7 +377,7 @@ class InSightMachine:
             return m.UNNAMED_APPLICATION
         number = text.strip()
         if not number.isdecimal() or len(number) > 9 or int(number) > LAST_JOB_ID:
-            raise unexpected(number, "the id of a job")
+            raise unexpected_line_error(number, "the id of a job")
         return int(number)
 
     def _query(self, _message: m.Message) -> Script:
