@@ -323,7 +323,7 @@ class LoopThread:
         try:
             self._refuse_fork()
             if self._loop is None:
-                raise self._not_running()
+                raise self._not_running_error()
         except BaseException:
             work.close()
             raise
@@ -339,7 +339,7 @@ class LoopThread:
         """Return the mailbox; raise if nothing can be called."""
         self._refuse_fork()
         if self._mailbox is None:
-            raise self._not_running()
+            raise self._not_running_error()
         if self.inside:
             raise LocalProtocolError(
                 f"{self._name}: called in its own thread (by a predicate, an observer or an "
@@ -354,7 +354,7 @@ class LoopThread:
                 "has no threads; make it in this process"
             )
 
-    def _not_running(self) -> ConfigurationError:
+    def _not_running_error(self) -> ConfigurationError:
         return ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
 
 

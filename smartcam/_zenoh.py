@@ -326,9 +326,9 @@ class ZenohSession:
                     except self._zenoh.ZError as exc:
                         # a silent end is given up after a lease, so another end may still be tried
                         if loop.time() - begun < 0.9 * min(timeout, LEASE_TIME):
-                            raise self._failed(await self._why(exc)) from exc
+                            raise self._connect_error(await self._why(exc)) from exc
         except TimeoutError as exc:
-            raise self._failed(f"no answer within {timeout:g} s") from exc
+            raise self._connect_error(f"no answer within {timeout:g} s") from exc
         if self._link.mode == "peer":
             await self._meet(min(timeout, ROUTER_TIMEOUT))
 
@@ -413,7 +413,7 @@ class ZenohSession:
                 return f"the name {host!r} does not resolve: {exc.strerror}"
         return reason
 
-    def _failed(self, why: str) -> ConnectFailedError:
+    def _connect_error(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
         text = f"{self._bus_name}: cannot {doing} {self._link.place}: {why}"
         return ConnectFailedError(text, attempts=(why,))

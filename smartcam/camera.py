@@ -901,15 +901,15 @@ class Camera(abc.ABC, Generic[ValueT]):
         return await self._frame_after(moment, form, timeout)
 
     def _frames(self, wanted: StreamRequest) -> contextlib.AbstractAsyncContextManager[FrameReader]:
-        raise self._no_frames()
+        raise self._no_frames_error()
 
     async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
-        raise self._no_frames()
+        raise self._no_frames_error()
 
     async def _frame_after(
         self, moment: float | None, form: FrameRequest, timeout: float
     ) -> FleetFrame:
-        raise self._no_frames()
+        raise self._no_frames_error()
 
     # ------------------------------------------------------------------ reservations
 
@@ -943,7 +943,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         return self._reserved(check_seconds(timeout, "timeout", self.name))
 
     def _reserved(self, timeout: float) -> contextlib.AbstractAsyncContextManager[Self]:
-        raise self._not_shared("it cannot be reserved")
+        raise self._not_shared_error("it cannot be reserved")
 
     async def take_back(self, *, timeout: float | None = None) -> None:
         """Make the agent take the camera back from another client, and wait for the session.
@@ -962,15 +962,15 @@ class Camera(abc.ABC, Generic[ValueT]):
         await self._take_back(self._limit(timeout, self.settings.request_timeout))
 
     async def _take_back(self, timeout: float) -> None:
-        raise self._not_shared("a new connection takes it back")
+        raise self._not_shared_error("a new connection takes it back")
 
-    def _not_shared(self, then: str) -> UnsupportedError:
+    def _not_shared_error(self, then: str) -> UnsupportedError:
         return UnsupportedError(
             f"{self.name}: the camera is at the wire, where it serves one client, and not one of a "
             f"fleet: {then}; smartcam serve shares it, and fleet://HOST/NAME is its address then"
         )
 
-    def _no_frames(self) -> UnsupportedError:
+    def _no_frames_error(self) -> UnsupportedError:
         return UnsupportedError(
             f"{self.name}: a camera at the wire gives results, no frames: open what takes its "
             "pictures by smartcam.frames.open(URL), or share the camera by a fleet file with "

@@ -165,7 +165,7 @@ class Requests:
         try:
             return await self._take_answer(answer, deadline)
         except TimeoutError as exc:
-            error = self._timeout(message, "no answer to", "in time")
+            error = self._timeout_error(message, "no answer to", "in time")
             self._give_up_overdue(key, error)
             raise error from exc
 
@@ -206,7 +206,7 @@ class Requests:
             async with asyncio.timeout_at(deadline):
                 await lock.acquire()
         except TimeoutError as exc:
-            raise self._unsent(message) from exc
+            raise self._unsent_error(message) from exc
         try:
             await self.await_pending(key, message, deadline)
         finally:
@@ -304,7 +304,7 @@ class Requests:
             try:
                 await self._take_answer(answer, deadline)
             except TimeoutError as exc:
-                error = self._unsent(message)
+                error = self._unsent_error(message)
                 self._give_up_overdue(key, error)
                 raise error from exc
 
@@ -352,10 +352,10 @@ class Requests:
         if self._late is not None:
             wake(self._late)
 
-    def _unsent(self, message: m.Message) -> ResponseTimeoutError:
-        return self._timeout(message, "could not send", "in time: an earlier answer is owed")
+    def _unsent_error(self, message: m.Message) -> ResponseTimeoutError:
+        return self._timeout_error(message, "could not send", "in time: an earlier answer is owed")
 
-    def _timeout(self, message: m.Message, failure: str, why: str) -> ResponseTimeoutError:
+    def _timeout_error(self, message: m.Message, failure: str, why: str) -> ResponseTimeoutError:
         dialect = self._connection.dialect
         return ResponseTimeoutError(
             f"{self.name}: {failure} {dialect.called(message)} {why}; status: {self._state.status}",

@@ -260,7 +260,7 @@ class Supervisor:
         if task.cancelled():
             if self._closing:
                 return self.closed_error()
-            return self._failed(asyncio.CancelledError("the client's own task was cancelled"))
+            return self._lost_error(asyncio.CancelledError("the client's own task was cancelled"))
         cause = task.exception()
         if cause is None:
             return task.result()
@@ -269,9 +269,9 @@ class Supervisor:
         if isinstance(cause, BaseExceptionGroup):
             cause = cause.exceptions[0]
         logger.error("%s ! the supervisor failed", self._name, exc_info=cause)
-        return self._failed(cause)
+        return self._lost_error(cause)
 
-    def _failed(self, cause: BaseException) -> ConnectionLostError:
+    def _lost_error(self, cause: BaseException) -> ConnectionLostError:
         error = ConnectionLostError(f"{self._name}: {cause!r} in the client")
         error.__cause__ = cause
         return error
@@ -281,7 +281,7 @@ class Supervisor:
             return await self._live()
         except ENDS_PROGRAM as exc:
             # the receive task has raised the error in the loop; here only clean up
-            return self._failed(exc)
+            return self._lost_error(exc)
 
     async def _live(self) -> SmartCamError:
         """Make sessions; return the reason why there will be no more."""
@@ -299,7 +299,7 @@ class Supervisor:
             short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
             takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
             if again and short and not self._excused and takes:
-                taken = self._taken(error)
+                taken = self._taken_error(error)
                 if self.on_taken is None:
                     return taken
                 await self._lock.vacated()
@@ -433,7 +433,7 @@ class Supervisor:
             port=settings.address.port,
         ) from failed
 
-    def _taken(self, error: ConnectionLostError) -> ConnectionTakenError:
+    def _taken_error(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
         outcome = f"stopped, so as not to fight for it ({error})"
         if self.on_taken is not None:

@@ -301,7 +301,7 @@ class Triggers:
             await self._status.refresh(deadline)
             correlation.note_query_answered()
         if state.bits & _SYSTEM_ERROR:
-            raise self._fault()
+            raise self._fault_error()
         if request.input_data is not None and self._results.input_in_doubt:
             raise InputContainerError(
                 f"{self._name}: input data of an earlier trigger, which had no result, may still "
@@ -461,7 +461,7 @@ class Triggers:
             ends_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
         while True:
             if self._state.bits & _SYSTEM_ERROR:
-                raise self._fault()
+                raise self._fault_error()
             status = self._status.last
             if takes_trigger(status):
                 return
@@ -497,7 +497,7 @@ class Triggers:
             # afterwards no line of that trigger can be taken for the next one's
             await self._requests.fence(deadline)
 
-    def _fault(self) -> CameraFaultError:
+    def _fault_error(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:

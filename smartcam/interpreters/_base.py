@@ -360,7 +360,7 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
     except ENDS_PROGRAM:
         raise
     except BaseException as exc:
-        raise _failed(exc, reader.data) from exc
+        raise _interpretation_error(exc, reader.data) from exc
 
 
 def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
@@ -372,7 +372,7 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
     except ENDS_PROGRAM:
         raise
     except BaseException as exc:
-        raise _failed(exc, reader.data) from exc
+        raise _interpretation_error(exc, reader.data) from exc
 
 
 def plain(interpreter: Interpreter) -> PlainInterpreter | None:
@@ -392,10 +392,10 @@ def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> o
     except ENDS_PROGRAM:
         raise
     except BaseException as exc:
-        raise _failed(exc, data) from exc
+        raise _interpretation_error(exc, data) from exc
 
 
-def _failed(exc: BaseException, data: bytes) -> InterpretationError:
+def _interpretation_error(exc: BaseException, data: bytes) -> InterpretationError:
     return InterpretationError(
         f"the interpreter failed with {text_of(exc)} (the container has {len(data)} bytes)",
         got=text_of(exc),

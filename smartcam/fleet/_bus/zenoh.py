@@ -132,7 +132,7 @@ class ZenohEnd(ZenohSession, Bus):
             if self._link.listen:
                 raise
             if why := await self._why_refused(Path(folder), end - loop.time()):
-                raise self._failed(why) from exc
+                raise self._connect_error(why) from exc
             raise
         self._looking = loop.create_task(self._look_now_and_then(), name="smartcam.fleet.look")
         return self
@@ -164,7 +164,7 @@ class ZenohEnd(ZenohSession, Bus):
         folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
         identity = await loop.run_in_executor(None, read_identity, folder)
         if identity.expired:
-            raise self._failed(identity.expired)
+            raise self._connect_error(identity.expired)
         warning = identity.digest, identity.urgency
         if identity.urgency and warning != self._warned:
             logger.warning("%s ! %s", self._link.place, identity.warning)
