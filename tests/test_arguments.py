@@ -408,7 +408,7 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "RtspServer.url": (rtsp.url, {}),
             "ConformanceOptions.__init__": (ConformanceOptions, {"url": "bvs://127.0.0.1"}),
             "judge": (smartcam.conformance.camera.judge, {}),
-            "Device.change_run": (device.change_run, {}),
+            "Device.change_inspection": (device.change_inspection, {}),
             "Device.drop_triggers": (device.drop_triggers, {}),
             "Device.hold_busy": (device.hold_busy, {}),
             "Device.reboot": (device.reboot, {}),

@@ -28,7 +28,7 @@ from smartcam.emulator._port import Port
 from smartcam.emulator._scenario.timeline import Timeline
 from smartcam.emulator._traffic import TrafficLog, Visit
 from smartcam.emulator.faults._base import DeviceFault
-from smartcam.emulator.faults._device_effects import Stage, act, kinds_of
+from smartcam.emulator.faults._device_effects import FaultTargets, act, supported_faults
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
@@ -162,7 +162,7 @@ class WireCamera(Server):
         self.name: str = name
         self.clock: Clock = clock if clock is not None else RealClock()
         self.seed: int = check_seed(seed, owner)
-        self.fault_kinds: frozenset[str] = kinds_of(device)
+        self.fault_kinds: frozenset[str] = supported_faults(device)
         self.codec: WireCodec = spoken
         self._cues = timeline
         self._step = _Bracket(self._begin_step, self._end_step)
@@ -172,7 +172,7 @@ class WireCamera(Server):
         self._step_at: float | None = None  # time of the present step
         self._shows = False  # whether each frame is logged, checked once a step
         self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
-        self._stage = Stage(
+        self._fault_targets = FaultTargets(
             device=device,
             refuse=self._refuse,
             let_second_client_in=self._let_second_client_in,
@@ -487,7 +487,7 @@ class WireCamera(Server):
         """Run device faults; the camera's answers trigger no other device fault."""
         for fault in faults:
             if isinstance(fault, DeviceFault) and when in {None, fault.when}:
-                act(self._stage, fault)
+                act(self._fault_targets, fault)
                 self._deliver_at_once()
 
     # ------------------------------------------------------------------ for links

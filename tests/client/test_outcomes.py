@@ -579,7 +579,7 @@ async def test_second_result_of_a_trigger_is_extra_and_never_the_next_ones(
 async def test_extra_results_of_the_emulator_are_counted() -> None:
     box = {"running": True, "active": 21}
     async with emulated(box=box) as (emulator, clock, camera):
-        emulator.device.change_run(extra=2)
+        emulator.device.change_inspection(extra=2)
         triggering = asyncio.create_task(camera.trigger())
         await emulator.wait_received(m.Trigger)
         clock.advance(1)

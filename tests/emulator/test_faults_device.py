@@ -201,7 +201,7 @@ def test_device_change_of_a_run_that_is_void_is_forgotten() -> None:
     device = Device([Application(id=2, layout="n: uint8", constant=[1])], running=True)
     device.handle(m.Connect())
     device.handle(m.Trigger())
-    device.change_run(silent=True)
+    device.change_inspection(silent=True)
     device.stop()
     device.start()
     device.handle(m.Trigger())
@@ -217,7 +217,7 @@ def test_device_late_free_run_swallows_the_runs_that_would_begin_meanwhile() -> 
     device = Device([free], running=True)
     device.handle(m.Connect())
     device.tick(0.05)
-    device.change_run(late=0.25)
+    device.change_inspection(late=0.25)
     assert heard(device)[2:] == ["result 2 00"]
     device.tick(0.3)
     assert heard(device) == []

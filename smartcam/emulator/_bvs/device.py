@@ -459,7 +459,7 @@ class Device:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
         self._trigger_drops += check_integer(count, "count", 0, owner="device")
 
-    def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
+    def change_inspection(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the running inspection, or else the next one.
 
         Args:

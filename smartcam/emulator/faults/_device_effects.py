@@ -1,4 +1,4 @@
-"""Apply device faults to the camera's device."""
+"""Apply device faults to the simulated device of an emulated camera."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _CONDITIONS = {"system_error": Status.SYSTEM_ERROR, "overheat": Status.OVERHEAT}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stage:
-    """The object that faults act on."""
+class FaultTargets:
+    """The device that faults change, and the camera's functions for faults beyond the device."""
 
     device: Any
     refuse: Callable[[float], None]  # closes the port for a number of seconds
@@ -27,60 +27,60 @@ class Stage:
     clear: Callable[[], None]  # forgets waiting faults, and ends lasting ones
 
 
-def _condition(stage: Stage, fault: f.Condition) -> None:
-    stage.device.set_condition(_CONDITIONS[fault.condition], fault.active)
+def _condition(targets: FaultTargets, fault: f.Condition) -> None:
+    targets.device.set_condition(_CONDITIONS[fault.condition], fault.active)
 
 
-def _switch(stage: Stage, fault: f.OperatorSwitch) -> None:
-    stage.device.switch_application(fault.application, running=fault.running)
+def _switch(targets: FaultTargets, fault: f.OperatorSwitch) -> None:
+    targets.device.switch_application(fault.application, running=fault.running)
 
 
-def _move(stage: Stage, fault: f.MovePart) -> None:
-    stage.device.scene.pieces[fault.part] = TablePose(fault.x, fault.y, fault.theta)
+def _move(targets: FaultTargets, fault: f.MovePart) -> None:
+    targets.device.scene.pieces[fault.part] = TablePose(fault.x, fault.y, fault.theta)
 
 
-_ACTIONS: Mapping[type[DeviceFault], Callable[[Stage, Any], object]] = {
-    f.Refuse: lambda stage, fault: stage.refuse(fault.seconds),
-    f.BusyForEver: lambda stage, fault: stage.device.hold_busy(fault.seconds),
-    f.Overtrigger: lambda stage, fault: stage.device.drop_triggers(fault.count),
-    f.SecondClient: lambda stage, _: stage.let_second_client_in(),
-    f.PowerCycle: lambda stage, fault: stage.device.reboot(fault.seconds),
+_ACTIONS: Mapping[type[DeviceFault], Callable[[FaultTargets, Any], object]] = {
+    f.Refuse: lambda targets, fault: targets.refuse(fault.seconds),
+    f.BusyForEver: lambda targets, fault: targets.device.hold_busy(fault.seconds),
+    f.Overtrigger: lambda targets, fault: targets.device.drop_triggers(fault.count),
+    f.SecondClient: lambda targets, _: targets.let_second_client_in(),
+    f.PowerCycle: lambda targets, fault: targets.device.reboot(fault.seconds),
     f.OperatorSwitch: _switch,
-    f.OperatorStop: lambda stage, _: stage.device.stop(),
-    f.OperatorStart: lambda stage, _: stage.device.start(),
+    f.OperatorStop: lambda targets, _: targets.device.stop(),
+    f.OperatorStart: lambda targets, _: targets.device.start(),
     f.Condition: _condition,
-    f.LateResult: lambda stage, fault: stage.device.change_run(late=fault.seconds),
-    f.NoResult: lambda stage, _: stage.device.change_run(silent=True),
-    f.ExtraResult: lambda stage, fault: stage.device.change_run(extra=fault.count),
-    f.DigitalInput: lambda stage, _: stage.device.trigger(),
-    f.ChangeByteOrder: lambda stage, fault: stage.device.set_endian(fault.endian),
+    f.LateResult: lambda targets, fault: targets.device.change_inspection(late=fault.seconds),
+    f.NoResult: lambda targets, _: targets.device.change_inspection(silent=True),
+    f.ExtraResult: lambda targets, fault: targets.device.change_inspection(extra=fault.count),
+    f.DigitalInput: lambda targets, _: targets.device.trigger(),
+    f.ChangeByteOrder: lambda targets, fault: targets.device.set_endian(fault.endian),
     f.MovePart: _move,
-    f.RemovePart: lambda stage, fault: stage.device.scene.pieces.pop(fault.part, None),
-    f.ClearFaults: lambda stage, _: stage.clear(),
+    f.RemovePart: lambda targets, fault: targets.device.scene.pieces.pop(fault.part, None),
+    f.ClearFaults: lambda targets, _: targets.clear(),
 }
 
 
 _NEEDS: Mapping[type[DeviceFault], str] = {
     f.BusyForEver: "hold_busy",
     f.Overtrigger: "drop_triggers",
-    f.SecondClient: "disconnect",
+    f.SecondClient: "disconnect",  # the camera calls it to free its session
     f.PowerCycle: "reboot",
     f.OperatorSwitch: "switch_application",
     f.OperatorStop: "stop",
     f.OperatorStart: "start",
     f.Condition: "set_condition",
-    f.LateResult: "change_run",
-    f.NoResult: "change_run",
-    f.ExtraResult: "change_run",
+    f.LateResult: "change_inspection",
+    f.NoResult: "change_inspection",
+    f.ExtraResult: "change_inspection",
     f.DigitalInput: "trigger",
     f.ChangeByteOrder: "set_endian",
     f.MovePart: "scene",
     f.RemovePart: "scene",
 }
-"""Methods that a device needs for a fault, by name; other faults need no methods."""
+"""Attribute that a device must have for a fault; other faults need none."""
 
 
-def kinds_of(device: object) -> frozenset[str]:
+def supported_faults(device: object) -> frozenset[str]:
     """Return the kinds of faults that a camera with this kind of device supports."""
     return frozenset(
         kind
@@ -91,6 +91,6 @@ def kinds_of(device: object) -> frozenset[str]:
     )
 
 
-def act(stage: Stage, fault: DeviceFault) -> None:
+def act(targets: FaultTargets, fault: DeviceFault) -> None:
     """Apply a device fault."""
-    _ACTIONS[type(fault)](stage, fault)
+    _ACTIONS[type(fault)](targets, fault)

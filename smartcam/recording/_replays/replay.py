@@ -328,7 +328,9 @@ class ReplayedCamera(EmulatedCamera):
         if self._pictures is not None:
             self._pictures.begins()
         if take is not None:
-            self.device.change_run(late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME))
+            self.device.change_inspection(
+                late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME)
+            )
 
     def _arm_drops(self, track: _Track) -> None:
         """Make the device drop the next triggers if the recorded ones were dropped."""
