@@ -1,8 +1,8 @@
 """Send results of all cameras of an agent in one message, for programs that receive all.
 
-With a message for each camera, a result costs as much as its message. So an agent has a further key
-for the results of all its cameras together, if the key has a subscriber. Bundles are numbered: a
-program that misses one asks for the next numbers of each camera.
+A message for each result costs much more than the result itself. An agent therefore also publishes
+the results of all its cameras together on one key, while that key has a subscriber. Bundles are
+numbered: a program that misses one asks the agent for the next number of each camera.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FULL_BUNDLE_BYTES = 1 << 15
 """Bytes of results with which a bundle is sent at once."""
 
 REMINDER_DELAYS = (0.05, 0.2, 1.0, 5.0)
-"""Seconds after the last bundle until the next number is sent again."""
+"""Delays, seconds, of the empty bundles after a bundle; each repeats the next bundle's number."""
 
 _HEAD = struct.Struct("<4sQQQI")
 _PART = struct.Struct("<HI")
@@ -60,12 +60,12 @@ def decode_bundle(payload: bytes, label: str) -> Bundled:
             raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
         place, parts = _HEAD.size, list[tuple[str, bytes]]()
         for _ in range(count):
-            name, size = _PART.unpack_from(payload, place)
-            begin = place + _PART.size + name
+            name_size, size = _PART.unpack_from(payload, place)
+            begin = place + _PART.size + name_size
             place = begin + size
             if place > len(payload):
                 raise ValueError(f"{place} bytes were announced, {len(payload)} came")
-            parts.append((str(payload[begin - name : begin], "utf-8"), payload[begin:place]))
+            parts.append((str(payload[begin - name_size : begin], "utf-8"), payload[begin:place]))
         if place != len(payload):
             raise ValueError(f"{len(payload) - place} bytes are left over")
     except (ValueError, struct.error) as exc:
@@ -88,7 +88,7 @@ class AgentBundle:
         self._out: Publisher | None = None
         self._fresh: list[bytes] = []
         self._count, self._bytes, self._number = 0, 0, 1
-        self._said_at = -math.inf
+        self._sent_at = -math.inf
         self._due: asyncio.Handle | None = None
         self._reminder: asyncio.TimerHandle | None = None
 
@@ -109,17 +109,17 @@ class AgentBundle:
         """True if the bundles have a subscriber."""
         return self._out is not None and self._out.has_subscribers
 
-    def add(self, camera: str, runs: bytes) -> None:
+    def add(self, camera: str, encoded_results: bytes) -> None:
         """Add a camera's results, which are sent soon with results of other cameras."""
         name = camera.encode()
-        self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
+        self._fresh += (_PART.pack(len(name), len(encoded_results)), name, encoded_results)
         self._count += 1
-        self._bytes += len(runs)
+        self._bytes += len(encoded_results)
         if self._bytes >= FULL_BUNDLE_BYTES:
             self.flush()
         elif self._due is None:
             loop = asyncio.get_running_loop()
-            at = self._said_at + BUNDLE_INTERVAL
+            at = self._sent_at + BUNDLE_INTERVAL
             self._due = (
                 loop.call_at(at, self.flush) if at > loop.time() else loop.call_soon(self.flush)
             )
@@ -130,7 +130,7 @@ class AgentBundle:
             self._due.cancel()
             self._due = None
         if self._fresh and self._out is not None:
-            self._said_at = asyncio.get_running_loop().time()
+            self._sent_at = asyncio.get_running_loop().time()
             fresh, count = self._fresh, self._count
             self._fresh, self._count, self._bytes = [], 0, 0
             number, self._number = self._number, self._number + 1

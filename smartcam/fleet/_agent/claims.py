@@ -116,14 +116,14 @@ class Claims:
         self._name.append(bus.be_present(keys.start(name, self._start)))
         for key in await bus.present(keys.start(name, "*"), timeout):
             if self._is_earlier(key):
-                raise self._namesake()
+                raise self._namesake_error()
         self._name.append(bus.watch(keys.start(name, "*"), self._on_namesake))
 
     def _is_earlier(self, key: str) -> bool:
         """Return True if another agent of this name was started earlier; there are no ties."""
         return _order(self._keys.tail(key, "presence/start")[-1]) < _order(self._start)
 
-    def _namesake(self) -> ConfigurationError:
+    def _namesake_error(self) -> ConfigurationError:
         name, fleet = self._agent.name, self._keys.fleet
         return ConfigurationError(
             f"an agent named {name} is in fleet {fleet}, which was started before this one: this "
@@ -132,7 +132,7 @@ class Claims:
 
     def _on_namesake(self, key: str, present: bool) -> None:
         if present and self._is_earlier(key):
-            self._agent.retire(self._namesake())
+            self._agent.retire(self._namesake_error())
         elif present and not key.endswith(f"/{self._start}"):
             logger.warning(
                 "%s ! another agent of this name was started later: that one ends", self._agent.name

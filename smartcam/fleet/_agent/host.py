@@ -134,7 +134,7 @@ class Host:
         self._fresh_states: list[bytes] = []
         self._fresh_bytes = 0
         self._due: asyncio.Handle | None = None  # task that sends the results
-        self._said_at = -math.inf
+        self._sent_at = -math.inf
         self._held = DeadlineTimer(self._flush_states)
         self._catch_up = DeadlineTimer(self._put_states)
         self._reminder: asyncio.TimerHandle | None = None
@@ -264,7 +264,7 @@ class Host:
         try:
             await self.gate.enter(program, timeout)
         except TimeoutError as exc:
-            raise self._not_granted(action, timeout) from exc
+            raise self._not_granted_error(action, timeout) from exc
 
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of other programs out, like :meth:`Gate.reserve`.
@@ -278,7 +278,7 @@ class Host:
         try:
             await self.gate.reserve(program, reservation, timeout)
         except TimeoutError as exc:
-            raise self._not_granted("reserve", timeout) from exc
+            raise self._not_granted_error("reserve", timeout) from exc
         if not (self.final or self.connected):
             self.gate.release(reservation)
             raise ConnectionLostError(
@@ -325,7 +325,7 @@ class Host:
         else:
             self.topics.on_state()
 
-    def _not_granted(self, action: str, timeout: float) -> SmartCamError:
+    def _not_granted_error(self, action: str, timeout: float) -> SmartCamError:
         """Return the error for a program whose wait for other programs timed out."""
         holder = self.gate.holder
         cause = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
@@ -472,7 +472,7 @@ class Host:
                 self._flush_results()
             elif self._due is None:
                 loop = asyncio.get_running_loop()
-                at = self._said_at + RESULTS_INTERVAL
+                at = self._sent_at + RESULTS_INTERVAL
                 call = self._flush_results
                 self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
         self.topics.on_run(run)
@@ -511,7 +511,7 @@ class Host:
             self._due.cancel()
             self._due = None
         if self._fresh:
-            self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
+            self._sent_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
             payload = encode_runs(self.epoch, self.results.following, fresh)
             if self._bundle.has_subscribers:

@@ -488,7 +488,7 @@ def load_fleet(path: str | Path) -> FleetFile:
         MissingExtraError: PyYAML is not installed.
     """
     if isinstance(path, str) and "://" in path:
-        raise _no_file(path)
+        raise _no_file_error(path)
     path = check_path(path, "path", "fleet")
     folder = path.parent
     file = read_model(
@@ -499,7 +499,7 @@ def load_fleet(path: str | Path) -> FleetFile:
     return file.model_copy(update={"certificates": str(folder / file.certificates)})
 
 
-def _no_file(url: str) -> ConfigurationError:
+def _no_file_error(url: str) -> ConfigurationError:
     """Return the error for an address instead of a fleet file."""
     shown = masked(url)
     if is_fleet(url):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 RESULT: Final = "result"
 
-_OUTCOMES: Final[tuple[tuple[type[BaseException], str], ...]] = (
+_FAILURE_WORDS: Final[tuple[tuple[type[BaseException], str], ...]] = (
     (asyncio.CancelledError, "cancelled"),
     (TimeoutError, "timeout"),
     (NotRunningError, "not_running"),
@@ -45,13 +45,13 @@ _OUTCOMES: Final[tuple[tuple[type[BaseException], str], ...]] = (
 )
 """Words for the failures of triggers, by the error's class; the first match decides."""
 
-OUTCOMES: Final = (RESULT, *dict.fromkeys(word for _, word in _OUTCOMES), "other")
+OUTCOMES: Final = (RESULT, *dict.fromkeys(word for _, word in _FAILURE_WORDS), "other")
 """All words for the outcomes of triggers."""
 
 
 def outcome_of(error: BaseException) -> str:
     """Return the word for a trigger's failure."""
-    return next((word for kind, word in _OUTCOMES if isinstance(error, kind)), "other")
+    return next((word for kind, word in _FAILURE_WORDS if isinstance(error, kind)), "other")
 
 
 SUMS: Final = (
@@ -69,13 +69,11 @@ class Totals:
         counts: sums of the counters in :data:`SUMS`.
     """
 
-    def __init__(self, before: Totals | None = None) -> None:
-        self.counts: dict[str, int] = (
-            dict.fromkeys(SUMS, 0) if before is None else {**before.counts}
-        )
+    def __init__(self, start: Totals | None = None) -> None:
+        self.counts: dict[str, int] = dict.fromkeys(SUMS, 0) if start is None else {**start.counts}
         empty = Histogram(HISTOGRAM_BOUNDS, (0,) * (len(HISTOGRAM_BOUNDS) + 1))
-        self.processing: Histogram = empty if before is None else before.processing
-        self.round_trip: Histogram = empty if before is None else before.round_trip
+        self.processing: Histogram = empty if start is None else start.processing
+        self.round_trip: Histogram = empty if start is None else start.round_trip
 
     def add(self, accounts: Iterable[Statistics]) -> None:
         """Add the counts of cameras."""

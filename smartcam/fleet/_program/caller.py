@@ -240,7 +240,7 @@ class Caller:
             return
         self.met, self.linked = None, False
         error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
-        self.program.fail(self, lambda: _unknown(error))
+        self.program.fail(self, lambda: _unknown_outcome_error(error))
         self._stirred.set()
         self._on_lost(error)
 
@@ -562,7 +562,7 @@ class Caller:
             reply: Reply = await waiting
         except TimeoutError as exc:
             self._cancel(key, number)
-            raise self._silence(do, deadline - begun) from exc
+            raise self._silence_error(do, deadline - begun) from exc
         except asyncio.CancelledError:
             self._cancel(key, number)
             raise
@@ -664,7 +664,7 @@ class Caller:
             return self._commands_to[1]
         return program.keys.ask(program.role, agent, camera)
 
-    def _silence(self, do: str, waited: float) -> SmartCamError:
+    def _silence_error(self, do: str, waited: float) -> SmartCamError:
         agent = "the agent" if self.met is None else f"the agent {self.met.agent}"
         if do == "trigger":
             return TriggerTimeoutError(
@@ -679,5 +679,5 @@ class Caller:
         )
 
 
-def _unknown(error: LinkError) -> LinkError:
+def _unknown_outcome_error(error: LinkError) -> LinkError:
     return ConnectionLostError(f"{error}; whether what was under way was done is unknown")

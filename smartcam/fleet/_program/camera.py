@@ -229,7 +229,7 @@ class FleetCamera(Camera[ValueT]):
             try:
                 await self._program.open(timeout)
             except ConnectFailedError as exc:
-                raise self._not_reached(str(exc)) from exc
+                raise self._not_reached_error(str(exc)) from exc
         self._receiver.open()
         self._caller.open()
         await self._settle(deadline, session=session)
@@ -268,11 +268,11 @@ class FleetCamera(Camera[ValueT]):
             waited = self.settings.connect_timeout
             fleet = self._program.keys.fleet
             why = f"no agent of fleet {fleet} has this camera, or none answered within {waited:g} s"
-            raise self._not_reached(
+            raise self._not_reached_error(
                 why if trouble is None else str(trouble).removeprefix(f"{self.name}: ")
             ) from trouble
 
-    def _not_reached(self, why: str) -> ConnectFailedError:
+    def _not_reached_error(self, why: str) -> ConnectFailedError:
         address = self.settings.address
         text = f"{self.name}: {self.url}: {why}"
         return ConnectFailedError(text, host=address.host, port=address.port, attempts=(why,))

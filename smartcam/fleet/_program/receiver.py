@@ -404,7 +404,7 @@ class Receiver:
         try:
             if own_call.expected is not None and run.application != own_call.expected:
                 counters.count("wrong_application")
-                raise self._wrong_application(run, own_call.expected)
+                raise self._wrong_application_error(run, own_call.expected)
             try:
                 outcome: Result | InterpretationError = self._interpret(
                     run, own_call.interpretation
@@ -494,7 +494,7 @@ class Receiver:
             self._counters.skip(empty_slots)
         return as_result(run, self._name, value, sequence, at)
 
-    def _wrong_application(self, run: ResultRun, expected: int) -> WrongApplicationError:
+    def _wrong_application_error(self, run: ResultRun, expected: int) -> WrongApplicationError:
         return WrongApplicationError(
             f"{self._name}: a result of application {run.application} came, "
             f"application {expected} was expected",
