@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from smartcam.layout._inside import Field
 
 MARK = "smartcam;"
-"""The text before each result of an uploaded layout; other results and codes begin
-otherwise."""
+"""Text at the beginning of each result in an uploaded layout; a result in another layout begins
+with another text."""
 
 _TYPES: Mapping[str, tuple[str, str]] = {
     **{f"int{bits}": (f"int{bits}", code) for bits, code in ((8, "b"), (16, "h"), (32, "i"))},
@@ -38,14 +38,14 @@ def layout_json(layout: Layout) -> str:
     """Return the layout for a device, which makes it send the declared fields in binary.
 
     Raises:
-        ConfigurationError: the device has no such type, or the layout has a number of records.
+        ConfigurationError: the device has no such type, or the layout fixes the number of records.
     """
     elements: list[dict[str, Any]] = [{"type": "string", "value": MARK, "id": "start_string"}]
     elements += map(_element, layout.head)
     fields = [_element(field) for field in layout.fields]
     if isinstance(layout.repeat, int):
         raise ConfigurationError(
-            f"ifm: the number of records is not fixed, write ( ... )*: {layout.text}"
+            f"ifm: a layout cannot fix the number of records; write ( ... )*: {layout.text}"
         )
     if layout.repeat is None:
         elements += fields
@@ -83,20 +83,22 @@ def check_layout(text: str) -> dict[str, Any]:
     """Return a layout that a client uploads; ValueError if a device would refuse it."""
     described = json.loads(text)
     if not isinstance(described, dict) or described.get("layouter") != "flexible":
-        raise ValueError("no flexible layouter")
+        raise ValueError('the layouter is not "flexible"')
     _check(described.get("elements"), MAX_DEPTH)
     return described
 
 
 def _check(elements: object, depth: int) -> None:
-    if not isinstance(elements, list) or depth < 1:
-        raise ValueError("no elements")
+    if depth < 1:
+        raise ValueError(f"records are nested deeper than {MAX_DEPTH}")
+    if not isinstance(elements, list):
+        raise ValueError(f"not a list of elements: {elements!r:.80}")  # noqa: TRY004
     for element in elements:
         kind = element.get("type") if isinstance(element, dict) else None
         if kind == "records":
             _check(element.get("elements"), depth - 1)
         elif kind not in {"string", "blob", *_CODES} or not isinstance(element.get("id"), str):
-            raise ValueError(f"no element: {element!r:.80}")
+            raise ValueError(f"not an element: {element!r:.80}")
 
 
 def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
