@@ -1,4 +1,4 @@
-"""Set the device of a camera's frames through parameters of the camera's node.
+"""Change the settings of the device that delivers the frames, by parameters of the camera's node.
 
 The controls of a V4L2 device have the names and types that v4l2_camera gives them; the features of
 any other device have their own names, in lower case with underscores.
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 REFRESH_DELAY = 0.2
-"""Seconds from setting a feature until all features are read anew."""
+"""Seconds from setting a feature until all features are read again."""
 
 
 class CameraControls:
     """Declares a parameter for each control or feature of a device, such as ``brightness``.
 
     A boolean control is ``bool``, any other ``int``, within the control's range. A feature that can
-    be set is ``bool``, ``int``, ``float``, or ``str`` for an entry's name; its range is in the
-    description, since other features may change it. Setting the parameter sets the device; if the
+    be set is ``bool``, ``int``, ``float``, or ``str`` for one of a list of names; the description
+    has its range, since other features may change it. Setting the parameter sets the device; if the
     device refuses a value, the parameter is refused with the device's error. After each set the
     parameters of all features are read from the device again.
 
@@ -78,7 +78,9 @@ class CameraControls:
         except UnsupportedError:  # a source without controls
             return
         except SmartCamError as exc:
-            logger.warning("%s ! its controls are no parameters: %s", self._node.full_name, exc)
+            logger.warning(
+                "%s ! its controls are not available as parameters: %s", self._node.full_name, exc
+            )
             return
         for control in controls.values():
             if control.kind != "button" and control.value is not None:

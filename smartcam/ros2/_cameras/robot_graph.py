@@ -95,7 +95,7 @@ class CameraGraph:
             async with asyncio.timeout(PICTURE_WAIT):
                 message, utc = await _fresh(subscription, times)
         except TimeoutError as exc:
-            raise self._missing(full, kind, times) from exc
+            raise self._missing_error(full, kind, times) from exc
         except StopAsyncIteration as exc:
             raise RosError(f"{full}: the node of the camera was closed meanwhile") from exc
         finally:
@@ -135,7 +135,7 @@ class CameraGraph:
                 return kind
         return COMPRESSED if topic.endswith("/compressed") else IMAGE
 
-    def _missing(self, topic: str, kind: str, times: list[float]) -> Exception:
+    def _missing_error(self, topic: str, kind: str, times: list[float]) -> Exception:
         old = f"; {len(times)} came that were taken before" if times else ""
         return Code.NO_PICTURE.refusal(
             f"{topic}: no picture came within {PICTURE_WAIT:g} s{old}; expected {kind} with the "

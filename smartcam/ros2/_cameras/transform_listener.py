@@ -238,7 +238,7 @@ class TransformListener:
         def root_of_chain() -> str:
             chain = self._chain(frame.strip("/"))
             if not chain:
-                raise self._strange(frame)
+                raise self._unknown_frame_error(frame)
             return chain[-1].parent
 
         return await self._until(root_of_chain)
@@ -278,7 +278,7 @@ class TransformListener:
         below = {base, *(link.parent for link in down)}
         shared = above & below
         if not shared:
-            raise self._strange(frame if not up else base if not down else frame, base)
+            raise self._unknown_frame_error(frame if not up else base if not down else frame, base)
         up = _until_shared(up, frame, shared)
         down = _until_shared(down, base, shared)
         at = utc
@@ -293,7 +293,7 @@ class TransformListener:
         when = None if not moving or at is None else _time(at)
         return Transform(base, frame, transform.rotation, transform.translation, when)
 
-    def _strange(self, frame: str, base: str = "") -> CalibrationError:
+    def _unknown_frame_error(self, frame: str, base: str = "") -> CalibrationError:
         known = sorted({*self._links, *(link.parent for link in self._links.values())})
         shown = ", ".join(known[:MAX_FRAMES_IN_ERROR]) or "no frame at all"
         to = f" to {base!r}" if base and base != frame else ""

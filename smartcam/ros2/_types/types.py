@@ -305,7 +305,7 @@ class RosTypes:
         if self._shared is not None and name not in self._added:
             return self._shared.service(name)
         if (text := self._service_text(name)) is None:
-            raise self._unknown(name)
+            raise self._unknown_type_error(name)
         with self._lock:
             if (made := self._services.get(name)) is None:
                 for definition in (*parse_service(name, text), event_of(name)):
@@ -355,7 +355,7 @@ class RosTypes:
             elif name in MESSAGES:
                 made = parse_message(name, MESSAGES[name])
             else:
-                raise self._unknown(name)
+                raise self._unknown_type_error(name)
             self._definitions[name] = made
         return made
 
@@ -400,7 +400,7 @@ class RosTypes:
             return NOT_SUPPORTED
         return hash_of_description(description(definition, self.definition))
 
-    def _unknown(self, name: str) -> ConfigurationError:
+    def _unknown_type_error(self, name: str) -> ConfigurationError:
         close = did_you_mean(name, self.names())
         return ConfigurationError(
             f"{name}: no such type in {self.distribution}, expected a name of it or add() first"
