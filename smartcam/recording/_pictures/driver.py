@@ -49,16 +49,16 @@ class RecordedDriver(TaskDriver):
 
     ========== ====================================================================================
     ``camera`` name of the camera in the recording; needed where several have pictures
-    ``pace``   ``real`` (usual): with the times between pictures as they were; or ``none``: each
+    ``pace``   ``real`` (default): with the times between pictures as they were; or ``none``: each
                picture when the readers have taken the last one, and none is skipped
-    ``speed``  times faster than recorded, 0.001 to 1000; usual 1
-    ``name``   of the source; usual that of the camera
+    ``speed``  times faster than recorded, 0.001 to 1000; default 1
+    ``name``   of the source; default: that of the camera
     ========== ====================================================================================
 
     A frame has the recorded bytes, number, ``utc``, ``device_time``, ``moment`` and ``duration``;
     ``lost`` counts frames that were lost or not recorded before it. Only ``captured`` is a time of
     the replay, on ``time.monotonic()``, with the recorded intervals. If a recording is silent for
-    longer than a source allows, use ``stall=None``.
+    longer than a source allows, open the source with ``stall=None``.
     """
 
     times_frames: ClassVar[bool] = True
@@ -101,7 +101,7 @@ class RecordedDriver(TaskDriver):
 
     def _first(self) -> RecordedPicture:
         first: RecordedPicture | None = None
-        behind = 0
+        items_from_first = 0
         cameras: dict[str, None] = {}
         try:
             for item in each_item(self._path, lambda _: None):
@@ -109,13 +109,15 @@ class RecordedDriver(TaskDriver):
                     cameras[item.camera] = None
                     if first is None and self._camera in (None, item.camera):
                         first = item
-                behind += first is not None
-                if first is not None and (self._camera is not None or behind > MAX_LOOKAHEAD):
+                items_from_first += first is not None
+                if first is not None and (
+                    self._camera is not None or items_from_first > MAX_LOOKAHEAD
+                ):
                     break
         except (ConfigurationError, RecordingError) as exc:
             raise FrameSourceError(str(exc), source=self.name) from exc
         if self._camera is None and len(cameras) > 1:
-            raise self._several(cameras)
+            raise self._several_cameras_error(cameras)
         if first is None:
             cameras_text = f"; those of {', '.join(cameras)} are" if cameras else ""
             whose = f" of camera {self._camera!r}" if self._camera is not None else ""
@@ -124,7 +126,7 @@ class RecordedDriver(TaskDriver):
             )
         return first
 
-    def _several(self, cameras: dict[str, None]) -> FrameFormatError:
+    def _several_cameras_error(self, cameras: dict[str, None]) -> FrameFormatError:
         return FrameFormatError(
             f"{self._path}: there are pictures of {', '.join(cameras)}: choose one, such as "
             f"{self._path}#camera={next(iter(cameras))}",
@@ -157,7 +159,7 @@ class RecordedDriver(TaskDriver):
         """Return the next picture, read in a thread; None at the end."""
         reading = asyncio.get_running_loop().run_in_executor(None, next, pictures, None)
         self._reading = reading
-        reading.add_done_callback(_looked_at)
+        reading.add_done_callback(_retrieve_exception)
         return await asyncio.shield(reading)
 
     async def deliver(self, sink: FrameSink) -> None:
@@ -192,10 +194,10 @@ class RecordedDriver(TaskDriver):
 def _between(last: Frame, frame: Frame) -> float:
     """Return the seconds between two captures, by the monotonic clock if both are from one run."""
     by_clock, by_utc = frame.captured - last.captured, frame.utc - last.utc
-    same_run = by_clock >= 0 and abs(by_clock - by_utc) < 1 + 0.01 * by_clock
-    return by_clock if same_run else max(0.0, by_utc)
+    same_clock = by_clock >= 0 and abs(by_clock - by_utc) < 1 + 0.01 * by_clock
+    return by_clock if same_clock else max(0.0, by_utc)
 
 
-def _looked_at(done: asyncio.Future[RecordedPicture | None]) -> None:
+def _retrieve_exception(done: asyncio.Future[RecordedPicture | None]) -> None:
     if not done.cancelled():
         done.exception()  # the caller may no longer wait
