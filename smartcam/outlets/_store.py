@@ -243,7 +243,7 @@ class _StoreFile:
                 except _UNFIT as exc:
                     raise EntryRefusedError(text_of(exc), place=place) from exc
         if self._identity_there() != self._identity:
-            raise OutletError(f"the store {self.path} was moved or deleted: it is begun anew")
+            raise OutletError(f"the store {self.path} was moved or deleted: a new one is begun")
 
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
         fields: dict[str, Any] = _readable(json.loads(entry.body))

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import VisionResult
 
 MAX_BOOK_CHARACTERS = 1 << 28
-"""Largest number of characters of the values that the results of a server keep, as JSON."""
+"""Largest total length of the values, as JSON, of all results that a server keeps, characters."""
 
 MAX_HANDLES = 10_000
 """Largest number of handles that clients have not released; beyond it the oldest are removed."""
@@ -22,15 +22,15 @@ class KeptResult(NamedTuple):
 
     Attributes:
         result: the result.
-        value: result as the nodeset's structure.
+        structure: result as the nodeset's structure.
         recipe: name of its recipe.
-        text: values of the result as JSON; "" without values.
+        values_json: values of the result as JSON; "" without values.
     """
 
     result: VisionResult
-    value: Any
+    structure: Any
     recipe: str
-    text: str
+    values_json: str
 
 
 class ResultBook:
@@ -49,13 +49,15 @@ class ResultBook:
     def add(self, kept: KeptResult) -> None:
         """Add a result; an earlier one with the same id is replaced."""
         before = self._results.pop(kept.result.id, None)
-        self._characters += len(kept.text) - (0 if before is None else len(before.text))
+        self._characters += len(kept.values_json) - (
+            0 if before is None else len(before.values_json)
+        )
         self._results[kept.result.id] = kept
         while len(self._results) > self._most or (
             self._characters > MAX_BOOK_CHARACTERS and len(self._results) > 1
         ):
             _, gone = self._results.popitem(last=False)
-            self._characters -= len(gone.text)
+            self._characters -= len(gone.values_json)
 
     def get(self, key: str, camera: str) -> KeptResult | None:
         """Return a camera's result by its id; None if it is unknown, or no longer kept."""
@@ -68,7 +70,7 @@ class ResultBook:
             if kept.result.camera == camera and fits(kept):
                 yield kept
 
-    def handle(self, timeout: int) -> int:
+    def new_handle(self, timeout: int) -> int:
         """Return a new handle; 0 for a client that needs none, since its ``timeout`` is 0."""
         if timeout == 0:
             return 0

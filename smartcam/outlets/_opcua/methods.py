@@ -227,7 +227,7 @@ class Methods:
         if not job or kept is None:
             raise KeyError(f"there is no result of job {job!r:.80}")
         state = ua.Variant(kept.result.state, ua.VariantType.Int32)
-        text = ua.Variant(kept.text, ua.VariantType.String)
+        text = ua.Variant(kept.values_json, ua.VariantType.String)
         return [state, text, ua.Variant(kept.result.error, ua.VariantType.String)]
 
     # ------------------------------------------------------------------ recipes
@@ -275,12 +275,12 @@ class Methods:
 
     async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
         kept = self._kept_result(result)
-        value = ua.Variant(kept.value, ua.VariantType.ExtensionObject)
-        return [_number(self._book.handle(timeout)), value]
+        value = ua.Variant(kept.structure, ua.VariantType.ExtensionObject)
+        return [_number(self._book.new_handle(timeout)), value]
 
     async def _components(self, result: Any, timeout: int) -> list[ua.Variant]:
-        value = self._kept_result(result).value
-        handle = _number(self._book.handle(timeout))
+        value = self._kept_result(result).structure
+        handle = _number(self._book.new_handle(timeout))
         outputs = [_boolean(bool(value.HasTransferableDataOnFile)), handle]
         for name, of in _COMPONENTS:
             component = getattr(value, name)
@@ -298,7 +298,7 @@ class Methods:
         def fits(kept: KeptResult) -> bool:
             if state and kept.result.state != state:
                 return False
-            identities = [getattr(kept.value, name) for name, _ in wanted]
+            identities = [getattr(kept.structure, name) for name, _ in wanted]
             texts = [text for _, text in wanted]
             return all(
                 identity is not None and identity.Id == text
@@ -308,8 +308,8 @@ class Methods:
         limit = _most(most)
         matching = self._book.newest(self._nodes.name, fits)
         page = [*itertools.islice(matching, first, first + limit + 1)]
-        listed = [kept.value for kept in page[:limit]]
-        handle = _number(self._book.handle(timeout))
+        listed = [kept.structure for kept in page[:limit]]
+        handle = _number(self._book.new_handle(timeout))
         return [_boolean(len(page) <= limit), _number(len(listed)), handle, _list(listed)]
 
     async def _release(self, handle: int) -> list[ua.Variant]:
