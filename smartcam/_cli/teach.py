@@ -57,7 +57,7 @@ LINGER: Final = 3.0
     help="Set tolerances from the PICTURES, which show good parts, and print the reasons.",
 )
 @click.option("--save", is_flag=True, help="Write the file.")
-@page_options("", always=True)
+@page_options(always=True)
 @option("--seconds")
 @runs(*OUTPUT)
 async def teach(
@@ -88,7 +88,7 @@ async def teach(
             from smartcam import frames
 
             source = await stack.enter_async_context(frames.open(teaching.frames, linger=LINGER))
-        site = TeachSite(teaching, files, source=source, **web.place)
+        site = TeachSite(teaching, files, source=source, **web.site_arguments)
         await first([_serve(site, options)], options.seconds)
 
 
@@ -108,7 +108,7 @@ def _change(
 ) -> None:
     """Change the tools, try them, and save them if that is asked for."""
     from smartcam.inspection import Picture
-    from smartcam.inspection._inside import learned
+    from smartcam.inspection._inside import learn_tolerances
 
     tools = _changed(teaching.tools, changes)
     program = teaching.program(tools)
@@ -118,7 +118,7 @@ def _change(
         if not pictures:
             raise click.UsageError("--learn: expected PICTURES of good parts, got none")
         seen = {str(file): program.inspect(picture) for file, picture in pictures}
-        tools, remarks = learned(tools, seen)
+        tools, remarks = learn_tolerances(tools, seen)
         program = teaching.program(tools)
     for file, picture in pictures:
         _show(str(file), program.inspect(picture), options)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
     from smartcam.inspection._camera.pairing import JudgedResults
     from smartcam.inspection._cell import CellCamera, Software, make_camera, software_mistakes
-    from smartcam.inspection._learning import learned
+    from smartcam.inspection._learning import learn_tolerances
     from smartcam.inspection._teaching import Teaching, read_settings, setting_text, tool_settings
 
 __all__ = [
@@ -19,7 +19,7 @@ __all__ = [
     "Software",
     "Teaching",
     "judged_source",
-    "learned",
+    "learn_tolerances",
     "make_camera",
     "read_settings",
     "setting_text",
@@ -34,7 +34,7 @@ if not TYPE_CHECKING:
             "_cell": "software_mistakes make_camera Software CellCamera",
             "_camera.judged_frames": "judged_source",
             "_camera.pairing": "JudgedResults",
-            "_learning": "learned",
+            "_learning": "learn_tolerances",
             "_teaching": "Teaching read_settings setting_text tool_settings",
         },
     )

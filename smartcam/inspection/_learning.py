@@ -22,7 +22,7 @@ AREA_MARGIN: Final = 0.2
 """Share by which a spot may be smaller or larger than the spots of the good pictures."""
 
 DIFFERENCE_MARGIN: Final = 1.5
-"""Ratio of the allowed number of differing pixels to the largest of the good pictures."""
+"""Ratio of the allowed number of differing pixels to the largest number in a good picture."""
 
 MIN_VALUES: Final = 5
 """Least number of good pictures with a value to learn a tolerance: fewer do not show outliers."""
@@ -66,10 +66,12 @@ class _Learned(NamedTuple):
     remark: str
 
 
-_NOTHING: Final = _Learned({}, "no picture has a value: all stays as it is.")
+_NOTHING: Final = _Learned({}, "no picture has a value: all settings stay as they are.")
 
 
-def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspection]) -> Lesson:
+def learn_tolerances(
+    tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspection]
+) -> Lesson:
     """Return the tools with tolerances that accept the good pictures.
 
     Outliers among measured values are left out, and the remarks name their pictures.
@@ -86,14 +88,18 @@ def learned(tools: Mapping[str, Mapping[str, Any]], good: Mapping[str, Inspectio
             remarks.append(f"{key}: a tool of this kind has no tolerance to learn.")
             continue
         seen = {
-            picture: had.findings[name] for picture, had in good.items() if name in had.findings
+            picture: inspection.findings[name]
+            for picture, inspection in good.items()
+            if name in inspection.findings
         }
         measured = {
-            picture: had
-            for picture, had in seen.items()
-            if had.values or had.records or had.details
+            picture: finding
+            for picture, finding in seen.items()
+            if finding.values or finding.records or finding.details
         }
-        left_out = {picture: had.reason for picture, had in seen.items() if picture not in measured}
+        left_out = {
+            picture: finding.reason for picture, finding in seen.items() if picture not in measured
+        }
         changes, remark = _LEARNERS[kind](measured, settings) if measured else _NOTHING
         settings.update(changes)
         remarks.append(f"{key}: {remark}{_left_out(left_out)}")
@@ -105,7 +111,7 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
     counts = [int(finding.values.get("count", 0)) for finding in findings]
     tolerances: dict[str, Any] = {"count": [min(counts), max(counts)]}
     many = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
-    remark = f"{many} spots in {_pictures(len(seen))}"
+    remark = f"{many} spots in {'each of ' if len(seen) > 1 else ''}{_pictures(len(seen))}"
     each = [finding.records or (finding.values,) for finding in findings]
     areas = [float(record["area"]) for records in each for record in records if record.get("area")]
     if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
@@ -116,7 +122,10 @@ def _learn_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) ->
             "and more"
         )
     elif any(counts):  # the area of spots outside of the result is unknown
-        remark += "; area stays as it is, since `most` leaves some of them out of the result"
+        remark += (
+            "; the setting `area` stays as it is, since the setting `most` leaves some of them out "
+            "of the result"
+        )
     return _Learned(tolerances, f"{remark}.")
 
 
@@ -135,7 +144,10 @@ def _learn_read(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
         if record.get("text")
     }
     if len(texts) != 1:
-        return _Learned({}, f"{len(texts)} texts in {_pictures(len(seen))}: expect stays as it is.")
+        return _Learned(
+            {},
+            f"{len(texts)} texts in {_pictures(len(seen))}: the setting `expect` stays as it is.",
+        )
     text = texts.pop()
     return _Learned({"expect": re.escape(text)}, f"the text {text!r:.60} in all that was read.")
 
@@ -171,7 +183,7 @@ def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> 
         return _Learned(
             {},
             f"expected {MIN_VALUES} good pictures with a value or more, got {len(values)}: the "
-            f"tolerance stays as it is.{_left_out(left_out)}",
+            f"setting `tolerance` stays as it is.{_left_out(left_out)}",
         )
     guard = float(settings.get("guard", 2.0)) * float(sigmas.max())
     mean, spread = float(values.mean()), float(values.std(ddof=1))
@@ -190,11 +202,11 @@ def _is_number(details: Any) -> bool:
     return math.isfinite(details.value) and math.isfinite(details.sigma) if details else False
 
 
-def _unit(old: Tolerance | None, measured: str) -> tuple[str, float]:
+def _unit(old: Tolerance | None, measured_unit: str) -> tuple[str, float]:
     """Return the unit to write, and its ratio to the measured unit."""
-    written = measured if old is None else old.written_unit
+    written = measured_unit if old is None else old.written_unit
     name, factor = UNITS[written]
-    return (written, factor) if name == measured else (measured, 1.0)
+    return (written, factor) if name == measured_unit else (measured_unit, 1.0)
 
 
 def _unwrapped(values: Array) -> Array:
@@ -222,40 +234,40 @@ def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_
 
 def _text(values: Array, spread: float, guard: float, old: Tolerance | None, unit: str) -> str:
     """Return the tolerance of values (N,), one-sided if the old tolerance was."""
-    mean, sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
-    wide = _tolerance_factor(len(values), sided=sided) * spread
+    mean, one_sided = float(values.mean()), old is not None and math.inf in (-old.least, old.most)
+    wide = _tolerance_factor(len(values), one_sided=one_sided) * spread
     half = max(wide, float(np.abs(values - mean).max())) + guard
     digits = min(max(1 - math.floor(math.log10(half)), 0), MAX_DIGITS) if half > 0 else 3
     step = 10.0**-digits
 
-    def out(value: float) -> float:
+    def round_outwards(value: float) -> float:
         return (math.floor(value / step) + 1) * step
 
-    if sided and old is not None and old.least == -math.inf:
-        return f"at most {out(mean + half):.{digits}f} {unit}"
-    if sided:
-        return f"at least {-out(-(mean - half)):.{digits}f} {unit}"
+    if one_sided and old is not None and old.least == -math.inf:
+        return f"at most {round_outwards(mean + half):.{digits}f} {unit}"
+    if one_sided:
+        return f"at least {-round_outwards(-(mean - half)):.{digits}f} {unit}"
     middle = round(mean, digits)
-    return f"{middle:.{digits}f} +- {out(half + abs(middle - mean)):.{digits}f} {unit}"
+    return f"{middle:.{digits}f} +- {round_outwards(half + abs(middle - mean)):.{digits}f} {unit}"
 
 
-def _tolerance_factor(number: int, *, sided: bool) -> float:
+def _tolerance_factor(number: int, *, one_sided: bool) -> float:
     """Return the tolerance factor of ``number`` normal values, in standard deviations.
 
     The formulas are Howe's for two sides, and Natrella's approximation for one side.
     """
     special = load("scipy.special", "teaching measure needs")
     degrees = number - 1
-    if sided:
+    if one_sided:
         # quantiles of the normal distribution
-        z_part, z_sure = (
+        z_coverage, z_sure = (
             float(special.ndtri(probability)) for probability in (TOLERANCE_COVERAGE, CONFIDENCE)
         )
-        a, b = 1 - z_sure**2 / (2 * degrees), z_part**2 - z_sure**2 / number
-        return (z_part + math.sqrt(z_part**2 - a * b)) / a
-    z_part = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
+        a, b = 1 - z_sure**2 / (2 * degrees), z_coverage**2 - z_sure**2 / number
+        return (z_coverage + math.sqrt(z_coverage**2 - a * b)) / a
+    z_coverage = float(special.ndtri((1 + TOLERANCE_COVERAGE) / 2))
     least = float(special.chdtri(degrees, CONFIDENCE))  # lower quantile of chi squared
-    return z_part * math.sqrt(degrees * (1 + 1 / number) / least)
+    return z_coverage * math.sqrt(degrees * (1 + 1 / number) / least)
 
 
 def _left_out(left_out: Mapping[str, str]) -> str:

@@ -18,7 +18,12 @@ from smartcam.web._threaded_site import ThreadedSite
 
 with from_part("inspection", "teaching needs"):
     from smartcam.inspection import Picture
-    from smartcam.inspection._inside import learned, read_settings, setting_text, tool_settings
+    from smartcam.inspection._inside import (
+        learn_tolerances,
+        read_settings,
+        setting_text,
+        tool_settings,
+    )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -194,7 +199,7 @@ class TeachSite(ThreadedSite):
         }
         if not seen:
             raise ConfigurationError("expected good pictures to learn from, got none")
-        lesson = learned(read_settings(given), seen)
+        lesson = learn_tolerances(read_settings(given), seen)
         return {"tools": texts_of(lesson.tools), "learned": lesson.remarks}
 
     def state(self) -> dict[str, Any]:

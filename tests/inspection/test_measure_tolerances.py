@@ -11,7 +11,7 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import Finding
-from smartcam.inspection._inside import learned
+from smartcam.inspection._inside import learn_tolerances
 from smartcam.inspection._learning import TOLERANCE_COVERAGE, Lesson
 from smartcam.inspection._measure.tolerances import Tolerance
 
@@ -100,7 +100,7 @@ def lesson(
         found = Finding(ok=there, reason="" if there else "no edge: none", details=details)
         good[f"part{number}.png"] = SimpleNamespace(findings={"measure": found})
     settings = {"width": {}, **more, **({} if before is None else {"tolerance": before})}
-    return learned({"measure": settings}, good)
+    return learn_tolerances({"measure": settings}, good)
 
 
 def tolerance(found: Lesson) -> Tolerance:
@@ -195,11 +195,11 @@ def test_a_tool_that_was_not_asked_teaches_nothing() -> None:
         "a.png": SimpleNamespace(findings={"present": Finding(ok=False, reason="outside")}),
         "b.png": SimpleNamespace(findings={"present": Finding(ok=True, values={"count": 2})}),
     }
-    found = learned({"present": {}}, good)
+    found = learn_tolerances({"present": {}}, good)
     assert found.tools == {"present": {"count": [2, 2]}}
     assert found.remarks == [
-        "present: 2 spots in 1 picture; area stays as it is, since `most` leaves some of them "
-        "out of the result. Not learned from: a.png (outside)."
+        "present: 2 spots in 1 picture; the setting `area` stays as it is, since the setting "
+        "`most` leaves some of them out of the result. Not learned from: a.png (outside)."
     ]
     del good["b.png"]
-    assert learned({"present": {"count": 3}}, good).tools == {"present": {"count": 3}}
+    assert learn_tolerances({"present": {"count": 3}}, good).tools == {"present": {"count": 3}}

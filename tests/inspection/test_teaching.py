@@ -9,7 +9,7 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import Picture, load_cell
-from smartcam.inspection._inside import Teaching, learned, read_settings, setting_text
+from smartcam.inspection._inside import Teaching, learn_tolerances, read_settings, setting_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -139,9 +139,12 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
     tools: dict[str, dict[str, Any]] = {"present": {"grey": [0, 120], "area": [1, 9999], "most": 4}}
     good = [spots(10, 10), spots(9, 11), spots(10, 11)]
     program = teaching.program(tools)
-    found, remarks = learned(tools, {str(n): program.inspect(one) for n, one in enumerate(good)})
+    found, remarks = learn_tolerances(
+        tools, {str(n): program.inspect(one) for n, one in enumerate(good)}
+    )
     assert remarks == [
-        "present: 2 spots in 3 pictures, of 81 to 121 pixels; area allows 20% less and more."
+        "present: 2 spots in each of 3 pictures, of 81 to 121 pixels; area allows 20% less and "
+        "more."
     ]
     assert found["present"]["count"] == [2, 2]
     assert found["present"]["area"] == [64, 146]
@@ -153,7 +156,7 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
 def test_tolerances_of_unknown_areas_are_not_learned(path: Path) -> None:
     tools = {"present": {"grey": [0, 120]}}  # only the largest is in the result
     program = Teaching(path, "cam", 7).program(tools)
-    found = learned(tools, {"one": program.inspect(spots(10, 6))})
+    found = learn_tolerances(tools, {"one": program.inspect(spots(10, 6))})
     assert found.tools == {"present": {"grey": [0, 120], "count": [2, 2]}}
 
 

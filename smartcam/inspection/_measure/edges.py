@@ -594,7 +594,7 @@ def choose(strip_edges: StripEdges, which: Choice) -> Edge:
         raise strip_edges.too_many
     edges = strip_edges.edges
     if which == "single" and len(edges) > 1:
-        raise _several(edges, "one was")
+        raise _several_edges_error(edges, "one was")
     if which == "strongest":
         return sound(max(edges, key=lambda judged_edge: abs(judged_edge.edge.height)))
     if which == "nearest":
@@ -616,7 +616,7 @@ def choose_pair(strip_edges: StripEdges, which: PairChoice) -> tuple[Edge, Edge]
     if which == "outermost":
         return sound(edges[0]), sound(edges[-1])
     if which == "single" and len(edges) > 2:
-        raise _several(edges, "two were")
+        raise _several_edges_error(edges, "two were")
     pairs = [
         (first, other)
         for first, other in itertools.pairwise(edges)
@@ -640,7 +640,7 @@ def sound(judged_edge: JudgedEdge) -> Edge:
     return judged_edge.edge
 
 
-def _several(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
+def _several_edges_error(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
     places = ", ".join(f"{edge.edge.place:.1f}" for edge in edges[:4])
     text = f"{len(edges)} edges where {expected} expected, {places} px from the region's middle"
     return NotMeasuredError(NoValueReason.TWO_EDGES, text)

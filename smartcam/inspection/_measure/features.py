@@ -164,7 +164,7 @@ def _collected(
             owners.append(owner)
     number = len(edges) + len(troubles)
     if len(edges) < MIN_FOUND_SHARE * number:
-        raise _few(troubles, number)
+        raise _too_few_error(troubles, number)
     places = np.array([edge.place for edge in edges])
     noises = np.array([edge.noise for edge in edges])
     noise = float(np.median(noises))
@@ -182,7 +182,7 @@ def _collected(
     return FoundShape(seen, tuple(troubles), blur, misfit)
 
 
-def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
+def _too_few_error(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
     """Return the error for a line or a circle with too few strips with an edge."""
     kinds = [trouble.why for trouble in troubles]
     most = max(kinds, key=kinds.count)
