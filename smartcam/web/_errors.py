@@ -51,7 +51,7 @@ def _expected(kind: str, text: str) -> str:
     )
 
 
-def refused_fields(error: ValidationError) -> RefusedError:
+def wrong_fields_error(error: ValidationError) -> RefusedError:
     """Return the refusal of a body or a query with wrong fields (422)."""
     fields = tuple(
         {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError
 from smartcam.web._failure_pictures import FailurePictures
-from smartcam.web._fleet_outlets import OutletsView, StoredRows
+from smartcam.web._fleet_outlets import OutletsView, StoredQuery
 from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
 from smartcam.web._fleet_view import FleetView
 from smartcam.web._live import CALLS as LIVE_CALLS
@@ -254,7 +254,7 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/stored",
-    query=StoredRows,
+    query=StoredQuery,
     about="The contents of agents' stores of results: the query may have `hours`, `failed` "
     "(errors, gaps, failures), `camera` (a pattern), `most`.",
 )

@@ -22,12 +22,12 @@ MAX_STORE_QUESTIONS: Final = 4
 """Largest number of questions to the stores at a time."""
 
 
-class StoredRows(BaseModel):
+class StoredQuery(BaseModel):
     """The query of a page for stored results."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
-    hours: float = Field(default=8.0, gt=0, le=24 * 3660)
+    hours: float = Field(default=8.0, gt=0, le=10 * 366 * 24)
     failed: bool = False
     camera: str = Field(default="**", max_length=200)
     most: int = Field(default=200, ge=0, le=1000)
@@ -45,7 +45,7 @@ class OutletsView:
         self._accounts: list[ReportedOutlet] = []
         self._at = -ANSWER_AGE
         self._turn = asyncio.Lock()
-        self._stores = asyncio.Semaphore(MAX_STORE_QUESTIONS)
+        self._store_questions = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
     async def accounts(self) -> list[ReportedOutlet]:
         """Return the accounts of all outlets, at most :data:`ANSWER_AGE` seconds old.
@@ -59,23 +59,23 @@ class OutletsView:
                 try:
                     self._accounts = await self._fleet.outlets()
                 except ConnectionClosedError as exc:
-                    raise RefusedError(503, str(exc)[:300], "an open fleet") from exc
+                    raise RefusedError(503, str(exc)[:300], expected="an open fleet") from exc
                 self._at = loop.time()
             return self._accounts
 
-    async def stored(self, wanted: StoredRows) -> list[ReportedStore]:
+    async def stored(self, wanted: StoredQuery) -> list[ReportedStore]:
         """Return the answers of the stores.
 
         Raises:
             RefusedError: 422, the pattern is not valid; 503, the fleet is closed.
         """
         since = datetime.now(UTC) - timedelta(hours=wanted.hours)
-        async with self._stores:
+        async with self._store_questions:
             try:
                 return await self._fleet.stored_results(
                     wanted.camera, since=since, failed=wanted.failed, most=wanted.most
                 )
             except ConfigurationError as exc:
-                raise RefusedError(422, str(exc)[:300], "a pattern of cameras") from exc
+                raise RefusedError(422, str(exc)[:300], expected="a pattern of cameras") from exc
             except ConnectionClosedError as exc:
-                raise RefusedError(503, str(exc)[:300], "an open fleet") from exc
+                raise RefusedError(503, str(exc)[:300], expected="an open fleet") from exc

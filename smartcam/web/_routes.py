@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from smartcam.exceptions import ConfigurationError, LinkError
 from smartcam.models import jsonable
 from smartcam.web._connections import visitor_of
-from smartcam.web._errors import RefusedError, refused_fields, shown
+from smartcam.web._errors import RefusedError, shown, wrong_fields_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -138,7 +138,7 @@ def _validate(model: _Model, value: object) -> Any:
             return model.validate_python(value)
         return model.model_validate(value)
     except ValidationError as exc:
-        raise refused_fields(exc) from exc
+        raise wrong_fields_error(exc) from exc
 
 
 def _checked_query(model: type[BaseModel] | None, request: web.Request) -> Any:
@@ -227,28 +227,28 @@ def middleware(guard: Guard, prefix: str) -> Any:
         except RefusedError as exc:
             refusal = exc
         except web.HTTPException as exc:
-            refusal = _translated(exc, prefix)
+            refusal = _translated_error(exc, prefix)
         except LinkError:  # a ConnectionError, but of a camera and not of the client
-            refusal = _fault(request)
+            refusal = _internal_error(request)
         except ConnectionError:
             refusal = RefusedError(400, "a connection that ended", "the whole of a request")
         except ConfigurationError as exc:
             refusal = RefusedError(422, str(exc), "what this camera has")
         except Exception:  # noqa: BLE001  the last place: the client is told
-            refusal = _fault(request)
+            refusal = _internal_error(request)
         tried = f"{request.method} {request.path}"
         return _json(refusal.status, refusal.as_json(shown(tried)[1:-1]), refusal.headers)
 
     return placed
 
 
-def _fault(request: web.Request) -> RefusedError:
+def _internal_error(request: web.Request) -> RefusedError:
     """Log the exception that is being handled, and return the refusal for the client."""
     _log.exception("! %s %s: a fault of ours", request.method, request.path)
     return RefusedError(500, "a fault of ours", "this to be reported, with the log")
 
 
-def _translated(error: web.HTTPException, prefix: str) -> RefusedError:
+def _translated_error(error: web.HTTPException, prefix: str) -> RefusedError:
     match error:
         case web.HTTPMethodNotAllowed():
             allowed = ", ".join(sorted(error.allowed_methods))

@@ -111,7 +111,7 @@ _STATUS = {
 """HTTP status by the code of a refusal; 422 for all others."""
 
 
-def _refused(error: CalibrationError) -> RefusedError:
+def _refused_error(error: CalibrationError) -> RefusedError:
     cause, expected = [*re.split(r"[;:] expected ", str(error), maxsplit=1), ""][:2]
     status = next((code for kind, code in _STATUS.items() if kind == error.code), 422)
     field = {"field": "code", "came": error.code, "expected": ""}
@@ -141,7 +141,7 @@ def _call(
                 value = handler(site.service, call.body)
                 return await value if inspect.isawaitable(value) else value
             except CalibrationError as exc:
-                raise _refused(exc) from exc
+                raise _refused_error(exc) from exc
             except OSError as exc:
                 raise RefusedError(500, f"the {writes}: {exc.strerror}", "one to write to") from exc
 
