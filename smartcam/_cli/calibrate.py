@@ -259,7 +259,7 @@ def _exit(view: Mapping[str, Any]) -> None:
 async def _serve(service: CalibrationService, options: Options, web: PageOptions) -> None:
     from smartcam.web import WizardSite
 
-    async with WizardSite(service, **web.place) as site:
+    async with WizardSite(service, **web.site_arguments) as site:
         options.show({"page": site.url}, f"page: {site.url}")
         await asyncio.Event().wait()
 

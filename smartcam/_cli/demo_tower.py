@@ -224,7 +224,7 @@ def loose_blocks(
         if abs(height - BLOCK[2]) < EDGE:  # the block is not on the tower
             lying.append(_pose(sight, region, height))
     if not lying:
-        raise _nothing(sight, colours)
+        raise _nothing_found_error(sight, colours)
     return lying
 
 
@@ -237,7 +237,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
     sight = table.look((rough.x, rough.y, MEASURING_HEIGHT), maps=0)
     poses = [_pose(sight, region, BLOCK[2]) for region in _regions(sight, colours)]
     if not poses:
-        raise _nothing(sight, colours)
+        raise _nothing_found_error(sight, colours)
     block = min(poses, key=lambda pose: math.dist(pose[:2], rough[:2]))
     beside = math.dist(block[:2], rough[:2])
     if beside > BLOCK[1] / 2:
@@ -328,7 +328,7 @@ def _pose(sight: TableSight, region: ColourRegion, height: float) -> BlockPose:
     return BlockPose(x, y, math.remainder(math.atan2(direction[1], direction[0]), math.pi), height)
 
 
-def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
+def _nothing_found_error(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     """Return an error that describes the regions of a colour, none of which is a block."""
     least, most = _area(sight)
     regions = find_regions(colours.mask(sight.rgb), area=(least / 10, math.inf))

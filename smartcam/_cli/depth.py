@@ -76,7 +76,7 @@ _UNIT = click.option(
     help="The axis that points up; -y in the frame of a level camera.",
 )
 @_UNIT
-@page_options("", always=True)
+@page_options(always=True)
 @option("--seconds")
 @runs(*OUTPUT)
 async def show(
@@ -86,7 +86,7 @@ async def show(
     from smartcam.web import CloudSite
 
     cloud = await asyncio.to_thread(load_cloud, file, unit=unit)
-    async with CloudSite(cloud, up=up, **web.place) as site:
+    async with CloudSite(cloud, up=up, **web.site_arguments) as site:
         options.show(
             {"page": site.url, "file": file, "points": len(cloud)},
             f"page: {site.url}\n  {file}: {len(cloud):,} points",
@@ -119,8 +119,8 @@ async def show(
 @click.option(
     "--outliers",
     is_flag=True,
-    help="Leave out the points whose 20 nearest are farther away than most points' are: above the "
-    "mean by two standard deviations.",
+    help="Leave out the points whose mean distance to their 20 nearest neighbours is large: above "
+    "that of all points by two standard deviations.",
 )
 @click.option(
     "--voxel",

@@ -277,7 +277,7 @@ async def take_back(url: str, camera: str, options: Options) -> None:
 @click.option(
     "--control", is_flag=True, help="The pages may trigger, start, stop and switch applications."
 )
-@page_options("", always=True)
+@page_options(always=True)
 @runs(*_READING, "--seconds", "--timeout", *OUTPUT, interrupted=0, terminated=0)
 async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
     from smartcam.web import FleetSite
@@ -289,7 +289,7 @@ async def page(url: str, control: bool, web: PageOptions, options: Options) -> N
             contextlib.AsyncExitStack() as stack,
         ):
             opened = await stack.enter_async_context(_awaited(url, options))
-            site = FleetSite(opened, control=control, units=units, **web.place)
+            site = FleetSite(opened, control=control, units=units, **web.site_arguments)
             await stack.enter_async_context(site)
             options.show({"page": site.url}, f"page: {site.url}")
             await asyncio.Event().wait()

@@ -35,7 +35,7 @@ LINGER: Final = 3.0
     metavar="JSON",
     help="Range at the beginning, as the page copies it, such as '{\"value\": [0, 60]}'.",
 )
-@page_options("", always=True)
+@page_options(always=True)
 @option("--seconds")
 @option("--timeout", help="Longest wait for a frame.  [default: 5]")
 @runs(*OUTPUT)
@@ -48,7 +48,7 @@ async def colours(url: str, begin: str | None, web: PageOptions, options: Option
         from smartcam.web import ColourSite
     seconds = options.step(FRAME_TIMEOUT)
     source = open_frames(url, timeout=seconds, stall=seconds, linger=LINGER)
-    site = ColourSite(source, colours=_range(begin), **web.place)
+    site = ColourSite(source, colours=_range(begin), **web.site_arguments)
     async with source:
         await first([_serve(site, options)], options.seconds)
 

@@ -65,7 +65,7 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
             is_flag=True,
             help="Everyone who can open the page may set features of the devices and trigger them.",
         ),
-        page_options("", always=True),
+        page_options(always=True),
         option("--seconds"),
         option("--timeout", help=TIMEOUT),
         runs(*OUTPUT, terminated=terminated),
@@ -160,7 +160,7 @@ async def serve_sources(
     from smartcam.web import FramesSite
 
     sources = [opened(url, options) for url in urls]
-    site = FramesSite(sources, quality=quality, changes=changes, **web.place)
+    site = FramesSite(sources, quality=quality, changes=changes, **web.site_arguments)
     tries = _Tries(len(sources))
     keeping = [site.pictures.keep_open(place, tries.of(place)) for place in range(len(sources))]
     await first([_serve(site, tries, players, options), *keeping], None)

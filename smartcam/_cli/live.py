@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @click.option(
     "--control", is_flag=True, help="The page may trigger, start, stop and switch applications."
 )
-@page_options("", always=True)
+@page_options(always=True)
 @runs(
     *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--units"),
     "--seconds",
@@ -52,7 +52,9 @@ async def serve_page(
         options.remark(camera)
         with contextlib.suppress(TimeoutError):  # --seconds are over
             async with asyncio.timeout(options.seconds):
-                async with LiveSite(camera, control=control, units=units, **web.place) as site:
+                async with LiveSite(
+                    camera, control=control, units=units, **web.site_arguments
+                ) as site:
                     options.show({"page": site.url}, f"page: {site.url}")
                     await have_open(camera, make, site.view.follow)
 

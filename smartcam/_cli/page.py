@@ -22,7 +22,7 @@ class PageOptions:
 
     Attributes:
         wanted: whether there is a page.
-        place: address of the page, and its token, in the form for a site.
+        site_arguments: address of the page, and its token, in the form for a site.
 
     Raises:
         click.UsageError: options of a page are given without a page.
@@ -36,7 +36,7 @@ class PageOptions:
         if needless and not web:
             raise click.UsageError(f"{needless[0]} needs --web")
         self.wanted: bool = web
-        self.place: dict[str, Any] = {
+        self.site_arguments: dict[str, Any] = {
             "host": web_host or "127.0.0.1",
             "port": web_port or 0,
             "token": web_token,
@@ -44,7 +44,7 @@ class PageOptions:
 
 
 def page_options(
-    about: str, *, always: bool = False
+    about: str = "", *, always: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that gives a command the options of a page, as ``web``.
 

@@ -200,7 +200,7 @@ async def _open_page(
         return None
     from smartcam.web import EmulatorSite
 
-    site = EmulatorSite({camera.name: camera for camera in cameras}, **web.place)
+    site = EmulatorSite({camera.name: camera for camera in cameras}, **web.site_arguments)
     await stack.enter_async_context(site)
     click.echo(f"page: {site.url}", err=True)
     return site.url
