@@ -209,7 +209,7 @@ async def _ask(exam: _GigEExamination) -> None:
         try:
             taken = await control.read_register(Register.CONTROL_PRIVILEGE)
         except FrameSourceError as exc:
-            raise await _no_answer(exam, exc) from exc
+            raise await _no_answer_error(exam, exc) from exc
         took = time.monotonic() - began
         other = await _register_or_0(control, Register.PRIMARY_APPLICATION_ADDRESS)
     finally:
@@ -231,7 +231,9 @@ async def _ask(exam: _GigEExamination) -> None:
         )
 
 
-async def _no_answer(exam: _GigEExamination, error: FrameSourceError) -> _ExaminationOverError:
+async def _no_answer_error(
+    exam: _GigEExamination, error: FrameSourceError
+) -> _ExaminationOverError:
     """Report why nothing answered, as far as possible."""
     others = await discovery.find(discovery.networks())
     at = [camera for camera in others if exam.host in (camera.address, camera.info.address)]

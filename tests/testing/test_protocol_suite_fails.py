@@ -95,7 +95,7 @@ def bad_dialect(**changes: Any) -> Any:
         ({"default_port": 0}, "1 to 65535"),
         ({"models": ("Acme1",)}, "expected capitals"),
         ({"dialects": {"other": LINES}}, "calls itself 'lines'"),
-        ({"parameters": {"quirks": "a thing"}}, "means something else"),
+        ({"parameters": {"quirks": "a thing"}}, "is reserved"),
         ({"parameters": {"speed": ""}}, "expected a line"),
     ],
 )

@@ -26,11 +26,11 @@ MAX_BODY_BYTES = 1 << 20
 
 
 _REFUSALS = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
-"""Codes of BVS ID that come alone (ID-a 52, published)."""
+"""Result codes of BVS ID that may be the whole body of an answer (ID-a 52, published)."""
 
 
 class BadBytesError(Exception):
-    """Received bytes are no frame of this dialect; the text says why."""
+    """Received bytes are not a frame of this dialect; the text says why."""
 
 
 class ReceivedFrame(NamedTuple):
@@ -103,7 +103,7 @@ class RawDialect:
     # ------------------------------------------------------------------ in
 
     def cut(self, buffer: bytes) -> tuple[int, bytes, int] | None:
-        """Return the first frame as id, body and size; None while it is incomplete.
+        """Return message id, body and total bytes of the first frame; None while it is incomplete.
 
         Raises:
             BadBytesError: no frame begins with these bytes.
@@ -144,7 +144,7 @@ class RawDialect:
         return self._spell(Sender.CAMERA, frame.message_id, frame.body)
 
     def spell_request(self, data: bytes) -> str:
-        """Return a sent frame in readable form, with hex; only hex for bytes that are no frame."""
+        """Return a sent frame in readable form, with hex; only hex if the bytes are not a frame."""
         try:
             parts = self.cut(data)
         except BadBytesError:
@@ -167,7 +167,7 @@ class RawDialect:
             return None  # a refusal may be only its code, for any request
         size = self._sizes().get(frame.message_id)
         if size is None:
-            return f"message {frame.message_id:#04x} is not one of a camera's"
+            return f"message {frame.message_id:#04x} is not one that a camera sends"
         least, exact = size
         if len(frame.body) < least or (exact and len(frame.body) != least):
             more = "" if exact else " or more"
@@ -176,16 +176,16 @@ class RawDialect:
         return None
 
     def _sizes(self) -> Mapping[int, tuple[int, bool]]:
-        """Return the length of each body of a camera in bytes, and whether it is exact."""
-        coded = self.dialect.coded
-        word, code = self.word, self.word if coded else 0
+        """Return the body length of each message that a camera sends, and whether it is exact."""
+        word = self.word
+        code_bytes = word if self.dialect.coded else 0
         table: dict[int, tuple[int, bool]] = {
-            MessageId.CONNECT: (code + word, True),
+            MessageId.CONNECT: (code_bytes + word, True),
             MessageId.STATUS: (2 * word if self.magic else word, True),
             MessageId.RESULT_CONTAINER: (0 if "no_id" in self.dialect.quirks else word, False),
-            MessageId.QUERY_APPLICATION: (code + word, True),
+            MessageId.QUERY_APPLICATION: (code_bytes + word, True),
             MessageId.SWITCH_APPLICATION: (2 * word, True),
-            MessageId.GET_CLOCK: (code + 6 * word, True),
+            MessageId.GET_CLOCK: (code_bytes + 6 * word, True),
         }
         if self.is_bid:
             acknowledged = (

@@ -56,17 +56,17 @@ class DialectChecks(Parameters):
         assert _is_line(protocol.name), f"name: expected a line, got {protocol.name!r}"
         assert protocol.schemes, "schemes: expected at least one"
         for scheme, transport in protocol.schemes.items():
-            assert SCHEME.fullmatch(scheme), f"scheme {scheme!r}: expected small letters"
+            assert SCHEME.fullmatch(scheme), f"scheme {scheme!r}: expected lower case"
             assert isinstance(transport, Transport), f"scheme {scheme!r}: {transport!r}"
         port = protocol.default_port
         assert 0 < port < 1 << 16, f"default_port: expected 1 to 65535, got {port}"
         for model in protocol.models:
-            assert model == model.upper(), f"model {model!r}: expected capitals"
+            assert model == model.upper(), f"model {model!r}: expected upper case"
         assert protocol.dialects, "dialects: expected at least one"
         for name, dialect in protocol.dialects.items():
             assert dialect.name == name, f"dialects[{name!r}] calls itself {dialect.name!r}"
         for name, about in protocol.parameters.items():
-            assert name not in {"dialect", "quirks"}, f"parameter {name!r} means something else"
+            assert name not in {"dialect", "quirks"}, f"parameter {name!r} is reserved"
             assert _is_line(about), f"parameter {name!r}: expected a line that says what it is"
 
     def test_entry_point_gives_the_protocol(self) -> None:
@@ -80,7 +80,7 @@ class DialectChecks(Parameters):
         assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
 
     def test_every_dialect_is_tried(self) -> None:
-        """Check that a client tries each dialect, and gets the pinned one."""
+        """Check that a client tries each dialect, and only the pinned one if one is pinned."""
         protocol = self.protocol
         used = set(protocol.schemes.values())
         surplus = set(protocol.detection) - used
@@ -92,14 +92,14 @@ class DialectChecks(Parameters):
             missing = set(protocol.dialects) - tried
             assert not missing, f"detection over {transport.value} leaves out {missing}"
             unknown = tried - set(protocol.dialects)
-            assert not unknown, f"detection over {transport.value}: {unknown} is no dialect"
+            assert not unknown, f"detection over {transport.value}: {unknown} is not a dialect"
             for name in protocol.dialects:
                 (group,) = protocol.tries(transport, name)
                 others = {dialect.name for dialect in group} - {name}
                 assert not others, f"pinned {name!r} over {transport.value} tries {others}, too"
 
     def test_model_picks_the_protocol(self) -> None:
-        """Check that a bare host with a model, in any letters, is a camera of this protocol."""
+        """Check that a bare host with a model, in any case of letters, is of this protocol."""
         for model in self.protocol.models:
             for written in (model, model.lower()):
                 address = parse_address("192.0.2.7", model=written)
@@ -143,9 +143,9 @@ class DialectChecks(Parameters):
             has = [dialect.has(kind) for kind in needed]
             names = " and ".join(kind.__name__ for kind in needed)
             if can:
-                assert all(has), f"capabilities.{name} is True, but it has not {names}"
+                assert all(has), f"capabilities.{name} is True, but has() is False for {names}"
             else:
-                assert not has[0], f"capabilities.{name} is False, but it has {names}"
+                assert not has[0], f"capabilities.{name} is False, but has() is True for {names}"
 
     def test_messages_have_ids_names_and_fields(self, dialect: Dialect) -> None:
         """Check that each message has an id and a name, and that its fields are the message's."""
@@ -168,7 +168,7 @@ class DialectChecks(Parameters):
             for message in (kind, example(kind, dialect)):
                 text = _refusal(UnsupportedError, dialect.message_id, message)
                 assert text is not None, f"has() is False for {kind.__name__}, but it has an id"
-                assert dialect.name in text, f"{text}: which dialect?"
+                assert dialect.name in text, f"{text}: expected the name of the dialect in it"
 
     def test_codes_mean_something(self, dialect: Dialect) -> None:
         """Check that any code has a text and a verdict, and that one is good and one is not."""
@@ -195,7 +195,7 @@ class DialectChecks(Parameters):
             payload = data.draw(strategies.noise(()))
             for sender in m.Sender:
                 for message_id in (0, 1, 2, 0x12, 0x20, 0x40, 0xFFFF):
-                    see_spelled(dialect, sender, Frame(message_id, payload))
+                    check_described(dialect, sender, Frame(message_id, payload))
 
         strategies.each_drawn(check)
 
@@ -217,13 +217,13 @@ class DialectChecks(Parameters):
             assert isinstance(body, bytes), f"body({other}): expected bytes, got {body!r}"
 
     def test_unknown_quirk_is_a_mistake(self, dialect: Dialect) -> None:
-        """Check that known quirks change nothing, and an unknown one is a ConfigurationError."""
+        """Check that a dialect with its own quirks is the same; an unknown one is an error."""
         same = dialect.with_quirks(dialect.quirks)
         assert same.label == dialect.label, f"with its own quirks it is {same.label!r}"
         assert dialect.with_parameters({}).name == dialect.name
         text = _refusal(ConfigurationError, dialect.with_quirks, ["no such quirk"])
-        assert text is not None, "with_quirks(['no such quirk']) was taken"
-        assert "no such quirk" in text, f"{text}: which quirk?"
+        assert text is not None, "with_quirks(['no such quirk']) did not fail"
+        assert "no such quirk" in text, f"{text}: expected the name of the quirk in it"
 
     def test_address_is_read_back(self, dialect: Dialect) -> None:
         """Check that a URL with everything pinned is read back, and has no password."""
@@ -236,7 +236,7 @@ class DialectChecks(Parameters):
         for scheme in self.protocol.schemes:
             for host in ("192.0.2.7", "2001:db8::7"):
                 for values in parameters:
-                    see_address(
+                    check_address(
                         Address(
                             self.protocol.name,
                             scheme,
@@ -253,7 +253,7 @@ class DialectChecks(Parameters):
     def test_framed_messages_are_read_back(self, dialect: Dialect) -> None:
         """Check that a dialect of binary frames reads what it writes, whatever the values are."""
         if not isinstance(dialect, FramedDialect):
-            pytest.skip("the dialect is no FramedDialect: its machine's conversations say it all")
+            pytest.skip("not a FramedDialect: the conversations of its machine check it")
         from smartcam.testing._suites import strategies
 
         def check(data: DataObject) -> None:
@@ -263,13 +263,13 @@ class DialectChecks(Parameters):
                 top = _TOPS.get((wire, dialect.word))
                 drawn = strategies.st.integers(0, top) if top else strategies.st.binary(max_size=64)
                 values[name] = data.draw(drawn, label=name)
-            see_read_back(dialect, row.type, values)
+            check_read_back(dialect, row.type, values)
 
         for row in dialect.table:
-            for place in (0, 1, -1):
+            for choice in (0, 1, -1):
                 tops = [(name, _TOPS.get((wire, dialect.word))) for name, wire in row.fields]
-                edges = {name: (0, 1, top)[place] if top else b"\0\xff" for name, top in tops}
-                see_read_back(dialect, row.type, edges)
+                edges = {name: (0, 1, top)[choice] if top else b"\0\xff" for name, top in tops}
+                check_read_back(dialect, row.type, edges)
         strategies.each_drawn(check)
 
 
@@ -279,7 +279,7 @@ _TOPS: Mapping[tuple[m.Wire, str], int] = {
     (m.Wire.UINT32, "I"): (1 << 32) - 1,
     (m.Wire.UINT32, "H"): (1 << 32) - 1,
 }
-"""Largest value of each kind of number, by the dialect's word."""
+"""Largest value of each kind of number, by the format of the dialect's words."""
 
 
 def _refusal(
@@ -293,7 +293,7 @@ def _refusal(
     return None
 
 
-def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
+def check_described(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
     """Check that a frame can be shown, in JSON as well.
 
     Raises:
@@ -307,7 +307,7 @@ def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
     return spelled
 
 
-def see_address(address: Address) -> None:
+def check_address(address: Address) -> None:
     """Check that an address equals the one in its own URL.
 
     Raises:
@@ -321,7 +321,9 @@ def see_address(address: Address) -> None:
     assert not secret or secret not in f"{url} {address!r} {read!r}", f"{url} has the password"
 
 
-def see_read_back(dialect: FramedDialect, kind: type[m.Message], values: Mapping[str, Any]) -> None:
+def check_read_back(
+    dialect: FramedDialect, kind: type[m.Message], values: Mapping[str, Any]
+) -> None:
     """Check that a message with these values on the wire goes through bytes unchanged.
 
     Raises:

@@ -20,7 +20,7 @@ from smartcam.protocols import Frame, LinkEnded, LinkFailed, State, Transport, V
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import Counters, ResultBurst
 from smartcam.testing._suites.protocols.conversations import Player, Received, Sent
-from smartcam.testing._suites.protocols.dialects import see_spelled
+from smartcam.testing._suites.protocols.dialects import check_described
 from smartcam.testing._suites.protocols.parameters import Parameters
 from smartcam.testing._suites.protocols.words import REQUESTS, example
 
@@ -319,7 +319,7 @@ class MachineChecks(Parameters):
             if isinstance(frame, RemoteProtocolError):
                 continue
             assert isinstance(frame, Frame), f"traced: expected a Frame, got {frame!r}"
-            spelled = see_spelled(dialect, sender, frame)
+            spelled = check_described(dialect, sender, frame)
             shown = f"{frame!r} {spelled!r}"
             assert not secret or secret not in shown, f"the trace has the password: {shown}"
         spoken = {
