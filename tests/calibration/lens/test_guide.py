@@ -31,11 +31,11 @@ def test_best_view_comes_first_and_each_view_has_its_gain() -> None:
 
 def test_mean_of_a_view_is_the_uncertainty_after_it() -> None:
     best = suggest_views(CENTRE.calibration(), distance=0.4)[0]
-    subset = Bench(LENS, [*CENTRE.poses, best.transform])
+    taken = Bench(LENS, [*CENTRE.poses, best.transform])
     before = CENTRE.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.present == pytest.approx(before.figures.mean, rel=1e-6)
     # the gauge includes the new view, too, so both differ a little
-    after = subset.calibration().uncertainty(distance=0.4, shape=(9, 12))
+    after = taken.calibration().uncertainty(distance=0.4, shape=(9, 12))
     assert best.mean == pytest.approx(after.figures.mean, rel=0.3)
 
 
