@@ -162,7 +162,7 @@ class RawDialect:
         return f"{shown}: {hex_excerpt(raw or spelled.data)}"
 
     def flaw(self, frame: ReceivedFrame) -> str | None:
-        """Return the undocumented property of a frame of the camera, None if there is none."""
+        """Return the difference of a camera's frame from the documents; None without one."""
         if self.is_bid and self.numbers(frame.body) in _REFUSALS:
             return None  # a refusal may be only its code, for any request
         size = self._sizes().get(frame.message_id)

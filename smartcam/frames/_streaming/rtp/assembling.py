@@ -77,7 +77,7 @@ class OpenUnit(ABC):
 
 
 class UnitKind(Protocol):
-    """How the access units in a stream's payloads begin and are assembled."""
+    """Rules by which the access units in a stream's payloads begin and are assembled."""
 
     def new_unit(self, timestamp: int, unbroken: bool, arrived: float, /) -> OpenUnit:
         """Return a new access unit."""

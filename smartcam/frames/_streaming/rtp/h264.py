@@ -181,7 +181,7 @@ class H264Unit(NalUnit):
 
 
 class H264Units:
-    """The kind of access units of H.264."""
+    """Rules by which access units of H.264 begin and are assembled."""
 
     new_unit = H264Unit
 

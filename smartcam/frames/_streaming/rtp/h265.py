@@ -38,7 +38,7 @@ class H265Unit(NalUnit):
 
 
 class H265Units:
-    """How access units of H.265 begin and are assembled."""
+    """Rules by which access units of H.265 begin and are assembled."""
 
     new_unit = H265Unit
 
