@@ -120,10 +120,10 @@ def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Arra
     # By R exp([a]x) = exp([R a]x) R, to first order:
     #     X: R_X^T becomes exp(-[a]x) R_X^T:  w = -a,            d = t_S x a - R_X^T b
     #     Z:                                  w = R_S a,         d = R_X^T R_A b
-    #     robot beside the camera, A = T:     w = R_X^T R_T a,   d = w x arm + R_X^T b,
-    #         arm = R_X^T R_T t_Z = t_S + R_X^T (t_X - t_T)
-    #     camera on the hand, A = T^-1:       w = -R_X^T a,      d = w x arm - R_X^T R_T^T b,
-    #         arm = R_X^T R_T^T (t_Z - t_T) = t_S + R_X^T t_X
+    #     robot beside the camera, A = T:     w = R_X^T R_T a,   d = w x lever + R_X^T b,
+    #         lever = R_X^T R_T t_Z = t_S + R_X^T (t_X - t_T)
+    #     camera on the hand, A = T^-1:       w = -R_X^T a,      d = w x lever - R_X^T R_T^T b,
+    #         lever = R_X^T R_T^T (t_Z - t_T) = t_S + R_X^T t_X
     # Source of the conventions: Sola, Deray and Atchuthan, A micro Lie theory (arXiv 1812.01537).
     seen = predicted_views(camera, robot, target)
     back = camera.rotation.T
@@ -136,14 +136,14 @@ def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Arra
     outer[:, 3:, 9:12] = back @ robot.between.rotation
     inner = np.zeros((count, 6, 6))
     if robot.in_hand:
-        arm = seen.translation + camera.translation @ camera.rotation
+        lever = seen.translation + camera.translation @ camera.rotation
         inner[:, :3, :3] = -back
-        inner[:, 3:, :3] = cross_matrix(arm) @ back
+        inner[:, 3:, :3] = cross_matrix(lever) @ back
         inner[:, 3:, 3:] = -back @ np.swapaxes(turn, 1, 2)
     else:
-        arm = seen.translation + (camera.translation - robot.poses.translation) @ camera.rotation
+        lever = seen.translation + (camera.translation - robot.poses.translation) @ camera.rotation
         inner[:, :3, :3] = back @ turn
-        inner[:, 3:, :3] = -cross_matrix(arm) @ back @ turn
+        inner[:, 3:, :3] = -cross_matrix(lever) @ back @ turn
         inner[:, 3:, 3:] = back
     return outer, inner
 

@@ -55,7 +55,7 @@ _HUFFMAN: Final = tuple(
 
 
 class JpegUnits:
-    """Rules by which access units of JPEGs begin and are assembled; stores tables that are sent once.
+    """Rules by which access units of JPEGs begin and are assembled; keeps tables that come once.
 
     Args:
         size: size of the pictures, for sizes above 2040 pixels, which packets do not have.
