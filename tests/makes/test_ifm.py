@@ -246,7 +246,8 @@ async def test_records_are_those_of_the_group_that_has_their_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "why"), [("n: int64", "no int64"), ("(n: int8)[3]", "records is not fixed")]
+    ("layout", "why"),
+    [("n: int64", "no int64"), ("(n: int8)[3]", "cannot fix the number of records")],
 )
 @pytest.mark.asyncio
 async def test_layout_that_no_device_can_send_is_a_mistake(layout: str, why: str) -> None:

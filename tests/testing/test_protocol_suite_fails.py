@@ -91,9 +91,9 @@ def bad_dialect(**changes: Any) -> Any:
     ("changes", "said"),
     [
         ({"schemes": {}}, "at least one"),
-        ({"schemes": {"Acme": Transport.TCP}}, "small letters"),
+        ({"schemes": {"Acme": Transport.TCP}}, "expected lower case"),
         ({"default_port": 0}, "1 to 65535"),
-        ({"models": ("Acme1",)}, "expected capitals"),
+        ({"models": ("Acme1",)}, "expected upper case"),
         ({"dialects": {"other": LINES}}, "calls itself 'lines'"),
         ({"parameters": {"quirks": "a thing"}}, "is reserved"),
         ({"parameters": {"speed": ""}}, "expected a line"),
@@ -116,7 +116,7 @@ def test_protocol_that_is_not_installed_fails() -> None:
         ({Transport.UDP: ((LINES,),)}, "no scheme has"),
         ({Transport.TCP: ((),)}, "a group is empty"),
         ({Transport.TCP: ((HANDBOOK,),)}, "leaves out {'lines'}"),
-        ({Transport.TCP: ((LINES,), (HANDBOOK,))}, "{'handbook'} is no dialect"),
+        ({Transport.TCP: ((LINES,), (HANDBOOK,))}, "{'handbook'} is not a dialect"),
     ],
 )
 def test_dialect_that_is_not_tried_fails(detection: dict[Any, Any], said: str) -> None:
@@ -149,9 +149,9 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
     "test_capabilities_are_those_of_its_messages": [
         (
             {"capabilities": can(get_status=True, reboot=True)},
-            "reboot is True, but it has not Reboot",
+            "reboot is True, but has() is False for Reboot",
         ),
-        ({"capabilities": can()}, "get_status is False, but it has GetStatus"),
+        ({"capabilities": can()}, "get_status is False, but has() is True for GetStatus"),
     ],
     "test_messages_have_ids_names_and_fields": [
         ({"called": lambda self, message: "it"}, "is 'it'"),
@@ -171,7 +171,9 @@ BAD_DIALECTS: dict[str, list[tuple[dict[str, Any], str]]] = {
         ({"raw_request": lambda *_: None}, "raw_request(0): None"),
         ({"body": lambda *_: "text"}, "expected bytes, got 'text'"),
     ],
-    "test_unknown_quirk_is_a_mistake": [({"with_quirks": lambda self, names: self}, "was taken")],
+    "test_unknown_quirk_is_a_mistake": [
+        ({"with_quirks": lambda self, names: self}, "did not fail")
+    ],
 }
 
 
