@@ -76,7 +76,7 @@ class HeldResults:
         results = [message for message in messages if isinstance(message, m.ResultContainer)]
         seen = set[int]() if self._named is None else {self._named}
         if answers_trigger and self._applications_seen is not None:
-            seen, self._applications_seen = self._applications_since, None
+            seen, self._applications_seen = self._applications_seen, None
         if results:
             size = sum(len(result.data) for result in results)
             self._waiting.append(_Held(messages, size, self._last + 1, self._before_trigger, seen))
