@@ -268,7 +268,7 @@ async def _detections(plan: Plan, pair: Pair) -> list[Comparison]:
         assert bytes(store.serialize_cdr(message, DETECTIONS)) == data
         publisher = node.publisher(topic, DETECTIONS)
         pair.far("hear", topic=topic, kind=DETECTIONS)
-        while not publisher.has_subscribers:  # noqa: ASYNC110 - of what nothing tells
+        while not publisher.has_subscribers:  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(0.01)
 
         def timed(work: Callable[[], object]) -> float:
@@ -359,7 +359,7 @@ async def _newcomer(port: int, count: int) -> list[Comparison]:
             tokens = await _settled(first, count)
         begin = time.perf_counter()
         async with Node("late", **how) as late:
-            while len(tuple(late.graph)) < tokens:  # noqa: ASYNC110 - of what nothing tells
+            while len(tuple(late.graph)) < tokens:  # noqa: ASYNC110 - there is no event for it
                 await asyncio.sleep(0.001)
             took = Series("seconds", "s", [time.perf_counter() - begin])
     note = f"{tokens} tokens; a node that opens in another process, until its graph has all"

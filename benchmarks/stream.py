@@ -229,7 +229,7 @@ def _number(count: int) -> bytes:
 
 
 class Record(NamedTuple):
-    """What ``struct`` makes of a record, with names."""
+    """A record with named fields, as a program would make it of the values of ``struct``."""
 
     feature_id: str
     quality: float

@@ -78,7 +78,7 @@ def _in_event_loop() -> bool:
 
     A notebook has an event loop, too, but that loop does nothing while a cell runs.
     """
-    if asyncio._get_running_loop() is None:  # noqa: SLF001 - documented; it raises no error
+    if asyncio._get_running_loop() is None:  # noqa: SLF001 - in asyncio.__all__
         return False
     ipython = sys.modules.get("IPython")
     return ipython is None or cast("Any", ipython).get_ipython() is None

@@ -185,7 +185,8 @@ class Observers:
     def _take(self, observers: Iterable[Observer]) -> None:
         self._all = check_all(observers, "observers", "a list of observers")
         for observer in self._all:
-            if not all(callable(getattr(observer, hook, None)) for hook in _HOOKS):
+            hooks = (getattr(observer, hook, None) for hook in _HOOKS)
+            if isinstance(observer, type) or not all(map(callable, hooks)):
                 raise wrong_argument("observers", "objects of classes of Observer", observer)
         self._on_state = self._overriding("on_state")
         seen = self._looking_at("on_results", "on_result")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam import Connected, Observer, Result, SmartCamError
+from smartcam import ConfigurationError, Connected, Observer, Result, SmartCamError
 from smartcam.observers import Observers, RawFrame, TraceEntry
 from smartcam.protocols import BVS, Frame
 from smartcam.protocols.messages import Sender
@@ -319,3 +319,9 @@ def test_exit_is_not_held_up_by_an_observer() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         Observers([Quitter()]).result(RESULT)
+
+
+@pytest.mark.parametrize("wrong", [Observer, object(), 5])
+def test_what_is_no_observer_is_refused(wrong: object) -> None:
+    with pytest.raises(ConfigurationError, match="observers: expected objects of classes of Obs"):
+        Observers([wrong])  # type: ignore[list-item]

@@ -91,7 +91,7 @@ async def heard_by(listens: ZenohEnd, connects: ZenohEnd) -> Heard:
     connects.subscribe("test/**", heard)
     publisher = listens.publisher("test/first")
     async with asyncio.timeout(PATIENCE):
-        while not publisher.has_subscribers:  # noqa: ASYNC110 - the engine tells
+        while not publisher.has_subscribers:  # noqa: ASYNC110 - Zenoh calls nobody
             await asyncio.sleep(0.005)
     return heard
 

@@ -678,7 +678,7 @@ async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
             await bridge.say({"op": "call_service", "service": service.name, "id": str(number)})
 
     calling = asyncio.create_task(call())
-    while not node._outbox.full:  # noqa: ASYNC110 - of what nothing tells
+    while not node._outbox.full:  # noqa: ASYNC110 - there is no event for it
         await asyncio.sleep(0.001)
     assert service.calls < 20
     bridge.reading.set()

@@ -173,7 +173,7 @@ async def seen(
 async def until(true: Callable[[], object], seconds: float = 60.0) -> None:
     """Wait until something is true."""
     async with asyncio.timeout(seconds):
-        while not true():  # noqa: ASYNC110 - of what nothing tells
+        while not true():  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(0.02)
 
 

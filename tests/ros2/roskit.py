@@ -86,7 +86,7 @@ async def two_nodes(**more: Any) -> AsyncIterator[tuple[Any, Any]]:
 async def until(true: Callable[[], object]) -> None:
     """Wait until something is true."""
     async with asyncio.timeout(PATIENCE):
-        while not true():  # noqa: ASYNC110 - of what nothing tells
+        while not true():  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(0.005)
 
 
