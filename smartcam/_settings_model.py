@@ -41,7 +41,7 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         Annotated[str, Field(strict=True, max_length=MAX_NAME_CHARACTERS), PLAIN],
         "name in logs and results; default HOST:PORT",
     ),
-    "application": (ApplicationId | None, "application to have running and ready"),
+    "application": (ApplicationId | None, "id or name of the application to load and run"),
     "application_names": (
         Annotated[dict[Text, ApplicationId], Field(max_length=1000)],
         "names of applications and their ids; a name may replace any id",
@@ -52,26 +52,26 @@ OPTIONS: dict[str, tuple[Any, str]] = {
         "transforms localizations into the robot's frame: one for all applications, or a mapping "
         "from application id to one, or to None to leave its values as they are",
     ),
-    "y_down": (Flag, "the camera's y axis points down; turned to y up on the way in"),
-    "lenient": (Flag, "any non-zero byte is a true bool"),
+    "y_down": (Flag, "the camera's y axis points down; poses get y up"),
+    "lenient": (Flag, "any byte but 0 counts as true in a bool"),
     "connect_timeout": (Seconds, "longest wait for a session, all attempts"),
-    "connect_attempts": (_integer(1, MAX_CONNECT_ATTEMPTS), "fresh links tried per dialect"),
+    "connect_attempts": (_integer(1, MAX_CONNECT_ATTEMPTS), "number of attempts for each dialect"),
     "switch_timeout": (Seconds, "longest wait for a switch"),
     "request_timeout": (Seconds, "longest wait for the answer to a request"),
-    "close_timeout": (Seconds, "longest wait for an orderly end of the link"),
+    "close_timeout": (Seconds, "longest wait for the camera to close the connection"),
     "liveness_timeout": (
         Seconds | None,
-        "longest silence of a camera that is asked for a sign of life; None: no end",
+        "longest wait for the answer to a check of the connection; None: no end",
     ),
-    "reconnect": (InstanceOf[Backoff] | None, "when a lost camera is tried again; None: never"),
+    "reconnect": (InstanceOf[Backoff] | None, "delays before each reconnect; None: never"),
     "restore": (
         Flag,
-        "after a reconnect have the named application and the run state back that were wanted; "
-        "else they are left as the camera has them",
+        "after a reconnect, restore the application and the run state that this client requested; "
+        "else leave them as they are",
     ),
     "max_length": (
         _integer(MIN_PAYLOAD_LIMIT_BYTES, MAX_DATA_BYTES),
-        "largest payload accepted, bytes",
+        "largest size of a payload that is accepted, bytes",
     ),
 }
 """Type of each option, and its description."""

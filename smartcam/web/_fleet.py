@@ -232,8 +232,8 @@ async def _cameras(site: FleetSite, call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/table",
-    about="A WebSocket: the changes of the rows in sight, five times a second at most, the next "
-    "after each `next`; the page sends the query for the rows as JSON, as in `/api/cameras`.",
+    about="A WebSocket: send the query for some rows as JSON, as in `/api/cameras`; after each "
+    "`next` it sends the changes of these rows, at most five times a second.",
 )
 async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
     check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)

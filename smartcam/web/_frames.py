@@ -185,7 +185,7 @@ async def _features(site: FramesSite, call: CallRequest) -> object:
     sample='{"name": "Gain", "value": 6.0}',
 )
 async def _set_feature(site: FramesSite, call: CallRequest) -> object:
-    """Set a feature, if the page may; answers the device's new value."""
+    """Set a feature, if changes are allowed; answers the device's new value."""
     place = _changing(site, call)
     with _refused(site, place):
         return {"value": await site.sources[place].features[call.body.name].set(call.body.value)}
@@ -195,7 +195,7 @@ async def _set_feature(site: FramesSite, call: CallRequest) -> object:
     "POST", f"{API}/sources/{{place}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
 )
 async def _command(site: FramesSite, call: CallRequest) -> object:
-    """Execute a command, if the page may; answers when the device has done it."""
+    """Execute a command, if changes are allowed; answers when the device has done it."""
     place = _changing(site, call)
     with _refused(site, place):
         await site.sources[place].features[call.body.name].execute()
@@ -204,7 +204,7 @@ async def _command(site: FramesSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
 async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
-    """Trigger the device, if the page may; answers the triggered picture as a JPEG."""
+    """Trigger the device, if changes are allowed; answers the triggered picture as a JPEG."""
     place = _changing(site, call)
     with _refused(site, place):
         return await _as_jpeg(site, place, await site.sources[place].trigger())

@@ -191,7 +191,7 @@ def _results(site: ShowsCamera, _call: CallRequest) -> object:
 
 @CALLS.add("GET", f"{API}/history")
 def _history(site: ShowsCamera, _call: CallRequest) -> object:
-    """Outcomes in bars of five minutes, the last failures, and since when it fails."""
+    """Outcomes in bars of five minutes, the last failures, and the first since a pass."""
     return site.view.history.as_json()
 
 

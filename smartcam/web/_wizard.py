@@ -234,5 +234,5 @@ def _load(service: CalibrationService, body: _Load) -> object:
 
 @_call("POST", "/transform", body=_CameraPose, sample='{"x": 0.1, "y": 0.05, "theta": 0.0}')
 def _transform(service: CalibrationService, body: _CameraPose) -> object:
-    """The robot's pose for one in the camera's plane, by the loaded calibration."""
+    """Convert a pose in the camera's plane to the robot's frame, by the loaded calibration."""
     return {"pose": service.transform(body.x, body.y, body.theta, body.frame)}

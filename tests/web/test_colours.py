@@ -269,7 +269,7 @@ def test_document_has_every_bound() -> None:
     page = (ROOT / "docs" / "tower.md").read_text(encoding="utf-8")
     assert PICTURES_PER_VIEWER == 2
     assert f"two pictures are kept for each of the last {MAX_VIEWERS_KEPT}" in page
-    assert f"At most {MAX_LOOKS} may wait" in page
+    assert f"At most {MAX_LOOKS} calls may wait" in page
 
 
 # ---------------------------------------------------------------------- the command

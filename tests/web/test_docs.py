@@ -60,7 +60,7 @@ CURL = [
 def test_live_page_has_its_numbers() -> None:
     assert f"The last {MAX_RESULTS}." in LIVE_PAGE
     assert MAX_BARS * BAR_SECONDS == 10 * 3600  # "Last ten hours"
-    assert f"the last {MAX_PICTURES} pictures of failures" in LIVE_PAGE
+    assert f"pictures of the last {MAX_PICTURES} failures" in LIVE_PAGE
     assert f"more than {MAX_NEWS / streams.PERIOD:g} come per second" in LIVE_PAGE
     words = PASS_WORDS | FAIL_WORDS
     named = set(
@@ -77,12 +77,13 @@ def test_fleet_page_has_its_numbers() -> None:
         5.0,
     )  # which it has as words
     said = {
-        f"for {ERROR_MARK_SECONDS:g} s after a loss",
-        f"that it shows, {MAX_ROWS} at most",
+        f"in the last {ERROR_MARK_SECONDS:g} s lost",
+        f"at most {MAX_ROWS} rows",
         f"shows nothing for {streams.SHOW_TIMEOUT:g} s",
-        f"may be {MAX_FLEET_VIEWERS} browsers at a time, and {MAX_CAMERAS} cameras",
+        f"At most {MAX_FLEET_VIEWERS} browsers",
+        f"at most {MAX_CAMERAS} cameras",
         f"and {LINGER:g} s longer",
-        f"two updates, {MAX_QUEUE} are shown",
+        f"two updates, at most {MAX_QUEUE} are shown",
         "`filter` is " + _listed(get_args(Filter)),
         "`sort` is " + _listed(["name", *SORTS]),
     }
@@ -105,8 +106,8 @@ def test_bounds_are_those_of_the_code() -> None:
         f"more than {routes.MAX_BODY_BYTES >> 10} KiB",
         f"{streams.MAX_STREAMS} event streams",
         f"nothing for {streams.SHOW_TIMEOUT:g} s",
-        f"long payloads to {serialize.MAX_HEX_BYTES} bytes "
-        f"and decode results up to {serialize.MAX_VALUES_BYTES}",
+        f"at most {serialize.MAX_HEX_BYTES} bytes of a payload, "
+        f"and decode results of at most {serialize.MAX_VALUES_BYTES}",
     }
     assert [text for text in said if text not in PAGE] == []
     assert emulator.MAX_ENTRIES >= 100  # the example's limit

@@ -262,11 +262,11 @@ class CameraEntry(Fields):
         "layout, or one for each application",
     )
     y_down: bool = Field(False, description="the camera's y axis points down")
-    lenient: bool = Field(False, description="any non-zero byte is a true bool")
+    lenient: bool = Field(False, description="any byte but 0 counts as true in a bool")
     restore: bool | None = Field(
         None,
-        description="restore application and run state after a reconnect; default: if nodes "
-        "of ROS become active by themselves",
+        description="restore application and run state after a reconnect; default: true if "
+        "the camera's ROS node becomes active by itself",
     )
     connect_timeout: Seconds = Field(10.0, description="longest wait for a session, all attempts")
     switch_timeout: Seconds = Field(10.0, description="longest wait for a switch")
@@ -383,7 +383,7 @@ class FleetFile(Fields):
         "otherwise programs on this computer",
     )
     history: History = Field(
-        History.model_validate({}), description="bounds of each camera's kept results"
+        History.model_validate({}), description="how many results are kept of each camera"
     )
     ros2: RosSection | None = Field(
         None, description="a node in ROS 2 for each camera; {} is enough"

@@ -41,14 +41,13 @@ class OperationsSection(Fields):
     )
     names: tuple[Name, ...] = Field(
         (),
-        description="further names of this computer that a request may have in its Host, besides "
-        "addresses and its own name, if it listens on more than its local address; requests of a "
-        "foreign web page have another name",
+        description="further names of this computer that are allowed as the Host of a request, "
+        "besides addresses and its own name; used if it listens on more than its local address",
     )
     latency: Literal["agent", "camera"] = Field(
         "agent",
-        description="histograms of latency: agent, one for all cameras, each of which has only sum "
-        "and count; or camera, one for each, with 20 lines more",
+        description="histograms of latency: agent, one for all cameras together, and sum and count "
+        "for each camera; or camera, one for each camera, with 20 lines more",
     )
     log: Literal["text", "json"] = Field(
         "text", description="form of smartcam serve's log: lines for people, or JSON"

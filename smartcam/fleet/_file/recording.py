@@ -23,10 +23,10 @@ class RecordSection(Fields):
         description="folder of the files, relative to this file; made if missing",
     )
     size: Size = Field(1e8, description="size at which a camera's next file starts, such as 100 MB")
-    age: Age = Field(3600.0, description="time after which it starts, such as 1 h, 30 min, 1 d")
+    age: Age = Field(3600.0, description="time after which the next file starts, such as 1 h, 1 d")
     keep: Size = Field(
         1e10,
-        description="size of all files, beyond which the oldest are deleted, such as 10 GB",
+        description="largest size of all files; the oldest are deleted, such as 10 GB",
     )
     cameras: Patterns = Field(
         ("**",),
@@ -39,8 +39,8 @@ class RecordSection(Fields):
     )
     pictures: Literal["none", "judged", "all"] = Field(
         "none",
-        description="record the pictures of cameras with frames, too: judged for each result's "
-        "picture, or all; then the device always streams",
+        description="record pictures of cameras with frames, too: none; judged, the picture that "
+        "belongs to each result; or all. Except for none, the device always streams",
     )
 
     def chooses(self, camera: str) -> bool:

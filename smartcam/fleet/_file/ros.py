@@ -43,8 +43,8 @@ class RosSection(Fields):
     namespace: Namespace = Field("/", description="namespace of the cameras' nodes")
     distribution: Literal["humble", "jazzy", "kilted", "lyrical", "rolling"] = Field(
         "jazzy",
-        description="distribution of ROS: its type hashes are part of all names; through rclpy, "
-        "the default is the installed one",
+        description="distribution of ROS, whose message types are used; through rclpy, the "
+        "default is the installed one",
     )
     autostart: bool = Field(True, description="the nodes become active by themselves")
     through: Literal["zenoh", "rclpy"] = Field(

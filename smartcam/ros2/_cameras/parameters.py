@@ -33,7 +33,7 @@ SETTINGS: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
         lambda given: as_text(given.interpret_as),
     ),
     "y_down": ("the camera's y axis points down", lambda given: given.y_down),
-    "lenient": ("any non-zero byte is a true bool", lambda given: given.lenient),
+    "lenient": ("any byte but 0 counts as true in a bool", lambda given: given.lenient),
     "restore": (
         "application and run state are restored after a reconnect",
         lambda given: given.restore,

@@ -89,7 +89,7 @@ def test_listing_names_unreadable_files_and_goes_on(tmp_path: Path) -> None:
 
 def test_wizards_bounds_are_those_of_the_code() -> None:
     said = {
-        f"Names have up to {MAX_NAME_LENGTH} letters",
+        f"`NAME` has at most {MAX_NAME_LENGTH} letters",
         f"`NAME.json.1` to `.{BACKUPS}`",
         f"`NAME.journal.1` to `.{MAX_EARLIER_JOURNALS}`",
         f"printed {RULER_MM:g} mm ruler",
