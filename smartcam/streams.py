@@ -353,10 +353,10 @@ class Subscribers(Generic[T]):
     The work to subscribe and to leave does not depend on the number of queues.
     """
 
-    __slots__ = ("_in_order", "horizon", "joined", "references")
+    __slots__ = ("_in_order", "added_count", "horizon", "references")
 
     def __init__(self) -> None:
-        self.joined: int = 0  # number of subscribers so far
+        self.added_count: int = 0  # number of subscribers so far
         # age of the items offered now; later subscribers do not get them
         self.horizon: float = math.inf
         # empty without subscribers: looked at for every message
@@ -368,7 +368,7 @@ class Subscribers(Generic[T]):
         """Offer a subscriber all items from now on."""
         self.references[weakref.ref(queue, self._discard)] = None
         self._in_order = None
-        self.joined += 1
+        self.added_count += 1
 
     def _discard(self, reference: weakref.ref[Queue[T]]) -> None:
         self.references.pop(reference, None)

@@ -103,23 +103,23 @@ class Tap(NamedTuple):
 class TappedListeners(Listeners):
     """Passes everything to the agent, too."""
 
-    hears_all_changes = True
+    wants_all_changes = True
     tap: Tap | None = None
 
     @property
-    def streams_results(self) -> bool:
+    def only_streams_results(self) -> bool:
         return True
 
     @property
-    def hears_results(self) -> bool:
+    def wants_results(self) -> bool:
         return True
 
     @property
-    def hears_statuses(self) -> bool:
+    def wants_statuses(self) -> bool:
         return True
 
     @property
-    def watches_status(self) -> bool:
+    def needs_polling(self) -> bool:
         return True
 
     def publish(self, event: CameraEvent) -> None:

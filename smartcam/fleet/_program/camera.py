@@ -385,7 +385,7 @@ class FleetCamera(Camera[ValueT]):
         if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
         self._receiver.meet(met)
-        if self._listeners.hears_results:
+        if self._listeners.wants_results:
             self._listens(self._listeners.results)
 
     def _read_as(self, hello: dict[str, Any]) -> None:
@@ -550,11 +550,11 @@ class FleetCamera(Camera[ValueT]):
         listeners, previous = self._listeners, self._status
         self._status = status
         if state["kind"] == "Status":
-            if listeners.hears_statuses:
+            if listeners.wants_statuses:
                 listeners.offer_status(status, asyncio.get_running_loop().time())
         elif status == previous:
             return
-        if status != previous and listeners.sees_events:
+        if status != previous and listeners.wants_events:
             listeners.publish(
                 StatusChanged(camera=self.name, at=_time(state), status=status, previous=previous)
             )

@@ -352,7 +352,7 @@ class Receiver:
             return
         self._count(payload)
         listeners = self._listeners
-        if not (listeners.hears_results or listeners.observed):
+        if not (listeners.wants_results or listeners.has_result_observer):
             self._leave_results()
             return
         self._see(batch.epoch)
@@ -428,13 +428,13 @@ class Receiver:
                 self.own_calls.get(run.call) if run.owner and run.owner == self._program else None
             )
             if own_call is not None:
-                self._offer(run, self._outcome(own_call, run), now, owned=True)
+                self._offer(run, self._outcome(own_call, run), now, reported_by_caller=True)
                 return
             expected = self._expected()
             if expected is not None and run.application != expected:
                 self._counters.count("wrong_application", len(run.payloads))
                 return
-            if listeners.streams_results and self._take_burst(run, now):
+            if listeners.only_streams_results and self._take_burst(run, now):
                 return
             for single in singles(run):
                 fate = "late" if run.flags & LATE else "streamed"
@@ -445,17 +445,24 @@ class Receiver:
                 except InterpretationError as error:
                     outcome, fate = error, "late" if fate == "late" else "uninterpretable"
                 self._counters.count(fate)
-                self._offer(single, outcome, now, owned=False)
+                self._offer(single, outcome, now, reported_by_caller=False)
         finally:
             listeners.results.horizon = math.inf
 
     def _offer(
-        self, run: ResultRun, outcome: Result | InterpretationError, now: float, *, owned: bool
+        self,
+        run: ResultRun,
+        outcome: Result | InterpretationError,
+        now: float,
+        *,
+        reported_by_caller: bool,
     ) -> None:
         current, listeners = bool(run.flags & CURRENT), self._listeners
         if isinstance(outcome, InterpretationError):
             size = len(run.payloads[0])
-            listeners.offer_error(outcome, now, size, current=current, owned=owned)
+            listeners.offer_error(
+                outcome, now, size, current=current, reported_by_caller=reported_by_caller
+            )
         else:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 

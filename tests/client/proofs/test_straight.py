@@ -23,9 +23,9 @@ def test_short_way_gives_what_the_long_one_gives(caplog: pytest.LogCaptureFixtur
 class ForgetsStatuses(ShortDispatch):
     """Does not count the statuses around a result."""
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
         heard = self._state.statuses_received
-        taken = super()._take_round(events, now, at)
+        taken = super()._handle_usual_round(events, now, at)
         if taken:
             self._state.statuses_received = heard
         return taken
@@ -34,8 +34,8 @@ class ForgetsStatuses(ShortDispatch):
 class KeepsFences(ShortDispatch):
     """Still waits for the answers that it has taken."""
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        taken = super()._take_round(events, now, at)
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._handle_usual_round(events, now, at)
         if taken:
             self._waits.expect_fences(2)
         return taken
