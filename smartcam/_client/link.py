@@ -608,7 +608,7 @@ def split_chunk(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
         event = events_left.popleft()
         if type(event) is ResultBurst:
             if len(event.data) > frames_left:
-                event, rest_of_burst = event.cut(frames_left)
+                event, rest_of_burst = event.split(frames_left)
                 events_left.appendleft(rest_of_burst)
             frames_left -= len(event.data)
         else:

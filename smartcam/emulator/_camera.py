@@ -362,7 +362,7 @@ class EmulatedCamera(WireCamera):
         """Return the policy for broken input."""
         tcp = transport is Transport.TCP
         policy = BAD_FRAME[self.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
-        return dataclasses.replace(policy, tells=self.device.behaviour.tells_bad_messages)
+        return dataclasses.replace(policy, reports_malformed=self.device.behaviour.tells_bad_messages)
 
     def received(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message of a link; without the session only Connect has an effect."""

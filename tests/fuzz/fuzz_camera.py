@@ -61,7 +61,7 @@ class Camera:
         )
         policy = dataclasses.replace(
             POLICIES_ON_A_BAD_FRAME[quirks.bad_frame],
-            tells=self.device.behaviour.tells_bad_messages,
+            reports_malformed=self.device.behaviour.tells_bad_messages,
         )
         self.dialect = dialect
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)

@@ -42,7 +42,9 @@ CHOSEN_POLICIES = (
     OWN_POLICY,
     Policy(fatal=(FrameError,), exact_length=True),  # of an emulator that hangs up
     Policy(fatal=(), exact_length=False),
-    Policy(fatal=(), exact_length=True, tells=True),  # of a camera that answers with codes
+    Policy(
+        fatal=(), exact_length=True, reports_malformed=True
+    ),  # of a camera that answers with codes
 )
 ANSWERED = (None, True, False)
 ENDED = {State.FAILED, State.CLOSED}

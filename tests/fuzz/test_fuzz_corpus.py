@@ -143,8 +143,8 @@ def forget_everything(framer: Framer) -> int:
 MISTAKES: dict[str, tuple[object, str, Any]] = {
     "framing": (Framer, "resync", forget_everything),
     "messages": (FramedDialect, "surplus", lambda *_: 0),
-    "machine": (Machine, "_wanted", lambda *_, **__: True),
-    "makes": (LineMachine, "_take", divide_by_zero),
+    "machine": (Machine, "_accept_answer", lambda *_, **__: True),
+    "makes": (LineMachine, "_handle_answer_line", divide_by_zero),
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (LocalizationsInterpreter, "_check_numbers", lambda *_: None),
     "scenario": cannot_tell_lines(divide_by_zero),

@@ -248,7 +248,7 @@ class Client:
         self.written = self.written[-128:]
         yield self.written
         yield machine.counters, machine.state, machine.buffered, machine.room().nbytes
-        yield machine._open, self.frames, self.deliveries
+        yield machine._pending_ids, self.frames, self.deliveries
         yield _parts(self.state, "_listeners")
         yield (
             [*waits.pending_answers],

@@ -44,19 +44,19 @@ class KeepsFences(ShortDispatch):
 class LooksAtSizes(ShortMachine):
     """Takes any delivery of a known size for the known one."""
 
-    def _note_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
-        super()._note_delivery(buffer, owed)
-        for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
+    def _store_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
+        super()._store_delivery(buffer, owed)
+        for size, known in self._known_deliveries.items():
+            self._known_deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
 
 
 class IsOwedAnything(ShortMachine):
     """Does not see that another answer is owed."""
 
-    def _receive_known(self) -> bool:
-        for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(pending=self._open)
-        return super()._receive_known()
+    def _receive_known_delivery(self) -> bool:
+        for size, known in self._known_deliveries.items():
+            self._known_deliveries[size] = known._replace(pending=self._pending_ids)
+        return super()._receive_known_delivery()
 
 
 @pytest.mark.parametrize(
