@@ -166,7 +166,7 @@ LIMITS = (
     "emulator._insight.connection.MAX_SESSIONS",
     "emulator._line_camera.MAX_INPUT_BYTES",
     "emulator._insight.connection.WRITE_LIMIT",
-    "emulator._line_camera.MAX_AGENDA",
+    "emulator._line_camera.MAX_SCHEDULED_CALLS",
     "emulator._insight.camera.MAX_ORDERED",
     "emulator._insight.image.MAX_PIXELS",
     "emulator._insight.job.MAX_CELL_TEXT_CHARACTERS",

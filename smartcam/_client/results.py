@@ -491,7 +491,7 @@ class Results:
     ) -> WrongApplicationError:
         return WrongApplicationError(
             f"{self._name}: a result of application {container.application} came, "
-            f"application {expected} old_bits expected",
+            f"application {expected} was expected",
             expected=expected,
             got=container.application,
         )

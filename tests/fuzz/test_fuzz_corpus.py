@@ -148,7 +148,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (LocalizationsInterpreter, "_check_numbers", lambda *_: None),
     "scenario": cannot_tell_lines(divide_by_zero),
-    "camera": (Device, "_report", lambda *_: None),
+    "camera": (Device, "_send_changed_status", lambda *_: None),
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
     "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
     "cell_file": (Teaching, "_check_written", lambda *_: 1 / 0),

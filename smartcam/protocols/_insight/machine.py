@@ -381,8 +381,8 @@ class InSightMachine:
         return int(number)
 
     def _query(self, _message: m.Message) -> Script:
-        request = yield from self._read_job_id()
-        self._report(m.QueryAnswer(code=StatusCode.DONE, application=request))
+        job = yield from self._read_job_id()
+        self._report(m.QueryAnswer(code=StatusCode.DONE, application=job))
 
     def _load_id(self, message: m.SwitchApplication) -> Script:
         return self._load(Command(line=f"SJ{message.application}"))
@@ -392,8 +392,8 @@ class InSightMachine:
 
     def _load(self, command: Command) -> Script:
         code = (yield command.line).code
-        request = yield from self._read_job_id()
-        self._report(m.SwitchAnswer(code=code, application=request))
+        job = yield from self._read_job_id()
+        self._report(m.SwitchAnswer(code=code, application=job))
 
     def _start(self, _message: m.Message) -> Script:
         self._report(m.StartAnswer(code=(yield "SO1").code))
@@ -412,7 +412,7 @@ class InSightMachine:
         self._report(m.TriggerAnswer(code=code))
         if code != StatusCode.DONE:
             return
-        request = yield from self._read_job_id()
+        job = yield from self._read_job_id()
         counter = self.dialect.counter
         before = (yield from self._read_value(counter)) if counter else None
         values: dict[str, str | None] = {}
@@ -423,9 +423,9 @@ class InSightMachine:
             m.CellValue(cell, None if values[cell] == ERROR_VALUE else values[cell])
             for cell in self.dialect.cells
         ]
-        fault, now = None, (yield from self._read_job_id()) if cells else request
-        if now != request:
-            fault = f"job {now} was loaded while the cells of job {request} were read"
+        fault, now = None, (yield from self._read_job_id()) if cells else job
+        if now != job:
+            fault = f"job {now} was loaded while the cells of job {job} were read"
         elif before != after:
             fault = (
                 f"cell {counter}, which counts runs, went from {before} to {after} while the cells "
@@ -433,7 +433,7 @@ class InSightMachine:
             )
         self._report(
             m.ResultContainer(
-                application=request,
+                application=job,
                 data=json.dumps(values).encode(),
                 cells=tuple(cells),
                 fault=fault,
