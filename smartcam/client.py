@@ -107,14 +107,14 @@ class SmartCamera(Camera[ValueT]):
     def _deadline(self, timeout: float) -> float:
         return self._connection.deadline(timeout)
 
-    def _listens(self, subscribers: object) -> None:
+    def _on_listener_added(self, subscribers: object) -> None:
         self._status.start_polling()
 
-    def _abandoned(self) -> bool:
+    def _release_unreferenced(self) -> bool:
         supervisor: Supervisor | None = getattr(self, "_supervisor", None)
         return supervisor is not None and supervisor.abandon()
 
-    def _over(self) -> tuple[SmartCamError | None] | None:
+    def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
         end = self._waits.end_reason
         if end is None or not self._supervisor.has_ended:
             return None  # between two sessions, streams wait for the next one

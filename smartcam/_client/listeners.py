@@ -45,7 +45,7 @@ class Listeners:
         self.statuses: Subscribers[Status] = Subscribers()
         self.events: Subscribers[CameraEvent] = Subscribers()
         self.has_result_observer: bool = observers.see_results
-        self._observes_singly = observers.see_each
+        self._observes_singly = observers.see_single_results
         self._name = name
         self._observers = observers
         # weak: a future that was made and never awaited must not count as a listener
@@ -75,7 +75,7 @@ class Listeners:
 
     @property
     def _has_result_streams(self) -> bool:
-        return self.results.any_open
+        return self.results.has_open_queue
 
     @property
     def _has_waiters(self) -> bool:

@@ -203,7 +203,7 @@ class SharedCamera(SmartCamera[Carried]):
         If the camera may still have input data queued, from a trigger without a result, the
         application is loaded again first, which empties the queue.
         """
-        if not self._observed and request.input_data is None:
+        if not self._has_observers and request.input_data is None:
             return await self._trigger(application, request, timeout)
         called_at = datetime.now(UTC)
         try:
