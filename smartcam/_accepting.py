@@ -73,7 +73,7 @@ def is_loopback(host: str) -> bool:
 
 
 def share_of(most: int) -> int:
-    """Return how many of ``most`` places one address may take; loopback may take all."""
+    """Return the number of ``most`` places that one address may take; loopback may take all."""
     return max(1, most - most // 4)
 
 

@@ -19,7 +19,7 @@ BROKEN_OPENCV = "5.0.0"
 class Package(NamedTuple):
     """A package of an extra: its name for users, the extra, and its usual purpose with a verb."""
 
-    called: str  # the package's name in error texts
+    called: str
     extra: str
     use: str
 

@@ -103,7 +103,7 @@ class ThesisTriggerRequest(ThesisRequest):
 
 
 class ThesisCamera(Protocol):
-    """What the six services need of a camera and of the publisher of its results and status.
+    """The camera that the six services work on, with the publisher of its results and status.
 
     Attributes:
         name: the camera's name.

@@ -121,7 +121,7 @@ class TransformRequest(ThesisRequest):
 
 
 class CalibrationHost(Protocol):
-    """What the five services need of the owner of a camera.
+    """The owner of the camera that the five services calibrate.
 
     Attributes:
         name: the camera's name.

@@ -123,9 +123,9 @@ class BusLink:
         listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
         connect: endpoints to connect to; of several, one that answers is used.
         certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
-        peer: for an end that only connects: True if it is a peer. A peer, such as a node of
-            rmw_zenoh, also has direct links to the ends that it finds on this host, and keeps
-            working without the routers at ``connect``.
+        peer: True if an end that only connects is a peer. A peer, such as a node of rmw_zenoh, also
+            has direct links to the ends that it finds on this host, and keeps working without the
+            routers at ``connect``.
     """
 
     listen: tuple[str, ...] = ()

@@ -31,7 +31,7 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 
 
 @dataclass(frozen=True, slots=True)
-class StateBefore:
+class PreviousState:
     """The camera's state before a switch, to which a job goes back.
 
     Attributes:
@@ -75,7 +75,7 @@ class CommandLock:
     def __post_init__(self) -> None:
         # tasks of the session; None between two sessions
         self._task_group: asyncio.TaskGroup | None = None
-        self._state_to_restore: StateBefore | None = None  # state to restore in the next session
+        self._state_to_restore: PreviousState | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
         self._waiting_commands = 0  # commands that wait for the lock
         self._running_jobs: set[asyncio.Task[None]] = set()
@@ -181,12 +181,12 @@ class CommandLock:
             self._lock.release()
             raise
 
-    async def enter_application(self, application: int, deadline: float) -> StateBefore:
+    async def enter_application(self, application: int, deadline: float) -> PreviousState:
         """Start ``application`` while the turn is held; go back if that fails."""
         commands = self._commands
         commands.check_id(application)
         active = await commands.query_loaded(deadline)
-        before = StateBefore(active, commands.is_in_run_mode, self._state.wanted)
+        before = PreviousState(active, commands.is_in_run_mode, self._state.wanted)
         try:
             await commands.ensure_running(application, deadline)
         except BaseException:
@@ -194,7 +194,7 @@ class CommandLock:
             raise
         return before
 
-    def go_back(self, before: StateBefore) -> asyncio.Task[None] | None:
+    def go_back(self, before: PreviousState) -> asyncio.Task[None] | None:
         """Start a job that goes back when the turn is free, and return it.
 
         Without a session return None; then the next session goes back. If several calls are made
@@ -214,7 +214,7 @@ class CommandLock:
         task.add_done_callback(self._running_jobs.discard)
         return task
 
-    async def go_back_and_wait(self, before: StateBefore) -> None:
+    async def go_back_and_wait(self, before: PreviousState) -> None:
         """Go back, or raise the error that prevented it.
 
         Cancellation: the job is finished nevertheless.
@@ -281,12 +281,12 @@ class CommandLock:
         while self._running_jobs:
             await asyncio.wait(self._running_jobs)
 
-    def _restore_later(self, before: StateBefore) -> None:
+    def _restore_later(self, before: PreviousState) -> None:
         """Keep the state that the next session must restore."""
         self._state_to_restore = before
         self._state.set_wanted(before.wanted)
 
-    async def _restore_earlier(self, before: StateBefore) -> None:
+    async def _restore_earlier(self, before: PreviousState) -> None:
         """Go back to an earlier application and run state; never raises."""
         await self._wait_adopted()
         async with self._lock:

@@ -148,7 +148,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             or another one sets.
         wake_in_order: function that makes the callers of this delivery continue after subscribers.
         trace: trace of the link's frames; None if neither an observer nor the log wants them.
-        heard_at: loop time of the last byte received.
+        last_byte_at: loop time of the last byte received.
     """
 
     # an object with more than thirty attributes and no slots is slower at each of them
@@ -172,7 +172,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             "_send_all",
             "_transport",
         ),
-        *("_writable", "deliveries", "heard_at", "host", "loop", "machine", "name"),
+        *("_writable", "deliveries", "last_byte_at", "host", "loop", "machine", "name"),
         *("outcome", "port", "trace", "wake_in_order"),
     )
 
@@ -195,9 +195,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.last_byte_at: float = self.loop.time()
         self._transport: Any = None
         self._datagrams = machine.transport is Transport.UDP
-        self._direct_socket: socket.socket | None = (
-            None  # socket for reading waiting datagrams directly
-        )
+        # socket for reading waiting datagrams directly
+        self._direct_socket: socket.socket | None = None
         self._machine_replies = machine.replies
         self._get_buffer = machine.room
         # if the machine can send several at once

@@ -126,7 +126,7 @@ class Listeners:
             self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
-        """Pass on results that are only streamed and has_result_observer; ``size`` bytes in all."""
+        """Pass results of ``size`` bytes to observers and streams; no caller waits for one."""
         if self._observes_singly:
             self._offer_singly(results, now)
             return

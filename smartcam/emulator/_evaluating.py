@@ -108,9 +108,8 @@ class EvaluatingCamera(LineCamera):
         }
         self._numbers_of_applications = [*parts]
         self._asking_client: LineClient | None = None  # client of the running evaluation
-        self._run_number = (
-            0  # number of the last evaluation or switch: a switch ends a running evaluation
-        )
+        # number of the last evaluation or switch: a switch ends a running evaluation
+        self._run_number = 0
         self.device: Any = Operator(self)
 
     @classmethod

@@ -66,7 +66,8 @@ MAX_LINKS = 32
 over. A new client is always accepted: the one that was without a session for longest is closed."""
 
 WRITE_LIMIT = 1 << 20
-"""Largest number of bytes kept for a client, or held back by faults; then its connection ends."""
+"""Bytes kept for a client that does not read, or held back by faults; if there are more, its
+connection ends."""
 
 _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
     Transport.TCP: TcpListener,

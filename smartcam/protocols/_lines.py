@@ -353,7 +353,7 @@ class _OpenRequest:
 
     Attributes:
         row: row of the request.
-        script: its remaining lines and answers.
+        script: the request's remaining lines and answers.
         line: line to send next, or the line sent last.
         answer_word: word by which the answer to ``line`` will be recognized; None: the first word
             of ``line``.

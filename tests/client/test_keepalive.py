@@ -448,7 +448,7 @@ def looks() -> list[asyncio.TimerHandle]:
     """Return the timers of watches that are set."""
     loop: Any = asyncio.get_running_loop()
     timers: list[asyncio.TimerHandle] = loop._scheduled
-    return [one for one in timers if not one.cancelled() and "_Watch.look" in repr(one)]
+    return [one for one in timers if not one.cancelled() and "_Watch.check_link" in repr(one)]
 
 
 async def test_no_timeout_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ for its login is closed; if all are logged in, the new one is closed. The real c
 published."""
 
 WRITE_LIMIT = 1 << 25
-"""Largest number of bytes kept for a client that does not read; then its connection ends. An image
-of 8 megapixels makes 17 million."""
+"""Bytes kept for a client that does not read; if there are more, its connection ends. An image of 8
+megapixels needs 17 million."""
 
 
 def _code(line: str) -> int:

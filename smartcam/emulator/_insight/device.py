@@ -102,9 +102,8 @@ class InSightDevice:
         self._running_event: _PendingEvent | None = None
         self._runs_since_load = 0  # number of acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
-        self._generation = (
-            0  # counts loads and changes of the mode; a free run from before one stops
-        )
+        # counts loads and changes of the mode; a free run from before one stops
+        self._generation = 0
         if active is not None:
             self.job = self.find(active)
         self._reset_job()

@@ -428,7 +428,7 @@ class Receiver:
                 self.own_calls.get(run.call) if run.owner and run.owner == self._program else None
             )
             if own_call is not None:
-                self._offer(run, self._outcome(own_call, run), now, reported_by_caller=True)
+                self._offer(run, self._outcome(own_call, run), now, owned=True)
                 return
             expected = self._expected()
             if expected is not None and run.application != expected:
@@ -445,24 +445,17 @@ class Receiver:
                 except InterpretationError as error:
                     outcome, fate = error, "late" if fate == "late" else "uninterpretable"
                 self._counters.count(fate)
-                self._offer(single, outcome, now, reported_by_caller=False)
+                self._offer(single, outcome, now, owned=False)
         finally:
             listeners.results.horizon = math.inf
 
     def _offer(
-        self,
-        run: ResultRun,
-        outcome: Result | InterpretationError,
-        now: float,
-        *,
-        reported_by_caller: bool,
+        self, run: ResultRun, outcome: Result | InterpretationError, now: float, *, owned: bool
     ) -> None:
         current, listeners = bool(run.flags & CURRENT), self._listeners
         if isinstance(outcome, InterpretationError):
             size = len(run.payloads[0])
-            listeners.offer_error(
-                outcome, now, size, current=current, reported_by_caller=reported_by_caller
-            )
+            listeners.offer_error(outcome, now, size, current=current, reported_by_caller=owned)
         else:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 

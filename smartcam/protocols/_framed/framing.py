@@ -147,9 +147,8 @@ class Framer:
         self._lengths: Mapping[int, range] = {}
         self._always_allowed = max_length  # length that any message may have
         self._read = header.reader()
-        self.buffer: Buffer = (
-            b""  # a received chunk, or one large frame; cut() returns offsets in it
-        )
+        # a received chunk, or one large frame; cut() returns offsets in it
+        self.buffer: Buffer = b""
         self.start: int = 0  # offset of the next frame
         self._large: memoryview | None = None  # whole size of an unfinished large frame
         self._filled = 0
