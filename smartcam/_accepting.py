@@ -4,19 +4,19 @@ Emulators, pages, the RTSP server and the link proxy use it. :class:`Places` dec
 connections may stay; it uses no socket and no clock. :class:`Acceptor` accepts them, and keeps the
 deadlines.
 
-- A newcomer always gets in as long as some connection has no session: the connection that has had
-  none for longest is closed. A connection with a session stays. The server defines what a session
-  is; a request that needs no session, such as OPTIONS, does not make one.
-- A connection without a session in time is closed, even if it has sent data.
+- If all places are taken, a new connection replaces the connection that has been without a session
+  for longest. If each has a session, the new connection is refused. The server defines what a
+  session is; a request that needs no session, such as OPTIONS, does not make one.
+- A connection that has no session in time is closed, even if it has sent data.
 - One address gets at most three quarters of the places; the programs of this machine share one
   address, so loopback may have all.
-- Some file descriptors of the process are left to others. If only those are left, the connection
-  without a session for longest, of any server on this event loop, is closed.
+- Some file descriptors of the process are reserved for others. If only those are left, the
+  connection without a session for longest, of any server on this event loop, is closed.
 
 Connections are not accepted by ``asyncio.Server``. If it is closed before an accepted connection
 has a transport, the socket stays open until the garbage collector finds it, and the client waits
-forever. Without a free file descriptor it logs a traceback for each place of its backlog, every
-second.
+forever. Without a free file descriptor it logs a traceback for each connection that its backlog
+may hold, every second.
 """
 
 from __future__ import annotations
@@ -73,29 +73,29 @@ def is_loopback(host: str) -> bool:
 
 
 def share_of(most: int) -> int:
-    """Return the share of ``most`` places for one address; loopback may take all."""
+    """Return the number of ``most`` places that one address may take; loopback may take all."""
     return max(1, most - most // 4)
 
 
 class Occupant(Protocol):
-    """A connection, as far as the policy knows it."""
+    """A connection, with the part of it that the policy uses."""
 
     @property
     def settled(self) -> bool:
-        """True if it has a session or is being served, so that it never makes room for another."""
+        """True if it has a session or is being served, so that it is never closed for another."""
         ...
 
     def turn_away(self, why: str) -> None:
-        """End the connection at once; harmless when called twice."""
+        """Close the connection at once, since it has lost its place. Harmless when called twice."""
         ...
 
 
 @dataclass(slots=True)
 class _TakenPlace:
     peer: str  # address of the peer, without a port
-    since: float  # time at which the connection came, or last had a session
-    within: float  # seconds that the connection may stay from then on
-    missing: str  # name of the missing thing, for the log
+    idle_since: float  # time at which the connection was made, was last served, or lost its session
+    timeout: float  # seconds within which the connection must have a session
+    missing: str  # what the connection lacks, for the log: "no session"
     deadline: float
 
 
@@ -109,9 +109,9 @@ class Places(Generic[G]):
 
     Args:
         most: largest number of connections at a time.
-        within: seconds that a connection may stay without a session.
-        missing: name of the missing thing, which the log gives as the reason for closing.
-        own: name of a session in the log, "a session".
+        within: seconds that a new connection may stay without a session.
+        missing: what such a connection lacks, for the log: "no session".
+        own: name of a session, for the log: "a session".
 
     Attributes:
         most: largest number of connections at a time; may be changed.
@@ -128,8 +128,8 @@ class Places(Generic[G]):
     ) -> None:
         self.most = most
         self.crowded_out = 0
-        self._within, self._missing, self._session_name = within, missing, own
-        self._places: dict[G, _TakenPlace] = {}  # the longest without a session is first
+        self._timeout, self._missing, self._session_name = within, missing, own
+        self._places: dict[G, _TakenPlace] = {}  # the first has been idle for longest
 
     def __len__(self) -> int:
         return len(self._places)
@@ -141,26 +141,26 @@ class Places(Generic[G]):
         return occupant in self._places
 
     def enter(self, occupant: G, peer: str, now: float) -> str:
-        """Give a newcomer a place; another connection may be closed for it.
+        """Give a new connection a place; another connection may be closed for it.
 
         Returns:
-            "", or the reason why the connection gets no place.
+            The reason why the connection is refused; "" if it has a place now.
         """
-        crowd, taken = list(self._places), f"{self.most} others are open"
-        if len(crowd) < self.most:
-            crowd = []
+        rivals, reason = list(self._places), f"{self.most} others are open"
+        if len(rivals) < self.most:
+            rivals = []
             if not is_loopback(peer):
-                same = [other for other, place in self._places.items() if place.peer == peer]
-                if len(same) >= share_of(self.most):
-                    crowd, taken = same, f"{len(same)} others of {peer} are open"
-        if crowd:
+                of_peer = [other for other, place in self._places.items() if place.peer == peer]
+                if len(of_peer) >= share_of(self.most):
+                    rivals, reason = of_peer, f"{len(of_peer)} others of {peer} are open"
+        if rivals:
             self.crowded_out += 1
-            evicted = next((other for other in crowd if not other.settled), None)
+            evicted = next((other for other in rivals if not other.settled), None)
             if evicted is None:
-                return f"{taken}, and each has {self._session_name}"
-            self._send_away(evicted, f"{taken}, it was without {self._session_name} for longest")
+                return f"{reason}, and each has {self._session_name}"
+            self._evict(evicted, f"{reason}, it was without {self._session_name} for longest")
         self._places[occupant] = _TakenPlace(
-            peer, now, self._within, self._missing, now + self._within
+            peer, now, self._timeout, self._missing, now + self._timeout
         )
         return ""
 
@@ -169,78 +169,85 @@ class Places(Generic[G]):
         self._places.pop(occupant, None)
 
     def move_back(self, occupant: G, now: float) -> None:
-        """Put a connection last in the line to make room: it was served, or its session ended."""
+        """Note that a connection was served or its session ended: it is idle only since now.
+
+        Connections that have been idle for longer are closed for new ones before it.
+        """
         place = self._places.pop(occupant, None)
         if place is not None:
-            place.since = now
+            place.idle_since = now
             self._places[occupant] = place
 
     def expect(self, occupant: G, within: float | None, missing: str, now: float) -> None:
-        """Set the seconds within which a connection must have a session; None: no limit.
+        """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
-            within: seconds from now on.
-            missing: name of the missing thing, for the log.
-            now: the moment.
+            within: seconds from ``now`` on.
+            missing: what a connection that is too late lacks, for the log: "no request".
+            now: the present time.
         """
         place = self._places.get(occupant)
         if place is not None:
-            place.within, place.missing = math.inf if within is None else within, missing
-            place.deadline = now + place.within
+            place.timeout, place.missing = math.inf if within is None else within, missing
+            place.deadline = now + place.timeout
 
     def waits_longest(self) -> tuple[float, G] | None:
-        """Return the connection that has had no session for longest, and since when; None: none."""
+        """Find the connection that has been without a session for longest.
+
+        Returns:
+            The time since which it has had none, and the connection; None if each has a session.
+        """
         for occupant, place in self._places.items():
             if not occupant.settled:
-                return place.since, occupant
+                return place.idle_since, occupant
         return None
 
     def make_room(self, why: str) -> None:
-        """Close the connection that has had no session for longest."""
-        longest_waiting = self.waits_longest()
-        if longest_waiting is not None:
+        """Close the connection that has been without a session for longest, if there is one."""
+        longest_idle = self.waits_longest()
+        if longest_idle is not None:
             self.crowded_out += 1
-            self._send_away(longest_waiting[1], why)
+            self._evict(longest_idle[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """End connections whose time is over; a connection with a session gets new time."""
+        """Close connections without a session at their deadline; others get a new deadline."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
             if occupant.settled:
-                place.deadline = now + place.within
+                place.deadline = now + place.timeout
             else:
-                self._send_away(occupant, f"{place.missing} within {place.within:g} s")
+                self._evict(occupant, f"{place.missing} within {place.timeout:g} s")
 
     def next_deadline(self) -> float:
-        """Return when :meth:`end_overdue` is to be called next; infinity: never."""
+        """Return the time at which :meth:`end_overdue` has work next; infinity if it has none."""
         return min((place.deadline for place in self._places.values()), default=math.inf)
 
-    def _send_away(self, occupant: G, why: str) -> None:
+    def _evict(self, occupant: G, why: str) -> None:
         self._places.pop(occupant, None)
         occupant.turn_away(why)
 
 
-class _OnThisThread(threading.local):
+class _ThreadState(threading.local):
     """The acceptors of the event loops that run in a thread."""
 
     def __init__(self) -> None:
         self.acceptors: weakref.WeakSet[Acceptor[Any]] = weakref.WeakSet()
 
 
-_here = _OnThisThread()
+_thread_state = _ThreadState()
 
 
 class Acceptor(Generic[G]):
-    """Gives each connection on a listening socket a protocol, which takes a place.
+    """Accepts connections on a listening socket; gives each a protocol, which takes a place.
 
     The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when it
     is lost.
 
     Args:
-        make: function that returns a new protocol. One made after :meth:`close` is for a connection
-            that was accepted earlier.
+        make: function that returns a new protocol. It may also be called after :meth:`close`, for a
+            connection that was accepted earlier.
         places: places of the connections that may stay.
         log: logger of failures.
         name: name of the tasks.
@@ -262,10 +269,10 @@ class Acceptor(Generic[G]):
         self._name = name
         self._reserve = reserve
         self._socket: socket.socket | None = None
-        self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
-        self._adopting: set[asyncio.Task[Any]] = set()
-        self._moving = 0  # connections that wait for a free descriptor
-        self._scarce = False  # the last try has failed
+        self._accept_handle: asyncio.Task[None] | asyncio.TimerHandle | None = None
+        self._adopt_tasks: set[asyncio.Task[Any]] = set()
+        self._moving_count = 0  # connections that :meth:`_move` will get
+        self._has_warned = False  # the last connection could not be accepted, and the log says so
         self._timer: asyncio.TimerHandle | None = None  # timer of the next deadline
         self.loop: asyncio.AbstractEventLoop | None = None  # event loop while the socket listens
 
@@ -275,32 +282,32 @@ class Acceptor(Generic[G]):
         """Start accepting on a listening, non-blocking socket."""
         self._socket = sock
         self.loop = asyncio.get_running_loop()
-        _here.acceptors.add(self)
+        _thread_state.acceptors.add(self)
         self._listen(sock)
 
     def close(self) -> None:
         """Stop accepting at once; connections and the socket stay open."""
         sock, self._socket = self._socket, None
         self.loop = None
-        _here.acceptors.discard(self)
+        _thread_state.acceptors.discard(self)
         if sock is not None:
             with contextlib.suppress(NotImplementedError):
                 asyncio.get_running_loop().remove_reader(sock)
-        if self._waiting is not None:
-            self._waiting.cancel()
-            self._waiting = None
+        if self._accept_handle is not None:
+            self._accept_handle.cancel()
+            self._accept_handle = None
 
     async def wait_closed(self) -> None:
-        """Wait until every connection that was accepted has its protocol, or is closed."""
-        if self._moving:  # a move takes one turn of the loop
+        """Wait until every accepted connection has its protocol, or is closed."""
+        if self._moving_count:  # the loop calls _move in its next turn
             await asyncio.sleep(0)
-        if self._adopting:
-            await asyncio.wait(self._adopting)
+        if self._adopt_tasks:
+            await asyncio.wait(self._adopt_tasks)
 
     # ------------------------------------------------------------------ its connections
 
     def enter(self, occupant: G, address: Any) -> str:
-        """Give a new connection a place; return "", or the reason why it gets none.
+        """Give a new connection a place; return the reason if it is refused, "" if it has a place.
 
         Args:
             occupant: the connection.
@@ -319,16 +326,16 @@ class Acceptor(Generic[G]):
             self._timer = None
 
     def move_back(self, occupant: G) -> None:
-        """Put a connection last in the line to make room: it was served, or its session ended."""
+        """Note that a connection was served or its session ended: :meth:`Places.move_back`."""
         self.places.move_back(occupant, asyncio.get_running_loop().time())
 
     def expect(self, occupant: G, within: float | None, missing: str) -> None:
-        """Set the seconds within which a connection must have a session; None: no limit.
+        """Set a new time limit within which a connection must have a session; None: no limit.
 
         Args:
             occupant: the connection.
             within: seconds from now on.
-            missing: name of the missing thing, for the log.
+            missing: what a connection that is too late lacks, for the log: "no request".
         """
         self.places.expect(occupant, within, missing, asyncio.get_running_loop().time())
         self._set_timer()
@@ -351,20 +358,20 @@ class Acceptor(Generic[G]):
     # ------------------------------------------------------------------ accepting
 
     def adopt(self, connection: socket.socket) -> None:
-        """Give an accepted connection its protocol, which closes one that is too late."""
+        """Start a task that gives an accepted connection its protocol."""
         loop = asyncio.get_running_loop()
         task = loop.create_task(
             loop.connect_accepted_socket(self._make, connection), name=f"{self._name}.adopt"
         )
-        self._adopting.add(task)
-        task.add_done_callback(partial(self._adopted, connection))
+        self._adopt_tasks.add(task)
+        task.add_done_callback(partial(self._on_adopted, connection))
 
     def _listen(self, sock: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         try:
             loop.add_reader(sock, self._accept, sock)
         except NotImplementedError:  # Windows' proactor
-            self._waiting = loop.create_task(
+            self._accept_handle = loop.create_task(
                 self._accept_for_ever(sock), name=f"{self._name}.accept"
             )
 
@@ -372,13 +379,13 @@ class Acceptor(Generic[G]):
         try:
             connection, _ = sock.accept()
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-            return  # the client has closed the connection already
-        except OSError as exc:  # no file descriptor is left: the reader would be called endlessly
+            return  # no connection: the client has closed it already
+        except OSError as exc:  # no file descriptor is left; without a pause, a busy loop
             self._warn_once(f"a connection cannot be accepted: {exc}")
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock)
             pause = 0.0 if _make_room() else ACCEPT_PAUSE
-            self._waiting = loop.call_later(pause, self._listen, sock)
+            self._accept_handle = loop.call_later(pause, self._listen, sock)
             return
         self._admit(connection)
 
@@ -394,56 +401,57 @@ class Acceptor(Generic[G]):
                 self._admit(connection)
 
     def _warn_once(self, text: str) -> None:
-        """Log that nothing can be accepted; once, until accepting works again."""
-        if not self._scarce:
+        """Log that a connection cannot be accepted; only the first time until one is accepted."""
+        if not self._has_warned:
             self._log.warning("! %s", text)
-        self._scarce = True
+        self._has_warned = True
 
     def _admit(self, connection: socket.socket) -> None:
-        """Adopt a connection, if the process has a descriptor left for it."""
-        if not _is_last(connection, self._reserve):
-            self._take(connection)
+        """Adopt a connection; close it if too few descriptors of the process are left."""
+        if not _is_reserved(connection, self._reserve):
+            self._adopt_ready(connection)
         elif _make_room():
-            self._moving += 1
+            self._moving_count += 1
             asyncio.get_running_loop().call_soon(self._move, connection)
         else:
             self._warn_once("a connection was refused: too few file descriptors are left")
             connection.close()
 
     def _move(self, connection: socket.socket) -> None:
-        """Move a connection to the descriptor that has become free, and release the last one.
+        """Move a connection from its reserved descriptor to the one that has become free.
 
-        Otherwise this connection would keep one of the last descriptors, and the next connection
-        would get the free one.
+        Otherwise this connection would keep the reserved descriptor, and the next connection would
+        get the free one.
         """
-        self._moving -= 1
+        self._moving_count -= 1
         try:
             moved = connection.dup()
         except OSError:
             moved = connection
         else:
             connection.close()
-        self._take(moved)
+        self._adopt_ready(moved)
 
-    def _take(self, connection: socket.socket) -> None:
-        self._scarce = False
+    def _adopt_ready(self, connection: socket.socket) -> None:
+        """Set a connection's options, and adopt it."""
+        self._has_warned = False
         connection.setblocking(False)
-        with contextlib.suppress(OSError):  # the connection is gone again
+        with contextlib.suppress(OSError):  # the connection has ended already
             # asyncio sets TCP_NODELAY only if the listening socket names the protocol TCP
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.adopt(connection)
 
-    def _adopted(self, connection: socket.socket, task: asyncio.Task[Any]) -> None:
-        self._adopting.discard(task)
+    def _on_adopted(self, connection: socket.socket, task: asyncio.Task[Any]) -> None:
+        self._adopt_tasks.discard(task)
         if task.cancelled() or task.exception() is not None:
             self._log.warning("! an accepted connection was lost: %s", task)
             connection.close()
 
 
-def _is_last(connection: socket.socket, reserve: int) -> bool:
-    """Return True if a new connection has one of the last descriptors of the process.
+def _is_reserved(connection: socket.socket, reserve: int) -> bool:
+    """Return True if a new connection has one of the last ``reserve`` descriptors of the process.
 
-    The system gives the lowest descriptor that is free: all below a high one are in use.
+    The system gives the lowest free descriptor, so all below are in use.
     """
     if sys.platform == "win32":
         return False
@@ -452,13 +460,17 @@ def _is_last(connection: socket.socket, reserve: int) -> bool:
 
 
 def _make_room() -> bool:
-    """Close the connection without a session for longest, of all on this event loop."""
+    """Close the connection that has been without a session for longest on this event loop.
+
+    Returns:
+        False if each has a session.
+    """
     loop = asyncio.get_running_loop()
-    open_here = [acceptor.places for acceptor in _here.acceptors if acceptor.loop is loop]
-    waiting = [(longest[0], places) for places in open_here if (longest := places.waits_longest())]
-    if not waiting:
+    of_loop = [acceptor.places for acceptor in _thread_state.acceptors if acceptor.loop is loop]
+    idle = [(longest[0], places) for places in of_loop if (longest := places.waits_longest())]
+    if not idle:
         return False
-    _, places = min(waiting, key=lambda pair: pair[0])
+    _, places = min(idle, key=lambda pair: pair[0])
     places.make_room("the process has too few file descriptors left")
     return True
 
@@ -469,7 +481,7 @@ async def listening(host: str, port: int, *, local: bool = False) -> socket.sock
     Args:
         host: name or address of this machine; "": all of them.
         port: 0 for a free one.
-        local: whether only loopback is accepted.
+        local: True if only an address of loopback is allowed.
 
     Raises:
         OSError, ValueError, OverflowError: the address is not available, or is not ``local``.

@@ -1,4 +1,4 @@
-"""Name the argument of a function that is of a wrong kind.
+"""Find the argument of a wrong kind after a function has failed, and raise an error that names it.
 
 Only kinds are checked. For numbers, shapes or words that cannot work, the function raises an error
 of its own.
@@ -25,14 +25,14 @@ R = TypeVar("R")
 
 
 def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function to name the argument that is of a wrong kind.
+    """Return a decorator for a function whose errors name the argument that is of a wrong kind.
 
-    The function is called first, and an error of the library comes out as it is. After any other
-    error the checks look at the arguments of these names. The first that finds one of a wrong kind
-    raises a ConfigurationError, whose text begins with the function's name, or with the class' for
-    an ``__init__``. If all are of the right kind, the function is called once more, with the plain
-    values that the checks return, since a subclass of ``str`` or ``float`` may have failed it. So
-    the function has to allow a second call.
+    The function is called first, and an error of the library is raised unchanged. After any other
+    error each check gets the argument of its name. The first check that finds a wrong kind raises
+    a ConfigurationError, whose text begins with the function's name, or for an ``__init__`` with
+    the name of its class. If all are of the right kind, the function is called once more, with the
+    plain values that the checks return, since a subclass of ``str`` or ``float`` may have caused
+    the error. So the function has to allow a second call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -45,12 +45,12 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 return function(*args, **options)
             except SmartCamError:
                 raise
-            except Exception:  # noqa: BLE001 - the checks say what it was, or the second call
-                given = signature.bind(*args, **options)
+            except Exception:  # noqa: BLE001 - the checks or the second call raise the error
+                bound = signature.bind(*args, **options)
                 for name, check in checks.items():
-                    if name in given.arguments:
-                        given.arguments[name] = check(given.arguments[name], name, owner)
-            return function(*given.args, **given.kwargs)
+                    if name in bound.arguments:
+                        bound.arguments[name] = check(bound.arguments[name], name, owner)
+            return function(*bound.args, **bound.kwargs)
 
         return call
 
@@ -58,7 +58,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def a_number(value: Any, name: str, owner: str) -> Any:
-    """Return a plain number that a float has room for; ``bool`` is not one."""
+    """Return a plain number that a float can hold; ``bool`` is not a number here."""
     number = plain(value)
     if isinstance(number, (int, float)) and not isinstance(number, bool):
         try:
@@ -79,7 +79,7 @@ def a_finite_number(value: Any, name: str, owner: str) -> Any:
 
 
 def an_integer(value: Any, name: str, owner: str) -> Any:
-    """Return a plain integer of at most 64 bits; ``bool`` is not one."""
+    """Return a plain integer of at most 64 bits; ``bool`` is not an integer here."""
     number = plain(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number
@@ -87,7 +87,7 @@ def an_integer(value: Any, name: str, owner: str) -> Any:
 
 
 def a_list(value: Any, name: str, owner: str) -> Any:
-    """Return the items of a sequence; a text is not one."""
+    """Return the items of a sequence; a text is refused."""
     return check_all(value, name, "a list", owner)
 
 

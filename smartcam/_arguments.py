@@ -34,20 +34,20 @@ MAX_TEXT_LENGTH = 10_000
 """Largest number of characters that a text may have, if no smaller bound is given."""
 
 MAX_DATA_BYTES = 1 << 30
-"""Largest number of bytes that a byte string may have; the largest payload that a client may
+"""Largest number of bytes of a byte string; also the largest payload that a client may
 accept."""
 
 MAX_NAME_CHARACTERS = 200
 """Largest number of characters of a camera's name from a user."""
 
 MAX_OPTION_SECONDS = 86_400.0
-"""Largest time limit among the options of a connection, seconds."""
+"""Largest value in seconds of an option of a connection that is a time limit."""
 
 MAX_CONNECT_ATTEMPTS = 100
 """Largest number of links that may be tried for a dialect."""
 
 MIN_PAYLOAD_LIMIT_BYTES = 16
-"""Least value of the largest payload that a client accepts."""
+"""Least value of ``max_length``, the largest payload that a client accepts."""
 
 MAX_SHOWN_LENGTH = 80
 """Largest number of characters of a wrong value that an error's text shows."""
@@ -69,8 +69,8 @@ def shown(value: object) -> str:
 def shown_time(seconds: float, *, coarse: bool = False) -> str:
     """Return a time as an error's text shows it: ``2.5 s``, ``4.2 ms``.
 
-    Seconds have two digits behind the point at most, or with ``coarse`` always one. What these
-    cannot show is milliseconds.
+    Seconds have at most two digits after the point, or with ``coarse`` always one. A time that is
+    too short for these digits is shown in milliseconds.
     """
     if 0 < seconds < (0.05 if coarse else 0.01):
         return f"{seconds * 1000:.3g} ms"
@@ -108,7 +108,7 @@ def _as_integer(value: Any) -> int | None:
 
 
 def plain(value: object) -> object:
-    """Return the plain value of a number, truth value or text of any class; others as they are.
+    """Return a number, truth value or text of any class as its plain value; others unchanged.
 
     Pydantic's strict types get the plain value, since they refuse numpy's numbers.
     """
@@ -136,7 +136,7 @@ def check_number(
     above: bool = False,
     unit: str = "a number",
 ) -> float:
-    """Return a finite number from ``least`` to ``most``; with ``above``, one above ``least``.
+    """Return a finite number from ``least`` to ``most``; with ``above`` not ``least`` itself.
 
     Numbers of numpy and fractions are accepted; ``bool``, texts and arrays are not.
     """
@@ -172,7 +172,7 @@ def check_seconds_or_none(
 
 
 def check_moment(value: object, name: str, owner: str = "") -> float:
-    """Return a moment of a clock: any finite number of seconds."""
+    """Return a time of any clock: any finite number of seconds."""
     if type(value) is float and math.isfinite(value):
         return value
     number = _as_float(value)
@@ -182,7 +182,7 @@ def check_moment(value: object, name: str, owner: str = "") -> float:
 
 
 def check_age(value: object, name: str, owner: str = "") -> float:
-    """Return an age in seconds, 0 or more; ``inf`` is any age."""
+    """Return an age in seconds, 0 or more; ``inf`` is allowed."""
     number = _as_float(value)
     if number is None or not number >= 0:
         raise wrong_argument(name, "0 or more seconds, or inf", value, owner)
@@ -223,7 +223,7 @@ def _has_surrogates(text: str) -> bool:
 
 
 def check_choice(value: object, name: str, known: Collection[str], owner: str = "") -> str:
-    """Return a word that is one of the known words."""
+    """Return a text that is one of the known words."""
     if isinstance(value, str) and str.__str__(value) in known:
         return str.__str__(value)
     raise wrong_argument(name, " or ".join(map(repr, known)), value, owner)
@@ -241,7 +241,7 @@ def check_bytes(value: object, name: str, owner: str = "") -> bytes:
 
 
 def check_callable(value: FunctionT, name: str, owner: str = "") -> FunctionT:
-    """Return the value if it can be called, else raise."""
+    """Return a value that can be called."""
     if not callable(value):
         raise wrong_argument(name, "a function", value, owner)
     return value
@@ -275,7 +275,7 @@ def check_time(value: datetime, name: str, owner: str = "") -> datetime:
 
 
 def check_application(value: object, name: str = "application", owner: str = "") -> int:
-    """Return an application's id; 0 passes, since the camera itself refuses it."""
+    """Return an application's id; 0 is allowed here, since the camera itself refuses it."""
     return check_integer(value, name, 0, MAX_APPLICATION_ID, owner)
 
 
@@ -320,7 +320,7 @@ def _is_name_of_file(path: str) -> bool:
 
 
 def fspath_of(value: object) -> object:
-    """Return the text of a path; anything else as it is."""
+    """Return the text of a path; any other value unchanged."""
     return str(value) if isinstance(value, PurePath) else value
 
 

@@ -11,16 +11,16 @@ if TYPE_CHECKING:
     import socket
 
 MAX_DATAGRAM_BYTES = 1 << 16
-"""Largest number of bytes of one read: UDP's length field, 16 bits, cannot say
+"""Largest number of bytes of one read: UDP's length field has 16 bits and cannot hold
 more."""
 
 
 def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
-    """Make an endpoint allocate room for one datagram per read, instead of asyncio's 256 KiB.
+    """Make an endpoint allocate memory for one datagram per read, instead of asyncio's 256 KiB.
 
-    The C library takes 256 KiB from the system and returns them at each read, until it adapts; in a
-    young process that costs more than the rest of the read. The attribute is asyncio's own, of both
-    its loops, and not documented: a transport without it, such as uvloop's, is left as it is.
+    At each read the C library would take 256 KiB from the system and return them, until it adapts;
+    in a new process that costs more than the rest of the read. The attribute ``max_size`` of
+    asyncio's transports is not documented; a transport without it, such as uvloop's, is unchanged.
     """
     size = getattr(transport, "max_size", None)
     if isinstance(size, int) and size > MAX_DATAGRAM_BYTES:
@@ -28,12 +28,13 @@ def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
 
 
 def second_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
-    """Return a socket to read datagrams that have come already; the caller closes it.
+    """Return a second socket of a transport, to read datagrams that have already arrived.
 
-    asyncio reads one datagram in a turn of its loop. The result is None if the loop reads several
-    by itself (uvloop), or if reading beside it is not safe (Windows' proactor).
+    asyncio's own loop reads only one datagram in each turn. The caller closes the socket. The
+    result is None if the loop reads several datagrams by itself (uvloop), or if two may not read
+    at once (Windows' proactor).
     """
-    known = transport.get_extra_info("socket")
-    if os.name != "posix" or not isinstance(known, TransportSocket):
+    first = transport.get_extra_info("socket")
+    if os.name != "posix" or not isinstance(first, TransportSocket):
         return None
-    return known.dup()
+    return first.dup()

@@ -17,7 +17,7 @@ BROKEN_OPENCV = "5.0.0"
 
 
 class Package(NamedTuple):
-    """A package of an extra: its name for users, the extra, and its usual purpose."""
+    """A package of an extra: its name for users, the extra, and its usual purpose with a verb."""
 
     called: str
     extra: str
@@ -51,7 +51,7 @@ PACKAGES: Final = {
     "zstandard": Package("zstandard", "record", "recordings need"),
 }
 
-# fully imported; sys.modules also has those that another thread is still importing
+# modules that are fully imported; sys.modules also has those that are still being imported
 _LOADED: Final[dict[str, Any]] = {}
 
 
@@ -60,14 +60,14 @@ def load(name: str, use: str = "") -> Any:
 
     Args:
         name: dotted name of the module.
-        use: purpose with its verb, for the error; "" for the usual one.
+        use: the purpose for the error, with its verb: "video needs"; "" for the usual purpose.
 
     Raises:
         MissingExtraError: the package is not installed, or it is OpenCV 5.0.0.
     """
     loaded = sys.modules.get(name)
     if loaded is not None and loaded is _LOADED.get(name):
-        return loaded  # import_module takes longer to look it up than a small picture takes
+        return loaded  # import_module takes longer than the work on a small picture
     try:
         module = importlib.import_module(name)
     except ImportError as exc:
@@ -85,21 +85,21 @@ def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
     Args:
         name: dotted name of the module.
         use: as for :func:`load`.
-        which: required version, if not every version will do.
+        which: the version required, such as "other than 5.0.0"; "" if any will do.
     """
-    called, extra, usual = PACKAGES[name.partition(".")[0]]
-    wanted = f"an {called} {which}" if which else called
-    text = f'{use or usual} {wanted}: pip install "smartcam[{extra}]"'
+    called, extra, usual_use = PACKAGES[name.partition(".")[0]]
+    package = f"an {called} {which}" if which else called
+    text = f'{use or usual_use} {package}: pip install "smartcam[{extra}]"'
     return MissingExtraError(text, extra=extra)
 
 
 @contextlib.contextmanager
 def from_part(extra: str, use: str) -> Iterator[None]:
-    """Import from another distribution of smartcam, which may not be installed.
+    """Raise a helpful error if an import in the block needs a part that is not installed.
 
     Args:
-        extra: the extra that brings the distribution.
-        use: purpose with its verb, for the error.
+        extra: the extra that installs this part of smartcam.
+        use: the purpose for the error, with its verb: "a camera of a fleet needs".
 
     Raises:
         MissingExtraError: a module of smartcam is not installed.

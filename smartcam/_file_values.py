@@ -1,4 +1,4 @@
-"""Values in settings files of several rooms: sizes, times, and patterns of cameras' names."""
+"""Types of values in settings files: sizes, times, and patterns of cameras' names."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ _PATTERN = re.compile(r"[a-z0-9_*-]+(?:/[a-z0-9_*-]+)*", re.ASCII)
 
 
 def _amount(units: Mapping[str, int], least: float, most: float, example: str) -> Any:
-    """Return a validator of numbers, with or without a unit, in upper or lower case."""
-    known = {unit.lower(): factor for unit, factor in units.items()}
+    """Return a validator of numbers; their unit may be missing, and in upper or lower case."""
+    factors = {unit.lower(): factor for unit, factor in units.items()}
     text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
 
     def read(given: object) -> float:
         value: float | None = None
         if isinstance(given, str):
             parts = text.fullmatch(given.strip().lower())
-            if parts is not None and parts[2] in known:
-                value = float(parts[1]) * known[parts[2]]
+            if parts is not None and parts[2] in factors:
+                value = float(parts[1]) * factors[parts[2]]
         elif isinstance(given, (int, float)) and not isinstance(given, bool):
             value = float(given)
         if value is None:
@@ -82,11 +82,13 @@ def _patterns(given: object) -> tuple[str, ...]:
     return tuple(patterns)
 
 
-_ONE = {"type": "string", "pattern": f"^{_PATTERN.pattern}$"}
+_PATTERN_SCHEMA = {"type": "string", "pattern": f"^{_PATTERN.pattern}$"}
 Patterns = Annotated[
     tuple[str, ...],
     PlainValidator(_patterns),
-    WithJsonSchema({"anyOf": [_ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
+    WithJsonSchema(
+        {"anyOf": [_PATTERN_SCHEMA, {"type": "array", "items": _PATTERN_SCHEMA, "minItems": 1}]}
+    ),
 ]
 
 
@@ -98,25 +100,26 @@ def chosen(patterns: Sequence[str], camera: str) -> bool:
 
 
 def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
-    """Return True if items fit a pattern, in which ``many`` means any number of items."""
-    places = _passed({0}, pattern, many)
+    """Return True if items match a pattern whose part ``many`` matches any number of items.
+
+    ``indices`` are those of the parts in ``pattern`` that may match the next item.
+    """
+    indices = _skip_many({0}, pattern, many)
     for item in items:
-        stayed = {place for place in places if place < len(pattern) and pattern[place] == many}
-        gone = {
-            place + 1
-            for place in places - stayed
-            if place < len(pattern) and fits(pattern[place], item)
+        repeated = {i for i in indices if i < len(pattern) and pattern[i] == many}
+        advanced = {
+            i + 1 for i in indices - repeated if i < len(pattern) and fits(pattern[i], item)
         }
-        places = _passed(stayed | gone, pattern, many)
-    return len(pattern) in places
+        indices = _skip_many(repeated | advanced, pattern, many)
+    return len(pattern) in indices
 
 
-def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
-    """Add to places in a pattern the places after parts that may match nothing."""
-    for place, part in enumerate(pattern):
-        if place in places and part == many:
-            places = places | {place + 1}
-    return places
+def _skip_many(indices: set[int], pattern: Sequence[str], many: str) -> set[int]:
+    """Add the indices after each part that equals ``many``, since it may match no item."""
+    for index, part in enumerate(pattern):
+        if index in indices and part == many:
+            indices = indices | {index + 1}
+    return indices
 
 
 def _part_fits(pattern: str, part: str) -> bool:

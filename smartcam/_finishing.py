@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Close a resource completely in a task of its own; closing has to be bounded and idempotent.
+    """Close a resource in a task of its own, completely; closing has to be bounded and idempotent.
 
     If that task is cancelled, perhaps before its first step, the caller closes the resource.
 
@@ -35,12 +35,12 @@ async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
 
 async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -> None:
-    """Close several resources side by side; each closing has to be bounded and idempotent.
+    """Close several resources at the same time; each closing has to be bounded and idempotent.
 
-    If the task of one is cancelled, perhaps before its first step, the caller closes the resource.
+    If the task of one is cancelled, perhaps before its first step, the caller closes that resource.
 
     Raises:
-        Exception: the first error, when all have ended.
+        Exception: the first error; raised when all have ended.
 
     Cancellation: passed on to each; takes effect when all have ended.
     """

@@ -1,8 +1,8 @@
-"""Forget, in a fork of this process, the locks that other threads held, and the threads.
+"""Notify objects in a fork of this process, where only one thread runs.
 
-A fork has one thread, the one that called it, and a copy of all else. A lock that another thread
-held at that moment stays locked in the copy forever, and the work of other threads is never
-finished. So no module here has a lock of its own, and objects with locks are notified.
+A fork has a copy of all memory, but only the thread that called ``fork``. A lock that another
+thread held at that moment stays locked in the fork forever, and what other threads had begun is
+never finished. So no module here has a lock of its own, and objects with locks are notified.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class KnowsForks(Protocol):
     """An object that is notified of forks."""
 
     def forked(self) -> None:
-        """Start anew in a fork: no other thread runs there; do not wait."""
+        """Reset the state that belongs to other threads; must not wait. Called in the fork."""
 
 
 _objects_to_notify: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -45,13 +45,13 @@ elif sys.version_info >= (3, 12):
 else:
 
     class cached_property(functools.cached_property):  # noqa: N801 - as functools has it
-        """A value that is made once for each object, as Python 3.12 has it.
+        """A value that is computed once for each object, as Python 3.12 does it.
 
-        Python 3.11 holds a lock of the class meanwhile, which a fork may inherit as locked.
+        Python 3.11 holds a lock of the class meanwhile, which may be locked in a fork.
         """
 
         def __get__(self, instance: Any, owner: Any = None) -> Any:
-            """Return the value; two threads may each make it, and the later one stays."""
+            """Return the value; if two threads compute it at once, the later value stays."""
             if instance is None:
                 return self
             values = instance.__dict__

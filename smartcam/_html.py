@@ -12,18 +12,19 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Result
 
 MAX_ROWS = 100
-"""Largest number of rows that are shown; a line gives the number of the others."""
+"""Largest number of rows that are shown; a line below gives the number of the others."""
 
 
-def localizations_html(parts: Sequence[Localization]) -> str:
-    """Return a table of parts, in millimetres and degrees."""
-    return _table(("part", "quality", "x mm", "y mm", "z mm", "angle deg"), map(_part, parts))
+def localizations_html(localizations: Sequence[Localization]) -> str:
+    """Return a table of localized parts, in millimetres and degrees."""
+    return _table(
+        ("part", "quality", "x mm", "y mm", "z mm", "angle deg"), map(_part_row, localizations)
+    )
 
 
 def result_html(result: Result) -> str:
-    """Return a result's fields, with its parts as a table, if its value has parts."""
+    """Return a table of a result's fields; localizations and records have a table of their own."""
     value: Any = result.value
-    shown = _is_parts(value)
     fields = {
         "camera": result.camera,
         "application": result.application,
@@ -34,14 +35,14 @@ def result_html(result: Result) -> str:
         "value": _value_text(value),
     }
     rows = [[name, str(text)] for name, text in fields.items() if text != ""]
-    if shown:
+    if _is_localizations(value):
         return _table((), rows) + localizations_html(value)
     return _table((), rows) + (records_html(value) if _is_records(value) else "")
 
 
 def _value_text(value: Any) -> str:
     """Return the text of a value in the table of its result."""
-    if _is_parts(value):
+    if _is_localizations(value):
         return f"{len(value)} localizations"
     if _is_records(value):
         return f"{len(value)} records" if isinstance(value, list) else "a record"
@@ -66,12 +67,12 @@ def _cell(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else f"{value!s:.1000}"
 
 
-def _is_parts(value: object) -> bool:
+def _is_localizations(value: object) -> bool:
     items: Any = value if isinstance(value, list) else ()
     return bool(items) and all(hasattr(item, "feature_id") for item in items)
 
 
-def _part(part: Localization) -> list[str]:
+def _part_row(part: Localization) -> list[str]:
     x, y, z = (f"{1e3 * length:.3f}" for length in part.pose.position)
     angle = math.degrees(part.pose.orientation.theta)
     return [part.feature_id, f"{part.quality:.3f}", x, y, z, f"{angle:.2f}"]
@@ -81,9 +82,9 @@ def _table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     listed = list(rows)
     head = f"<tr>{_cells('th', names)}</tr>" if names else ""
     body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in listed[:MAX_ROWS])
-    more = len(listed) - MAX_ROWS
-    more_text = f"<p>and {more} more</p>" if more > 0 else ""
-    return f"<table>{head}{body}</table>{more_text}"
+    hidden_count = len(listed) - MAX_ROWS
+    last_line = f"<p>and {hidden_count} more</p>" if hidden_count > 0 else ""
+    return f"<table>{head}{body}</table>{last_line}"
 
 
 def _cells(kind: str, texts: Iterable[str]) -> str:

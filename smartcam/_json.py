@@ -1,6 +1,6 @@
-"""Write values as JSON, like ``json.dumps(jsonable(value))`` without white space, but faster.
+"""Write values as JSON, as ``json.dumps(jsonable(value))`` without white space, but faster.
 
-Values of other types than the client's go through :func:`smartcam.models.jsonable`.
+Values of types that the client does not make are converted by :func:`smartcam.models.jsonable`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 MIN_HEX_CHARACTERS = 1024
-"""Least number of characters of a text that may be hex. Hex needs no quoting, which takes most of
-the time of a large container."""
+"""Texts with more characters are checked for hex, which needs no quoting; quoting takes most of the
+time of a large container."""
 
 NULL = "null"
 
@@ -29,14 +29,14 @@ _EPOCH = datetime.fromtimestamp(0, UTC)
 _PLAIN = frozenset({str, int, float, bool, type(None)})
 _FLOAT = frozenset({float})
 _INTEGERS = frozenset({int})
-_FORMS = {"i": "%d", "u": "%d", "f": "%r", "S": "%s"}
-"""Forms of the values in a table's columns, by the columns' kinds."""
+_FORMATS = {"i": "%d", "u": "%d", "f": "%r", "S": "%s"}
+"""The ``%`` formats of values in a table's columns, by numpy's kind of the column."""
 
 MAX_FLOAT_BYTES = 8
-"""Largest size of numpy's floats that become Python's floats, in bytes."""
+"""Largest size in bytes of numpy's floats that Python's ``float`` can hold."""
 
 _COLUMNS = frozenset("iufbS")
-"""Kinds of a table's columns whose values become Python's own."""
+"""Numpy's kinds of columns whose values become values of Python's own types."""
 
 _quoted: Callable[[str], str] = encode_basestring_ascii
 _encode = json.JSONEncoder(separators=(",", ":")).encode
@@ -75,12 +75,12 @@ def text_of(value: object) -> str:
 
 
 _latest: list[tuple[datetime, str]] = [(_EPOCH, f'"{_EPOCH.isoformat()}"')]
-"""The time written last, and its text, since a result and its parts share a time."""
+"""The last time written, and its text: a result and its parts share the time."""
 
 
 def _time_text(at: datetime) -> str:
-    known, text = _latest[0]
-    if known is not at:
+    last, text = _latest[0]
+    if last is not at:
         text = f'"{at.isoformat()}"'
         _latest[0] = at, text
     return text
@@ -121,40 +121,40 @@ def _is_table(value: object) -> bool:
 
 def _table_text(table: Any) -> str | None:
     """Return the text of a table's rows; None if :func:`jsonable` has to make it."""
-    row = _row_form(table.dtype)
-    if table.ndim != 1 or row is None:
+    row_format = _row_format(table.dtype)
+    if table.ndim != 1 or row_format is None:
         return None
-    form, texts, numbers = row
+    format_text, text_indices, float_indices = row_format
     rows: list[str] = []
     for values in table.tolist():
         fields = [*values]
         total = 0.0
-        for place in numbers:
-            total += fields[place]
+        for index in float_indices:
+            total += fields[index]
         if not math.isfinite(total):
-            return None  # the sum is not finite if a value is not
-        for place in texts:
-            fields[place] = _quoted(_text_or_hex(fields[place]))
-        rows.append(form % (*fields,))
+            return None  # the sum is finite only if all values are
+        for index in text_indices:
+            fields[index] = _quoted(_text_or_hex(fields[index]))
+        rows.append(format_text % (*fields,))
     return f"[{','.join(rows)}]"
 
 
 @functools.lru_cache(maxsize=256)
-def _row_form(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None:
-    """Return the form of a row, the places of its texts and floats; None for other columns."""
+def _row_format(dtype: Any) -> tuple[str, tuple[int, ...], tuple[int, ...]] | None:
+    """Return a row's format, the indices of its texts and of its floats; None for other columns."""
     kinds = [dtype.fields[name][0] for name in dtype.names or ()]
     if not kinds or any(
-        kind.kind not in _FORMS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)
+        kind.kind not in _FORMATS or (kind.kind == "f" and kind.itemsize > MAX_FLOAT_BYTES)
         for kind in kinds
     ):
         return None
     fields = zip(dtype.names, kinds, strict=True)
-    form = ",".join(
-        [f"{_quoted(name).replace('%', '%%')}:{_FORMS[kind.kind]}" for name, kind in fields]
+    format_text = ",".join(
+        [f"{_quoted(name).replace('%', '%%')}:{_FORMATS[kind.kind]}" for name, kind in fields]
     )
-    texts = tuple(place for place, kind in enumerate(kinds) if kind.kind == "S")
-    floats = tuple(place for place, kind in enumerate(kinds) if kind.kind == "f")
-    return f"{{{form}}}", texts, floats
+    texts = tuple(index for index, kind in enumerate(kinds) if kind.kind == "S")
+    floats = tuple(index for index, kind in enumerate(kinds) if kind.kind == "f")
+    return f"{{{format_text}}}", texts, floats
 
 
 def _parts_text(value: list[object]) -> str | None:
@@ -168,23 +168,23 @@ def _parts_text(value: list[object]) -> str | None:
         feature_id, quality, photo_index, pose = part
         if type(pose) is not Pose or type(feature_id) is not str or type(photo_index) is not int:
             return None
-        of, position, orientation = pose
+        part_header, position, orientation = pose
         if type(position) is not Position or type(orientation) is not Quaternion:
             return None
         numbers = quality, *position, *orientation
         if not _FLOAT.issuperset(map(type, numbers)) or not math.isfinite(sum(numbers)):
-            return None  # the sum is not finite if a value is not
-        if of is not header:  # parts of one result share a header
-            if type(of) is not Header:
+            return None  # the sum is finite only if all values are
+        if part_header is not header:  # parts of one result share a header
+            if type(part_header) is not Header:
                 return None
-            header, header_text = of, _HEADER % (*map(text_of, of),)
+            header, header_text = part_header, _HEADER % (*map(text_of, part_header),)
         front = _quoted(feature_id), quality, photo_index, header_text
         texts.append(_PART % (*front, *numbers[1:]))
     return f"[{','.join(texts)}]"
 
 
 def plain(value: Any) -> Any:
-    """Return a value as :func:`~smartcam.models.jsonable` does, but with NaN and infinity."""
+    """Return a value as :func:`~smartcam.models.jsonable` does, but keep NaN and infinity."""
     kind = type(value)
     if kind in _PLAIN:
         return value
@@ -205,17 +205,17 @@ def plain(value: Any) -> Any:
 
 
 def _rows(table: Any) -> Any:
-    """Return a table's rows; None if they are not simple."""
+    """Return a table's rows; None if :func:`jsonable` has to make them."""
     names, fields = table.dtype.names, table.dtype.fields
     kinds = [fields[name][0].kind for name in names or ()]
     if table.ndim != 1 or not kinds or not _COLUMNS.issuperset(kinds):
         return None
-    texts = [place for place, kind in enumerate(kinds) if kind == "S"]
+    texts = [index for index, kind in enumerate(kinds) if kind == "S"]
     rows: list[Any] = table.tolist()
     if texts:
         columns = [*zip(*rows, strict=True)]
-        for place in texts if columns else ():
-            columns[place] = tuple(map(_text_or_hex, columns[place]))
+        for index in texts if columns else ():
+            columns[index] = tuple(map(_text_or_hex, columns[index]))
         rows = [*zip(*columns, strict=True)]
     return [dict(zip(names, row, strict=True)) for row in rows]
 

@@ -1,4 +1,4 @@
-"""Names of a package that are resolved when they are first used."""
+"""Import the names of a package when they are first used."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ if TYPE_CHECKING:
 def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """Return the ``__getattr__`` of a package's door, and set the door's ``__dir__``.
 
-    For type checkers the door imports the same names if ``TYPE_CHECKING`` is set.
+    A door is the module by which others import from a package. For type checkers it imports the
+    same names under ``if TYPE_CHECKING``.
 
     Args:
         door: name of the package, or of its module ``_inside``.
-        names: maps each module of the package to its names, separated by spaces. A submodule is a
-            name, too, below its parent's name and a dot, or below ``""``. A key that begins
-            with ``smartcam.`` is a module of another room.
+        names: maps each module of the package to its names, separated by spaces. For names that are
+            submodules, the key is their parent's name and a dot, or ``""``. A key that begins
+            with ``smartcam.`` is a module of another package.
     """
     homes = {name: module for module, words in names.items() for name in words.split()}
     door_names = vars(sys.modules[door])
@@ -30,8 +31,8 @@ def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
             raise AttributeError(f"module {door!r} has no attribute {name!r}")
         home = homes[name]
         is_module = not home or home.endswith(".")
-        place = home if home.startswith("smartcam.") else f"{package}.{home}"
-        module = importlib.import_module(f"{place}{name if is_module else ''}")
+        module_name = home if home.startswith("smartcam.") else f"{package}.{home}"
+        module = importlib.import_module(f"{module_name}{name if is_module else ''}")
         value = door_names[name] = module if is_module else getattr(module, name)
         return value
 

@@ -23,17 +23,17 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 CALL_TIMEOUT = 10.0
-"""Seconds for a call into the thread without its own deadline. A call normally takes well
-under a millisecond; a longer one means that a function in the thread does not return, such as a
-generator of an application."""
+"""Seconds that a call into the thread may take if it has no deadline of its own. It normally takes
+less than a millisecond. If it takes longer, a function in the thread does not return, such as a
+user's generator."""
 
 MAX_LOCK_WAIT_TIME = 0.1
-"""Seconds that Ctrl-C may be delayed if it does not interrupt the wait for a lock: on Windows, and
-elsewhere if it comes between the lock's look for signals and its wait."""
+"""Seconds of one wait for a lock, after which Ctrl-C takes effect. On Windows, Ctrl-C does not
+interrupt the wait; elsewhere it does not if it comes between Python's check and the wait."""
 
 
 def start_task(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-    """Return a task that has begun, if Python supports that; it saves a turn of the loop."""
+    """Return a task; from Python 3.12 on it has already started, which saves a turn of the loop."""
     loop = asyncio.get_running_loop()
     if sys.version_info >= (3, 12):
         return asyncio.Task(work, loop=loop, eager_start=True)
@@ -43,7 +43,8 @@ def start_task(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
 class _Mailbox:
     """Functions from other threads, to be called in a loop's thread.
 
-    On Linux a counter wakes the loop, in a fifth of the time of the loop's own pair of sockets.
+    On Linux a counter of the system (eventfd) wakes the loop. It takes a fifth of the time that the
+    loop's own pair of sockets takes.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -53,7 +54,7 @@ class _Mailbox:
         self._counter: int | None = None
         if sys.platform == "linux":
             self._counter = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-            loop.add_reader(self._counter, self._woken)
+            loop.add_reader(self._counter, self._on_wake)
 
     def post(self, function: Callable[[], object]) -> None:
         """Schedule a function, from any thread.
@@ -64,7 +65,7 @@ class _Mailbox:
         self._functions.append(function)
         if not self._closed:
             self._wake()
-        elif function in self._functions:  # otherwise close() has called it
+        elif function in self._functions:  # else close() has called the function
             self._functions.remove(function)
             raise ConfigurationError("the thread of the event loop has ended")
 
@@ -85,7 +86,7 @@ class _Mailbox:
         else:
             self._loop.call_soon_threadsafe(self._call_all)
 
-    def _woken(self) -> None:
+    def _on_wake(self) -> None:
         if sys.platform == "linux" and self._counter is not None:
             os.eventfd_read(self._counter)
         self._call_all()
@@ -96,22 +97,23 @@ class _Mailbox:
 
 
 class _ThreadCall:
-    """A call into the thread: begun there, awaited in another.
+    """A call that runs in the loop's thread, while another thread waits for it.
 
-    A lock and one wake-up each way: half as many as ``asyncio.run_coroutine_threadsafe`` takes.
+    It needs one lock, and wakes each of the two threads once: half of what
+    ``asyncio.run_coroutine_threadsafe`` needs.
     """
 
     __slots__ = (
         *(
             "_cancelled",
-            "_done",
+            "_done_lock",
             "_error",
             "_finished",
             "_function",
             "_mailbox",
             "_result",
             "_task",
-            "_work",
+            "_coroutine",
         ),
     )
 
@@ -120,15 +122,17 @@ class _ThreadCall:
         self._mailbox = mailbox
         self._function = function
         self._task: asyncio.Task[Any] | None = None
-        self._work: Coroutine[Any, Any, object] | None = None
+        self._coroutine: Coroutine[Any, Any, object] | None = None
         self._result: Any = None
         self._error: BaseException | None = None
         self._cancelled = self._finished = False
-        self._done = threading.Lock()
-        self._done.acquire()
+        self._done_lock = threading.Lock()
+        self._done_lock.acquire()
 
     def wait(self, timeout: float | None) -> bool:
-        """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
+        """Begin the call, and wait until it ends; return False if it did not end in time.
+
+        Ctrl-C cancels the call, and is raised.
 
         Args:
             timeout: seconds; None if the called function has its own deadlines.
@@ -136,20 +140,20 @@ class _ThreadCall:
         try:
             self._mailbox.post(self._begin)
             deadline = None if timeout is None else time.monotonic() + timeout
-            while not self._done.acquire(timeout=MAX_LOCK_WAIT_TIME):
+            while not self._done_lock.acquire(timeout=MAX_LOCK_WAIT_TIME):
                 if deadline is not None and time.monotonic() >= deadline:
                     return False
         except BaseException:  # KeyboardInterrupt, in the main thread
             self.cancel()
             if not self._finished:  # a cancelled call ends at once
-                self._done.acquire(timeout=CALL_TIMEOUT)
+                self._done_lock.acquire(timeout=CALL_TIMEOUT)
             raise
         return True
 
     def cancel(self) -> None:
         """Cancel the call, from any thread; a call that has not begun will not begin."""
         self._cancelled = True
-        with contextlib.suppress(ConfigurationError):  # then the call is over
+        with contextlib.suppress(ConfigurationError):  # the loop has ended, and the call with it
             self._mailbox.post(self._cancel)
 
     def result(self) -> Any:
@@ -158,7 +162,7 @@ class _ThreadCall:
             try:
                 raise self._error
             finally:
-                self._error = None  # no circle through the traceback
+                self._error = None  # else this object and the traceback keep each other alive
         return self._result
 
     # ------------------------------------------------------------------ in the thread
@@ -170,20 +174,20 @@ class _ThreadCall:
         try:
             returned = self._function()
             if inspect.iscoroutine(returned):
-                self._work = returned
-                task = self._task = start_task(self._finish_by(returned))
+                self._coroutine = returned
+                task = self._task = start_task(self._run_to_end(returned))
                 if sys.version_info < (3, 12):
-                    task.add_done_callback(self._end_unbegun)
+                    task.add_done_callback(self._close_unstarted)
                 return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
         else:
             self._succeed(returned)
 
-    async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
-        """Run a coroutine; the waiting thread goes on without another turn of the loop."""
+    async def _run_to_end(self, work: Coroutine[Any, Any, object]) -> None:
+        """Run a coroutine, and release the waiting thread in the same turn of the loop."""
         if sys.version_info < (3, 12) and self._task is not None:
-            self._task.remove_done_callback(self._end_unbegun)  # it would take another turn
+            self._task.remove_done_callback(self._close_unstarted)  # it would need another turn
         try:
             outcome = await work
         except asyncio.CancelledError:
@@ -194,10 +198,10 @@ class _ThreadCall:
         else:
             self._succeed(outcome)
 
-    def _end_unbegun(self, _: asyncio.Task[None]) -> None:
-        """End a coroutine that was cancelled before its task's first step; asyncio does not."""
-        if not self._finished and self._work is not None:
-            self._work.close()
+    def _close_unstarted(self, _: asyncio.Task[None]) -> None:
+        """Close a coroutine whose task was cancelled before its first step; asyncio does not."""
+        if not self._finished and self._coroutine is not None:
+            self._coroutine.close()
             self._fail(asyncio.CancelledError())
 
     def _succeed(self, result: object) -> None:
@@ -210,12 +214,12 @@ class _ThreadCall:
 
     def _finish(self) -> None:
         self._finished = True
-        self._done.release()
+        self._done_lock.release()
 
     def _cancel(self) -> None:
         if self._task is not None:
             self._task.cancel()
-        elif not self._finished:  # the call was never begun
+        elif not self._finished:  # the call has not begun
             self._fail(asyncio.CancelledError())
 
 
@@ -230,7 +234,7 @@ class LoopThread:
         self._name = name
         self._loop: asyncio.AbstractEventLoop | None = None
         self._mailbox: _Mailbox | None = None
-        self._end: asyncio.Event | None = None
+        self._end_event: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
         self._forked = False
         notify_of_forks(self)
@@ -241,10 +245,10 @@ class LoopThread:
             return
         ready: threading.Event = threading.Event()
 
-        async def live() -> None:
+        async def run_until_end() -> None:
             self._loop = asyncio.get_running_loop()
-            end = self._end = asyncio.Event()
-            # last, since the thread runs from now on
+            end = self._end_event = asyncio.Event()
+            # last, since the thread counts as running once it has a mailbox
             mailbox = self._mailbox = _Mailbox(self._loop)
             ready.set()
             await end.wait()
@@ -252,7 +256,7 @@ class LoopThread:
 
         # a daemon, so that a program that is killed does not wait for it
         self._thread = threading.Thread(
-            target=_run_loop, args=(live,), name=self._name, daemon=True
+            target=_run_loop, args=(run_until_end,), name=self._name, daemon=True
         )
         self._thread.start()
         if not ready.wait(CALL_TIMEOUT):
@@ -261,12 +265,12 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End the thread. Harmless when called twice, and in a fork, which has no such thread."""
+        """End the thread. Do nothing if it has ended, or in a fork, which has no such thread."""
         if self._forked:
             return
         thread, self._thread = self._thread, None
-        if thread is not None and self._mailbox is not None and self._end is not None:
-            self._mailbox.post(self._end.set)
+        if thread is not None and self._mailbox is not None and self._end_event is not None:
+            self._mailbox.post(self._end_event.set)
             thread.join(CALL_TIMEOUT)
             self._loop = self._mailbox = None
 
@@ -308,7 +312,7 @@ class LoopThread:
         return cast("T", self._call(lambda: function(*args, **kwargs), CALL_TIMEOUT))
 
     def _call(self, function: Callable[[], object], timeout: float | None) -> Any:
-        call = _ThreadCall(self._checked(), function)
+        call = _ThreadCall(self._require_mailbox(), function)
         if not call.wait(timeout):
             call.cancel()
             raise ResponseTimeoutError(
@@ -319,7 +323,7 @@ class LoopThread:
         return call.result()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
-        """Run a coroutine in the thread, and do not wait; errors as of :meth:`call`."""
+        """Start a coroutine in the thread without waiting; errors as of :meth:`call`."""
         try:
             self._refuse_fork()
             if self._loop is None:
@@ -330,13 +334,13 @@ class LoopThread:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def post(self, function: Callable[[], object]) -> None:
-        """Schedule a function in the thread without waiting, if the thread runs."""
+        """Schedule a function in the thread without waiting; do nothing if it does not run."""
         if self._mailbox is not None and not self._forked:
             with contextlib.suppress(ConfigurationError):
                 self._mailbox.post(function)
 
-    def _checked(self) -> _Mailbox:
-        """Return the mailbox; raise if nothing can be called."""
+    def _require_mailbox(self) -> _Mailbox:
+        """Return the mailbox; raise an error if no call is possible."""
         self._refuse_fork()
         if self._mailbox is None:
             raise self._not_running_error()
@@ -358,10 +362,10 @@ class LoopThread:
         return ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
 
 
-def _run_loop(live: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run a coroutine in a loop of its own until it ends, also while the interpreter ends."""
+def _run_loop(run_until_end: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a coroutine in a new loop until it ends, even while the interpreter ends."""
     try:
-        asyncio.run(live())
+        asyncio.run(run_until_end())
     except RuntimeError:
         # asyncio starts a thread to end its executor, and from Python 3.12 on an interpreter that
         # ends starts none; the loop is closed nevertheless

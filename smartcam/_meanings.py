@@ -1,4 +1,4 @@
-"""Tell from the name of a truth value which value is good."""
+"""Decide from the name of a truth value which of its values is good."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def meaning(name: str) -> bool | None:
     ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.
     """
     words = set(re.findall(r"[a-z]+", name.lower()))
-    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
-    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)
+    groups_found = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
+    return None if groups_found != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)

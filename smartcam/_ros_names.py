@@ -39,7 +39,7 @@ def check_namespace(namespace: str) -> str:
         ConfigurationError: the namespace is not valid.
     """
     text = "/" + namespace.strip("/")
-    return "/" if text == "/" else _checked(text, "namespace")
+    return "/" if text == "/" else _check_name(text, "namespace")
 
 
 def check_domain(domain: int) -> int:
@@ -66,12 +66,12 @@ def resolve(name: str, namespace: str, node: str, kind: str = "topic") -> str:
             (``~/a``).
         namespace: namespace of the node.
         node: name of the node.
-        kind: kind of the thing named, for error texts.
+        kind: what the name is for, "topic" or "service", for error texts.
 
     Raises:
         ConfigurationError: the name is not valid.
     """
-    checked = _checked(name, kind)
+    checked = _check_name(name, kind)
     if checked.startswith("/"):
         return checked
     if checked.startswith("~"):
@@ -80,7 +80,7 @@ def resolve(name: str, namespace: str, node: str, kind: str = "topic") -> str:
 
 
 def as_name(text: str) -> str:
-    """Return a ROS name for a name of smartcam: ``line_1/cam3`` for ``line-1/cam3``.
+    """Return the name in ROS for a name in smartcam: ``line_1/cam3`` for ``line-1/cam3``.
 
     Characters that ROS does not allow become ``_``; ``_`` is put before a part's leading digit.
     """
@@ -89,7 +89,7 @@ def as_name(text: str) -> str:
     return "/".join(f"_{part}" if part[:1].isdigit() else part for part in parts)
 
 
-def _checked(name: str, kind: str) -> str:
+def _check_name(name: str, kind: str) -> str:
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name) or "__" in name:
         raise ConfigurationError(
             f"ROS {kind} {name!r:.120}: expected parts of letters, digits and _ joined by /, none "

@@ -1,7 +1,7 @@
-"""The options of a connection as pydantic checks them.
+"""Check the options of a connection with pydantic.
 
 :class:`~smartcam.settings.CameraSettings` accepts the usual values itself, since importing pydantic
-takes longer than connecting; whether any other value is valid is decided here.
+takes longer than connecting. It uses this module for any other value.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from smartcam._arguments import (
 from smartcam.backoff import Backoff
 
 PLAIN = BeforeValidator(plain)
-"""Lets a strict type take numbers and texts of any class, such as numpy's."""
+"""Lets a strict type accept numbers and texts of any class, such as numpy's."""
 
 
 def _integer(least: int, most: int) -> Any:
@@ -79,4 +79,4 @@ OPTIONS: dict[str, tuple[Any, str]] = {
 _FIELDS: dict[str, Any] = {option: (kind, None) for option, (kind, _) in OPTIONS.items()}
 _CONFIG = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 SettingsModel = create_model("SettingsModel", __config__=_CONFIG, **_FIELDS)
-"""Takes any of the options; those that are not given are None."""
+"""Model of all options; each may be missing, and is None then."""

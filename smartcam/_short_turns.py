@@ -1,9 +1,9 @@
-"""Let Python's threads take turns more often while a part of the process requests it.
+"""Make Python switch between threads more often while a part of the process requests it.
 
-A thread that works in Python keeps the others waiting for the interpreter's switch interval, by
-default 5 ms, and delays an event loop beside it by as much. The interval belongs to the process,
-so all users of a shorter interval share this module. The shortest requested interval is set;
-the original one is restored after the last request has ended.
+A thread that works in Python makes the other threads, such as an event loop's, wait for the
+interpreter's switch interval, by default 5 ms. The interval belongs to the process, so all who
+request a shorter interval use this module. It sets the shortest requested interval, and restores
+the original interval after the last request has ended.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_wanted: Final[dict[object, float]] = {}  # requested seconds, by the requesting object
-_before: Final[list[float]] = []  # the original interval while a shorter one is set
+_requested: Final[dict[object, float]] = {}  # requested seconds, by the requesting object
+_original: Final[list[float]] = []  # the original interval while a shorter one is set
 
 
 def shorten_turns(owner: object, seconds: float) -> None:
-    """Shorten turns to at most this length, until :func:`leave_turns`.
+    """Limit the length of a thread's turns, until :func:`leave_turns`.
 
     Args:
-        owner: any object that can be a key; it has one length at a time.
-        seconds: length of a turn.
+        owner: any object that can be a dict's key; a new request replaces its last one.
+        seconds: largest length of a turn.
     """
-    if not _wanted:
-        _before[:] = [sys.getswitchinterval()]
-    _wanted[owner] = seconds
+    if not _requested:
+        _original[:] = [sys.getswitchinterval()]
+    _requested[owner] = seconds
     _apply()
 
 
 def leave_turns(owner: object) -> None:
     """End an object's request for short turns. Harmless when called twice."""
-    if _wanted.pop(owner, None) is not None:
+    if _requested.pop(owner, None) is not None:
         _apply()
 
 
 @contextmanager
 def short_turns(seconds: float) -> Iterator[None]:
-    """Shorten turns to at most this length within a block."""
+    """Limit the length of a thread's turns within a block."""
     owner = object()
     shorten_turns(owner, seconds)
     try:
@@ -51,7 +51,7 @@ def short_turns(seconds: float) -> Iterator[None]:
 
 def _apply() -> None:
     """Set the shortest requested interval, even if other threads change the requests."""
-    set_to = 0.0
-    while set_to != (interval := min([*_wanted.values(), *_before])):
-        sys.setswitchinterval(interval + 5e-7)  # Python cuts off to whole microseconds
-        set_to = interval
+    last_set = 0.0
+    while last_set != (interval := min([*_requested.values(), *_original])):
+        sys.setswitchinterval(interval + 5e-7)  # Python rounds down to whole microseconds
+        last_set = interval

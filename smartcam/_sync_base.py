@@ -1,7 +1,7 @@
 """The base of ``smartcam.sync``: the thread of all cameras, and calls into it.
 
-The methods that only call those of the camera with asyncio stand in ``sync.py``, which
-``python -m scripts.write_sync`` writes.
+The methods that only call a method of the asynchronous camera are in ``sync.py``, which
+``python -m scripts.write_sync`` writes from the signatures of that camera.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def _started_thread() -> LoopThread:
     Each process has one thread; a fork has its own. No lock is held, since a fork
     might inherit it. If two threads are started at once, one of them is ended again.
     """
-    known = _threads.get(_NAME)
-    if known is not None and known.running:
-        return known
-    made = LoopThread(_NAME)
-    made.start()
-    thread = _threads.setdefault(_NAME, made)
-    if thread is not made:
-        made.stop()
+    existing = _threads.get(_NAME)
+    if existing is not None and existing.running:
+        return existing
+    new = LoopThread(_NAME)
+    new.start()
+    thread = _threads.setdefault(_NAME, new)
+    if thread is not new:
+        new.stop()
     return thread
 
 
@@ -74,7 +74,7 @@ def _close_all() -> None:
 
 
 def _in_event_loop() -> bool:
-    """Return True if waiting here would hold up an event loop that runs in this thread.
+    """Return True if this thread runs an event loop that waiting would block.
 
     A notebook has an event loop, too, but that loop does nothing while a cell runs.
     """
@@ -85,7 +85,7 @@ def _in_event_loop() -> bool:
 
 
 class SyncCameraBase(Generic[ValueT]):
-    """The base of a camera without asyncio: all but the methods written from signatures.
+    """The base of a camera without asyncio: all except the methods that ``write_sync`` writes.
 
     Args:
         camera: asynchronous camera that this class wraps, not opened yet.
@@ -98,25 +98,25 @@ class SyncCameraBase(Generic[ValueT]):
     # ------------------------------------------------------------------ life
 
     def open(self) -> Self:
-        """Connect: :meth:`smartcam.Camera.open`."""
+        """Connect, as :meth:`smartcam.Camera.open` does."""
         camera, opened = self._camera, False
 
-        async def opening() -> None:  # keeps no reference to this object
+        async def open_camera() -> None:  # keeps no reference to this object
             nonlocal opened
             await camera.open()
             opened = True
 
         try:
-            self._wait(opening)
+            self._wait(open_camera)
             _cameras.add(self)
         except BaseException:
             if opened:  # Ctrl-C came after the camera was opened
-                self._thread.post(lambda: _keep(camera.close()))
+                self._thread.post(lambda: _start_closing(camera.close()))
             raise
         return self
 
     def close(self) -> None:
-        """Disconnect; idempotent: :meth:`smartcam.Camera.close`."""
+        """Disconnect, as :meth:`smartcam.Camera.close` does. Idempotent."""
         self._wait(self._camera.close)
         _cameras.discard(self)
 
@@ -137,7 +137,7 @@ class SyncCameraBase(Generic[ValueT]):
         if self in _cameras and self._thread.running:
             warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
             camera = self._camera
-            self._thread.post(lambda: _keep(camera.close()))
+            self._thread.post(lambda: _start_closing(camera.close()))
 
     def __repr__(self) -> str:
         return f"<SyncCamera {self.name} {self.url}>"
@@ -177,7 +177,7 @@ class SyncCameraBase(Generic[ValueT]):
     def _subscribed(
         self, subscribe: Callable[P, Any], *args: P.args, **kwargs: P.kwargs
     ) -> SyncSubscription[Any]:
-        # made in the loop's thread, where it is also closed if the caller never gets it
+        # in the loop's thread, which also closes it if Ctrl-C keeps the caller from getting it
         return self._do(lambda: SyncSubscription(subscribe(*args, **kwargs), self._thread, self))
 
     @contextlib.contextmanager
@@ -187,41 +187,41 @@ class SyncCameraBase(Generic[ValueT]):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Generator[T]:
-        """Enter a context in the loop's thread; leave it also if Ctrl-C comes."""
+        """Enter a context in the loop's thread, and leave it after the block, also after Ctrl-C."""
         inside = _Inside(function(*args, **kwargs))
         try:
             yield self._wait(inside.enter)
         except BaseException as exc:
-            if inside.entered:
+            if inside.is_entered:
                 self._wait(functools.partial(inside.leave, exc))
             raise
         else:
             self._wait(functools.partial(inside.leave, None))
         finally:
-            if inside.entered:  # Ctrl-C came before leaving had begun
-                self._thread.post(lambda: _keep(inside.leave(None)))
+            if inside.is_entered:  # Ctrl-C came before leaving began
+                self._thread.post(lambda: _start_closing(inside.leave(None)))
 
 
 class _Inside(Generic[T]):
     """A context that is entered and left in the loop's thread.
 
     Attributes:
-        entered: True from entering the context until leaving begins.
+        is_entered: True after the context was entered, until leaving it begins.
     """
 
     def __init__(self, context: contextlib.AbstractAsyncContextManager[T]) -> None:
         self._context = context
-        self.entered: bool = False
+        self.is_entered: bool = False
 
     async def enter(self) -> T:
         """Enter the context."""
         value = await self._context.__aenter__()
-        self.entered = True
+        self.is_entered = True
         return value
 
     async def leave(self, exc: BaseException | None) -> None:
         """Leave the context; an error raised inside reaches the caller."""
-        self.entered = False
+        self.is_entered = False
         kind, trace = (None, None) if exc is None else (type(exc), exc.__traceback__)
         try:
             await self._context.__aexit__(kind, exc, trace)
@@ -233,8 +233,8 @@ class _Inside(Generic[T]):
 _closing: set[asyncio.Future[None]] = set()
 
 
-def _keep(work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine in the loop's thread without waiting for it."""
+def _start_closing(work: Coroutine[Any, Any, None]) -> None:
+    """Start a coroutine that closes something; called in the loop's thread, it does not wait."""
     task = start_task(work)
     _closing.add(task)
     task.add_done_callback(_closing.discard)
@@ -243,8 +243,8 @@ def _keep(work: Coroutine[Any, Any, None]) -> None:
 class SyncSubscription(Generic[ItemT]):
     """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
 
-    As :class:`smartcam.streams.Subscription`: it subscribes when it is made, and its account always
-    balances. Each item goes to one thread.
+    As with :class:`smartcam.streams.Subscription`, it subscribes when it is made, and its account
+    always balances. If several threads iterate, each item goes to one of them.
     """
 
     def __init__(
@@ -293,7 +293,7 @@ class SyncSubscription(Generic[ItemT]):
         return self
 
     def __next__(self) -> ItemT:
-        """Return the next item; waits as long as the stream lives.
+        """Return the next item; wait until there is one or the stream ends.
 
         Raises:
             StopIteration: the subscription is closed.
@@ -308,12 +308,12 @@ class SyncSubscription(Generic[ItemT]):
                 f"{self._camera.name}: smartcam.sync would hold up the event loop that runs here; "
                 "in it: async for item in a stream of smartcam.connect(...)"
             )
-        item = self._thread.call(lambda: self._take(timeout))
+        item = self._thread.call(lambda: self._next_item(timeout))
         if item is _END:
             raise StopIteration
         return cast("ItemT", item)
 
-    async def _take(self, timeout: float | None) -> Any:
+    async def _next_item(self, timeout: float | None) -> Any:
         try:
             async with asyncio.timeout(timeout):
                 return await anext(self._subscription)
@@ -335,12 +335,12 @@ class SyncSubscription(Generic[ItemT]):
         self.close()
 
     def __del__(self) -> None:
-        # in the loop's thread, which iterates over the subscribers
+        # posted, since only the loop's thread may change the subscribers
         self._thread.post(self._subscription.close)
 
 
 class SyncFrameReaderBase:
-    """The part of a synchronous frame reader that is not written from signatures.
+    """The part of a synchronous frame reader that ``write_sync`` does not write.
 
     Args:
         reader: asynchronous reader that this class wraps.
@@ -349,7 +349,7 @@ class SyncFrameReaderBase:
 
     def __init__(self, reader: FrameReader, camera: SyncCameraBase[Any]) -> None:
         self._reader = reader
-        self._wait, self._do = camera._wait, camera._do  # noqa: SLF001 - the two are one
+        self._wait, self._do = camera._wait, camera._do  # noqa: SLF001 - as the camera's own part
 
     def __iter__(self) -> Iterator[Frame]:
         return self
@@ -359,15 +359,15 @@ class SyncFrameReaderBase:
 
         Raises:
             StopIteration: the source ended in order.
-            FrameTimeoutError: no frame came in time; it may be waited for again.
+            FrameTimeoutError: no frame came in time; the next call waits again.
             FrameSourceError: the source has failed.
         """
-        frame = self._wait(self._take)
+        frame = self._wait(self._next_item)
         if frame is None:
             raise StopIteration
         return frame
 
-    async def _take(self) -> Frame | None:
+    async def _next_item(self) -> Frame | None:
         return await anext(self._reader, None)
 
 

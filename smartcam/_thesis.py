@@ -1,8 +1,10 @@
-"""The thesis' six services: their requests, and the work for each.
+"""The six services for a camera that the thesis defines: their requests, and what each does.
 
-Programs reach them as JSON on a fleet's bus, at a node of ROS 2, or at one of ROS 1. Each of these
-is a :class:`ThesisFace`: it converts its messages to requests, and answers to its messages.
-A field that is 0 or an empty text counts as missing, since messages of ROS have no other way.
+The thesis is the one with which smartcam began; its names of services and fields are kept. Programs
+call the services in JSON on a fleet's bus, at a node of ROS 2, or at a node of ROS 1. Each of these
+converts its messages to requests and the answers to its messages, and gives the services the camera
+as a :class:`ThesisCamera`. A field that is 0 or an empty text counts as missing, since a field of a
+ROS message cannot be left out.
 """
 
 from __future__ import annotations
@@ -23,10 +25,10 @@ if TYPE_CHECKING:
     from smartcam.settings import Address
 
 DEFAULT_TIMEOUT: Final = 10.0
-"""Seconds for a service that does not trigger, if the request gives none."""
+"""Seconds for a service that does not trigger, if the request gives no timeout."""
 
 MAX_TIMEOUT: Final = 600.0
-"""Largest number of seconds that a request may give its service."""
+"""Largest timeout that a request may give, in seconds."""
 
 MAX_DELAY: Final = 3600.0
 """Longest delay between two published results, in seconds."""
@@ -42,7 +44,7 @@ _Application = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
 def spec_of_text(text: str) -> str | None:
-    """Return the specification that a text names; None for an empty text."""
+    """Return the interpretation's specification for a text of a request; None for an empty text."""
     spec = text.strip()
     return _KEYWORDS.get(spec.lower(), spec) or None
 
@@ -57,7 +59,7 @@ class ThesisRequest(BaseModel):
 
 
 class SetupRequest(ThesisRequest):
-    """A request for a camera by its address, with application and interpretation."""
+    """A request that names a camera by its address, its application and its interpretation."""
 
     camera_model_name: _Text = ""
     port: Annotated[int, Field(ge=0, le=0xFFFF)] | _Text = 0
@@ -72,16 +74,16 @@ class SetupRequest(ThesisRequest):
         Raises:
             ConfigurationError: no camera can have this address.
         """
-        place = self.con_address
-        if "://" not in place:
-            place = f"[{place}]" if place.count(":") > 1 and "[" not in place else place
-            if self.port not in {0, "", "0"} and ":" not in place.rpartition("]")[2]:
-                place = f"{place}:{self.port}"
-        return parse_address(place, model=self.camera_model_name or None)
+        text = self.con_address
+        if "://" not in text:
+            text = f"[{text}]" if text.count(":") > 1 and "[" not in text else text
+            if self.port not in {0, "", "0"} and ":" not in text.rpartition("]")[2]:
+                text = f"{text}:{self.port}"
+        return parse_address(text, model=self.camera_model_name or None)
 
 
 class PublishingRequest(ThesisRequest):
-    """A request that names the topic for results, and the least time between two of them."""
+    """A request that names the topic for results, and the least time between two results."""
 
     topic_for_outputs: _Text = ""
     min_delay: Annotated[float, Field(ge=0, le=MAX_DELAY, allow_inf_nan=False)] = 0.0
@@ -89,25 +91,25 @@ class PublishingRequest(ThesisRequest):
 
 
 class ApplicationRequest(ThesisRequest):
-    """The application to load."""
+    """A request that names the application to load."""
 
     application_id: Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 
 
 class ThesisTriggerRequest(ThesisRequest):
-    """The application to trigger, before the camera returns to its own; 0 is the active one."""
+    """A request that names the application for this trigger only; 0 is the active application."""
 
     application_id: _Application = 0
 
 
-class ThesisFace(Protocol):
-    """A camera as the six services see it, and the publisher of its results and status.
+class ThesisCamera(Protocol):
+    """The camera that the six services work on, with the publisher of its results and status.
 
     Attributes:
         name: the camera's name.
         address: address of the camera itself.
         application: the id of the active application; None if that is not known.
-        reading: interpretation of its results; None if their contents are not known.
+        reading: interpretation of its results; None if no layout of results is known.
         stopped: whether SmartcameraStop has closed the camera for these services.
     """
 
@@ -140,30 +142,30 @@ class ThesisFace(Protocol):
         ...
 
     def check_status_topic(self, topic: str) -> None:
-        """Raise ConfigurationError if there can be no such topic."""
+        """Raise ConfigurationError if a topic cannot have this name."""
 
     def publish_status(self, topic: str) -> dict[str, Any]:
-        """Publish the status on this topic, and no longer on the one before."""
+        """Publish the status on this topic, and no longer on the topic of an earlier call."""
         ...
 
     async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
-        """Publish results on this topic, and no longer on the one before."""
+        """Publish results on this topic, and no longer on the topic of an earlier call."""
         ...
 
     async def end_publishing(self) -> None:
         """Publish nothing more on the topics that requests have named."""
 
     async def have_session(self) -> None:
-        """Make sure of a session with the camera; raise the reason if there is none."""
+        """Make sure that there is a session with the camera; else raise an error that says why."""
 
     async def ensure(self, application: int, timeout: float) -> None:
-        """Make sure that an application is running and ready."""
+        """Switch to an application if it is not running and ready already."""
 
     async def switch(self, application: int, timeout: float) -> None:
         """Load an application."""
 
     async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
-        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        """Trigger; return the result's application, and its value, interpreted by ``spec``."""
         ...
 
 
@@ -171,12 +173,12 @@ class ThesisCall(NamedTuple):
     """A running call of a service.
 
     Attributes:
-        face: the camera.
+        camera: the camera.
         request: the request, of the service's own class.
         timeout: seconds.
     """
 
-    face: ThesisFace
+    camera: ThesisCamera
     request: Any
     timeout: float
 
@@ -186,12 +188,13 @@ class ThesisService(NamedTuple):
 
     Attributes:
         request: class of its requests.
-        do: function that carries the service out, and returns the answer's fields but ``error``.
+        do: function that carries the service out, and returns the answer's fields except ``error``.
         timeout: seconds, if the request gives none.
-        settles: the service changes publishing; such services run one after the other.
-        after_stop: whether the service works after SmartcameraStop, before the next
+        settles: True if the service changes publishing; such services run one after the other.
+        after_stop: True if the service works after SmartcameraStop, before the next
             SmartcameraSetup.
-        nothing: name of the answer's field that is an empty list beside an error, if it has one.
+        nothing: name of the answer's field that is an empty list after an error; None if the answer
+            has no such field.
     """
 
     request: type[ThesisRequest]
@@ -202,121 +205,124 @@ class ThesisService(NamedTuple):
     nothing: str | None = None
 
     async def answer(self, call: ThesisCall) -> dict[str, Any]:
-        """Carry the service out; return the fields of its answer, without ``error``.
+        """Carry the service out; return the answer's fields except ``error``.
 
         Raises:
             LocalProtocolError: the camera was stopped.
             SmartCamError: the service failed.
         """
-        if call.face.stopped and not self.after_stop:
+        if call.camera.stopped and not self.after_stop:
             raise LocalProtocolError(
-                f"{call.face.name}: SmartcameraStop has closed it: expected SmartcameraSetup first"
+                f"{call.camera.name}: SmartcameraStop has closed it: expected "
+                "SmartcameraSetup first"
             )
         return await self.do(call)
 
 
 async def _setup(call: ThesisCall) -> dict[str, Any]:
-    """Set a camera up by a request, after checking that the request means this camera."""
-    face, request = call.face, call.request
-    _check_place(face, request)
+    """Set up the camera, after checking that the request is for this camera."""
+    camera, request = call.camera, call.request
+    _check_same_camera(camera, request)
     spec = spec_of_text(request.interpret_as)
     if spec is not None:
-        face.check_reading(spec)
-    face.check_status_topic(request.topic_status)
-    await face.have_session()
+        camera.check_reading(spec)
+    camera.check_status_topic(request.topic_status)
+    await camera.have_session()
     if request.application_id:
-        await face.ensure(request.application_id, call.timeout)
+        await camera.ensure(request.application_id, call.timeout)
     if spec is not None:
-        face.read_as(spec)
-    face.stopped = False
-    return face.publish_status(request.topic_status)
+        camera.read_as(spec)
+    camera.stopped = False
+    return camera.publish_status(request.topic_status)
 
 
-def _check_place(face: ThesisFace, request: SetupRequest) -> None:
-    """Check that a request means the camera of the face.
+def _check_same_camera(camera: ThesisCamera, request: SetupRequest) -> None:
+    """Check that a request is for this camera.
 
     Raises:
-        ConfigurationError: the request means another camera.
+        ConfigurationError: the request is for another camera.
     """
-    name, has, model = face.name, face.address, request.camera_model_name
+    name, actual, model = camera.name, camera.address, request.camera_model_name
     cure = "; Stop it first, or choose another camera_name"
     if not (model or request.con_address):
         return
-    if has.scheme in FLEET_SCHEMES:
+    if actual.scheme in FLEET_SCHEMES:
         raise ConfigurationError(
             f"{name}: the fleet knows its address: expected con_address and "
             "camera_model_name to be empty"
         )
-    if model and (protocol := parse_address(has.host, model=model).protocol) != has.protocol:
+    if model and (protocol := parse_address(actual.host, model=model).protocol) != actual.protocol:
         raise ConfigurationError(
             f"{name}: Setup says it is a {model}, which speaks {protocol}, but it speaks "
-            f"{has.protocol}{cure}"
+            f"{actual.protocol}{cure}"
         )
     if request.con_address:
-        wanted = request.address()
-        if (wanted.host, wanted.port, wanted.protocol) != (has.host, has.port, has.protocol):
+        asked = request.address()
+        if (asked.host, asked.port, asked.protocol) != (actual.host, actual.port, actual.protocol):
             raise ConfigurationError(
-                f"{name}: Setup says it is at {wanted.url}, but it is at {has.url}{cure}"
+                f"{name}: Setup says it is at {asked.url}, but it is at {actual.url}{cure}"
             )
 
 
 async def _enable_publishing(call: ThesisCall) -> dict[str, Any]:
     request: PublishingRequest = call.request
     queue = request.queue_size or DEFAULT_QUEUED_RESULTS
-    return await call.face.publish_results(request.topic_for_outputs, request.min_delay, queue)
+    return await call.camera.publish_results(request.topic_for_outputs, request.min_delay, queue)
 
 
 async def _stop(call: ThesisCall) -> dict[str, Any]:
-    await call.face.end_publishing()
-    call.face.read_as(None)
-    call.face.stopped = True
+    await call.camera.end_publishing()
+    call.camera.read_as(None)
+    call.camera.stopped = True
     return {}
 
 
 async def _change_application(call: ThesisCall) -> dict[str, Any]:
-    await call.face.switch(call.request.application_id, call.timeout)
+    await call.camera.switch(call.request.application_id, call.timeout)
     return {}
 
 
 async def _trigger_strings(call: ThesisCall) -> dict[str, Any]:
     application = call.request.application_id or None
-    _, strings = await call.face.trigger(application, "strings50", call.timeout)
+    _, strings = await call.camera.trigger(application, "strings50", call.timeout)
     return {"strings": strings}
 
 
 async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
-    face, wanted = call.face, call.request.application_id or None
-    spec = _spec_of_localizations(face, wanted)
-    application, value = await face.trigger(wanted, spec, call.timeout)
+    camera, requested = call.camera, call.request.application_id or None
+    spec = _spec_of_localizations(camera, requested)
+    application, value = await camera.trigger(requested, spec, call.timeout)
     localizations = localizations_of(value)
-    pixels = in_pixels(_interpreter_of(spec, application)) and not face.is_calibrated(application)
-    if localizations is None or pixels:
+    interpreter = _interpreter_of(spec, application)
+    are_pixels = in_pixels(interpreter) and not camera.is_calibrated(application)
+    if localizations is None or are_pixels:
         raise InterpretationError(
-            f"{face.name}: expected localizations in metres, got {value!r:.80}; "
+            f"{camera.name}: expected localizations in metres, got {value!r:.80}; "
             "a trigger without these services gives what the layout says",
             expected="localizations",
         )
     return {"localizations": localizations}
 
 
-def _spec_of_localizations(face: ThesisFace, application: int | None) -> Any:
-    """Return the specification of localizations: the camera's own, or the thesis'."""
-    reading = face.reading
+def _spec_of_localizations(camera: ThesisCamera, application: int | None) -> Any:
+    """Return the specification for localizations: the camera's own, or the thesis' fields."""
+    reading = camera.reading
     if reading is None:
         return "localizations"
     if not reading.by_application:
         return _with_poses(reading, None)
-    ids = {*reading.applications, application, face.application} - {None}
-    return {number: _with_poses(reading, number) for number in ids}
+    ids = {*reading.applications, application, camera.application} - {None}
+    return {id_: _with_poses(reading, id_) for id_ in ids}
 
 
 def _with_poses(reading: Interpretation, application: int | None) -> Any:
-    known = reading.interpreter(application)
-    return "localizations" if known is None or without_poses(known) is not None else known
+    """Return an application's own interpreter if it makes localizations, else "localizations"."""
+    own = reading.interpreter(application)
+    return "localizations" if own is None or without_poses(own) is not None else own
 
 
 def _interpreter_of(spec: Any, application: int) -> Any:
-    """Return the interpreter of an application; None if the thesis' own fields are read."""
+    """Return the interpreter of an application; None if the fields of the thesis are read."""
     own_spec = spec.get(application) if isinstance(spec, dict) else spec
     return None if isinstance(own_spec, str) else own_spec
 

@@ -1,8 +1,9 @@
-"""The thesis' five calibration services: their requests, and the work for each.
+"""The five calibration services that the thesis defines: their requests, and what each does.
 
-They have the same faces as the six camera services, see :mod:`smartcam._thesis`. The work is done
-by :class:`~smartcam.calibration.wizards._thesis.ThesisCalibration`, one object for each camera,
-which all faces share.
+Programs call them as they call the six services of :mod:`smartcam._thesis`, which says what the
+thesis is: in JSON on a fleet's bus, in ROS 2 or in ROS 1. Each camera has one
+:class:`~smartcam.calibration.wizards._thesis.ThesisCalibration` object, which does the work for all
+three.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ if TYPE_CHECKING:
     from smartcam.models import Localization
 
 STEP_TIMEOUT: Final = 150.0
-"""Seconds for a step if the request gives none: a calculation has 120, a picture 60."""
+"""Seconds for a step if the request gives none: enough for a calculation, which may take 120 s, and
+for a picture, which may take 60 s."""
 
 MAX_INPUTS: Final = 100
-"""Largest number of answers of one kind that a request may have; a step asks for some dozen."""
+"""Largest number of a request's values of one kind; a step asks for about a dozen."""
 
 MAX_COORDINATE: Final = 1e9
-"""Coordinate of a pose that is transformed, in the calibration's unit, either way from 0."""
+"""Largest absolute coordinate of a pose to transform, in the calibration's unit."""
 
 _Text = Annotated[str, Field(max_length=200)]
 _Answer = Annotated[str, Field(max_length=2000)]
@@ -39,24 +41,24 @@ _Real = Annotated[float, Field(allow_inf_nan=False)]
 _Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
 
 
-def _place(value: object) -> object:
-    """Return the text of a place in the spelling that is compared."""
+def _capitalize(value: object) -> object:
+    """Return a text such as "true" or " TRUE " as "True"; any other value unchanged."""
     return value.strip().capitalize() if isinstance(value, str) else value
 
 
 class StartRequest(ThesisRequest):
-    """The sources of pictures and poses, and the place of the camera."""
+    """The sources of pictures and poses, and whether the camera is fixed or on the robot."""
 
     topic_image1: _Text = ""
     topic_image2: _Text = ""
     checkerboard_squaresize_m: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.0
     tf_frame_robot_tcp: _Text = ""
     tf_frame_robot_base: _Text = ""
-    fixed_camera: Annotated[Literal["True", "False", ""], BeforeValidator(_place)] = ""
+    fixed_camera: Annotated[Literal["True", "False", ""], BeforeValidator(_capitalize)] = ""
 
 
 class PerformRequest(ThesisRequest):
-    """The answers of a step, or the action instead of answering."""
+    """The user's answers to a step, or what to do instead: repeat the last step, or abort."""
 
     repeat_last_step: bool = False
     abort: bool = False
@@ -79,7 +81,7 @@ class LoadRequest(ThesisRequest):
 
 
 class RequestHeader(BaseModel):
-    """The header of a request; ``stamp`` and ``time`` are the same, ISO text or seconds, UTC."""
+    """The header of a request. Its time is in ``stamp`` or ``time``: ISO text, or seconds, UTC."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -109,7 +111,7 @@ class RequestHeader(BaseModel):
 
 
 class TransformRequest(ThesisRequest):
-    """The camera's view, and the frame for the robot's pose."""
+    """A pose in the camera's picture to transform, and the frame in which the answer is wanted."""
 
     header: RequestHeader = RequestHeader()
     x: _Coordinate
@@ -118,13 +120,14 @@ class TransformRequest(ThesisRequest):
     tf_frame_reference: _Text = ""
 
 
-class CalibrationFace(Protocol):
-    """A camera as the five services see it.
+class CalibrationHost(Protocol):
+    """The owner of the camera that the five services calibrate.
 
     Attributes:
         name: the camera's name.
         calibrations: calibrations of the camera; None if no folder for them is set.
-        camera: function that returns the camera, for one call of that number of seconds.
+        camera: function that returns the camera for one call, which takes at most ``timeout``
+            seconds.
     """
 
     name: str
@@ -139,12 +142,12 @@ class CalibrationCall(NamedTuple):
     """A running call of a service.
 
     Attributes:
-        face: the camera.
+        host: the owner of the camera.
         request: the request, of the service's own class.
         timeout: seconds.
     """
 
-    face: CalibrationFace
+    host: CalibrationHost
     request: Any
     timeout: float
 
@@ -155,10 +158,10 @@ class CalibrationCall(NamedTuple):
         Raises:
             ConfigurationError: no folder for them is set.
         """
-        calibrations = self.face.calibrations
+        calibrations = self.host.calibrations
         if calibrations is None:
             raise ConfigurationError(
-                f"{self.face.name}: there is no folder for calibrations; expected "
+                f"{self.host.name}: there is no folder for calibrations; expected "
                 "calibrations: FOLDER in the fleet file of its agent, and to be asked there"
             )
         return calibrations
@@ -193,7 +196,7 @@ async def _perform(call: CalibrationCall) -> dict[str, Any]:
         from smartcam.calibration._inside import StepRequest
     request = call.request
     step_request = StepRequest(*(getattr(request, name) for name in StepRequest._fields))
-    return await call.calibrations.perform(step_request, call.face.camera(call.timeout))
+    return await call.calibrations.perform(step_request, call.host.camera(call.timeout))
 
 
 async def _export(call: CalibrationCall) -> dict[str, Any]:
@@ -211,18 +214,18 @@ async def _transform(call: CalibrationCall) -> dict[str, Any]:
         from smartcam.calibration._inside import PixelPoseRequest
     request = call.request
     header = request.header
-    seen = PixelPoseRequest(
+    pixel_pose = PixelPoseRequest(
         *(request.x, request.y, request.theta),
         *(header.frame_id, request.tf_frame_reference, header.seq, header.utc),
     )
-    return {"pose": await call.calibrations.transform(seen)}
+    return {"pose": await call.calibrations.transform(pixel_pose)}
 
 
 def own_localizations(reading: Interpretation | None, application: int | None) -> tuple[Any, str]:
-    """Return the specification for reading a camera's localizations, and their unit.
+    """Return the specification for localizations in the camera's own frame, and their unit.
 
     Args:
-        reading: interpretation of the camera's results; None if their contents are not known.
+        reading: interpretation of the camera's results; None if no layout of results is known.
         application: the active application; None if that is not known.
     """
     interpreter = None if reading is None else reading.interpreter(application)
@@ -232,10 +235,10 @@ def own_localizations(reading: Interpretation | None, application: int | None) -
 
 
 def checked_localizations(value: object, camera: str) -> list[Localization]:
-    """Return a value as a list of localizations.
+    """Return the localizations of a value.
 
     Raises:
-        InterpretationError: the value is not valid.
+        InterpretationError: the value is not a list of localizations.
     """
     localizations = localizations_of(value)
     if localizations is None:

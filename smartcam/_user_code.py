@@ -1,9 +1,9 @@
 """Handle the errors of code that a user passes in, so that our tasks go on.
 
-For each call of an interpreter, a calibration, an observer, a predicate or a generator,
-``except ENDS_PROGRAM: raise`` stands first, and then ``except BaseException``, which reports the
-error. ``except Exception`` would miss the error of ``pytest.fail``, and CancelledError, which
-would cancel the calling task.
+Each call of an interpreter, a calibration, an observer, a predicate or a generator is followed by
+``except ENDS_PROGRAM: raise``, and then by ``except BaseException``, which reports the error.
+``except Exception`` would miss the error of ``pytest.fail``, and CancelledError, which would cancel
+the calling task.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ ENDS_PROGRAM: Final[tuple[type[BaseException], ...]] = (KeyboardInterrupt, Syste
 
 
 def text_of(error: BaseException) -> str:
-    """Return the kind and the text of an error, even if the error's ``__str__`` fails."""
+    """Return the class and the text of an error, even if the error's ``__str__`` fails."""
     try:
         return f"{type(error).__name__}: {error}"
     except ENDS_PROGRAM:

@@ -1,10 +1,10 @@
-"""Files that are written whole or not at all.
+"""Write files whole or not at all.
 
-A temporary file in the same folder is written and synced. If backups are wanted, the present file
-is kept as ``NAME.1``, older ones as ``NAME.2``, ... The new file replaces it in one step, and the
-folder is synced. If the process is killed at any step, the name leads to the whole old or the
-whole new file, and the next writer removes the leftovers. One process writes in a folder at a time:
-the one that has its lock.
+A temporary file in the same folder is written and synced. If backups are wanted, the old file is
+kept as ``NAME.1``, and its backups become ``NAME.2``, ... Then the temporary file replaces the old
+file in one step, and the folder is synced. If the process is killed at any time, the name leads to
+the whole old file or the whole new file, and the next writer removes the temporary files. A folder
+has a lock, so that only one process at a time writes in it.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 LOCK_TIMEOUT = 30.0
-"""Seconds that a writer waits for others in the same folder, each of which takes milliseconds."""
+"""Seconds that a writer waits for other writers in the folder, each of which takes milliseconds."""
 
-_LOOK_AGAIN = 0.002
-_ATTEMPTS = 5
+_LOCK_RETRY_TIME = 0.002
+_MAX_ATTEMPTS = 5
 
 
 class FolderInUseError(OSError):
@@ -36,19 +36,19 @@ class FolderInUseError(OSError):
 
 
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
-    """Put a file in the place of another, whole or not at all; a symbolic link is replaced.
+    """Write a file, whole or not at all, in place of the old one; a symbolic link is replaced.
 
-    Any number of processes and threads may do so at once; the file of the last one stays. Leftovers
-    of a crash are removed.
+    Any number of processes and threads may write at once; the file of the last writer stays.
+    Temporary files that a crash has left are removed.
 
     Raises:
         FolderInUseError: another process writes in the folder and does not finish.
-        OSError: the file cannot be written. The file from before is still there.
+        OSError: the file cannot be written. The old file is still there.
     """
-    with _writing(path) as alone:
-        if alone:
-            _clear(path)
-        for _ in range(_ATTEMPTS - 1):
+    with _writing(path) as has_lock:
+        if has_lock:
+            _remove_leftovers(path)
+        for _ in range(_MAX_ATTEMPTS - 1):
             with contextlib.suppress(FileNotFoundError, FileExistsError):
                 return _replace(path, body, backups)
         return _replace(path, body, backups)
@@ -87,14 +87,14 @@ def _writing(path: Path) -> Iterator[bool]:
     handle = _open_lock(path.parent)
     try:
         deadline = time.monotonic() + LOCK_TIMEOUT
-        while (alone := try_lock(handle)) is False:
+        while (has_lock := try_lock(handle)) is False:
             if time.monotonic() > deadline:
                 raise FolderInUseError(
                     f"another process has written in its folder for {LOCK_TIMEOUT:g} s; expected "
                     "it to end"
                 )
-            time.sleep(_LOOK_AGAIN)
-        yield alone is True
+            time.sleep(_LOCK_RETRY_TIME)
+        yield has_lock is True
     finally:
         os.close(handle)  # and with it the lock
 
@@ -109,7 +109,7 @@ def _open_lock(folder: Path) -> int:
 
 def _replace(path: Path, body: bytes, backups: int) -> None:
     """Replace a file; without locks, another process may change the backups, too."""
-    temporary = _temporary(path, body)
+    temporary = _write_temporary(path, body)
     try:
         if backups > 0:
             _rotate(path, backups)
@@ -121,7 +121,7 @@ def _replace(path: Path, body: bytes, backups: int) -> None:
     sync_folder(path.parent)
 
 
-def _clear(path: Path) -> None:
+def _remove_leftovers(path: Path) -> None:
     """Remove temporary files for this path whose writer was killed."""
     stale = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}\.tmp")
     with os.scandir(path.parent) as entries:
@@ -130,8 +130,8 @@ def _clear(path: Path) -> None:
         path.with_name(name).unlink(missing_ok=True)
 
 
-def _temporary(path: Path, body: bytes) -> Path:
-    """Write a file beside the path, which will replace the old file."""
+def _write_temporary(path: Path, body: bytes) -> Path:
+    """Write a new file in the path's folder, under a temporary name, and return its path."""
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -148,16 +148,16 @@ def _temporary(path: Path, body: bytes) -> Path:
 def _rotate(path: Path, count: int) -> None:
     if not path.is_file() or path.is_symlink():
         return
-    rows = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
-    if rows[0].is_file() and filecmp.cmp(path, rows[0], shallow=False):
+    backup_paths = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
+    if backup_paths[0].is_file() and filecmp.cmp(path, backup_paths[0], shallow=False):
         return  # a crash came between backup and new file
-    filled = list(itertools.takewhile(Path.exists, rows[:-1]))  # up to the first gap
-    for newer, older in reversed(list(zip(filled, rows[1:], strict=False))):
+    present = list(itertools.takewhile(Path.exists, backup_paths[:-1]))  # up to the first gap
+    for newer, older in reversed(list(zip(present, backup_paths[1:], strict=False))):
         if older.exists() and newer.samefile(older):
             newer.unlink()  # renaming one name of a file to another does nothing
         else:
             newer.replace(older)
     try:
-        os.link(path, rows[0])  # a second name, so that the file is always there
+        os.link(path, backup_paths[0])  # a second name, so that the file is always there
     except (OSError, NotImplementedError):
-        _temporary(path, path.read_bytes()).replace(rows[0])
+        _write_temporary(path, path.read_bytes()).replace(backup_paths[0])

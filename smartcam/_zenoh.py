@@ -1,6 +1,7 @@
-"""A session of Zenoh, whose binding calls back in threads of its own, for one event loop.
+"""Use a session of Zenoh in an event loop, although Zenoh calls back in threads of its own.
 
-Received messages are put into one queue, and a burst wakes the event loop once.
+The callbacks put received messages into one queue. A burst of messages wakes the event loop once.
+"Engine" means Zenoh's own code, "end" a program that has a session on the bus.
 """
 
 from __future__ import annotations
@@ -45,39 +46,41 @@ RUNTIME = (
     "app:(worker_threads:1))"
 )
 """Zenoh's threads: as few as possible, which halves the CPU time of a call; callbacks only put
-messages into a queue. Sending has a thread of its own: the receiving thread waits for it if an
-answer is longer than a queue (128 KiB, such as the tokens of 20 nodes of ROS), and would otherwise
-wait for itself until the link is given up. Inner tasks have two threads: when a latched publisher
-is closed, the binding waits for such a task and blocks all threads of Python, including the one
-that is to call back. The variable ZENOH_RUNTIME overrides these numbers."""
+messages into a queue. Sending has a thread of its own: if an answer exceeds a queue (128 KiB,
+such as the tokens of 20 nodes of ROS), the receiving thread waits for the sending thread. If both
+were one, it would wait for itself until the link is given up. Tasks inside Zenoh have two threads:
+when a latched publisher is closed, the binding waits for such a task and blocks all threads of
+Python, including the thread that is to call back. The variable ZENOH_RUNTIME overrides these
+numbers."""
 
 LEASE_TIME = 5.0
-"""Seconds without a sign of life after which an end counts as gone; if its process was killed, the
-end is gone at once."""
+"""Seconds without a sign of life after which an end counts as gone. If its process was killed, it
+counts as gone at once."""
 
 MAX_LISTING_TIME = 120.0
-"""Seconds after which the engine ends a list of presences as if it were complete. The engine's own
-default is 10; thousands of presences on a busy machine take longer."""
+"""Seconds after which the engine treats a list of presences as complete. The engine's own default
+is 10; to list thousands of presences on a busy machine takes longer."""
 
 PORTS = range(20_000, 32_000)
 """The ports tried for port 0, below the range from which systems give ports to connections.
 
-No connection of another program takes such a port after it was found free and before the engine
-listens there.
+So no connection of another program takes a port between the test that it is free and the engine's
+use of it.
 """
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 ROOM_TIMEOUT = 0.001
-"""Seconds that the engine waits for room before it drops a message that may be dropped. It waits
-once: until something is sent to the same end, further messages of that priority drop at once."""
+"""Seconds that the engine waits for room in a queue before it drops a message that may be dropped.
+It waits only once: until it can send something to the same end again, it drops further messages of
+that priority at once."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Largest number of bytes that wait for the event loop, as many for patient callbacks, or for the
-thread that sends long replies. More is dropped; results are requested again later."""
+"""Largest number of bytes in each of the queues: for the event loop, for its patient callbacks, and
+for the thread that sends long replies. More is dropped; results are requested again later."""
 
 QUERY_BYTES = 256
-"""Bytes that a query counts beside its payload."""
+"""Bytes that a query counts in addition to its payload."""
 
 REPLY_THREADS = 4
 """Threads that answer queries; a client that does not read its answer blocks one of them."""
@@ -91,13 +94,13 @@ CALLBACKS_PER_TURN = 64
 PATIENT_CALLBACKS_PER_TURN = 8
 """Patient callbacks that run after the others in one turn of the event loop.
 
-A flood of patient callbacks delays other work only by the time of these few.
+So a flood of patient callbacks delays other work only by the time that these few take.
 """
 
 CLOSE_TIMEOUT = 5.0
 
 PEER_ENDPOINT = "tcp/127.0.0.1:0"
-"""Endpoint by which peers on this host have links of their own to a peer."""
+"""Endpoint on which a peer listens for direct links from other peers on this host."""
 
 ROUTER_TIMEOUT = 3.0
 """Seconds that a peer waits for a router before it goes on without one."""
@@ -107,21 +110,22 @@ NOT_ZENOH = "nothing there speaks Zenoh"
 MAX_DECLARED_AT_ONCE = 32
 """Largest number of declarations made in one turn of the event loop."""
 
-_ONE = (1).to_bytes(8, sys.byteorder)
+_RING = (1).to_bytes(8, sys.byteorder)
 
-_NOT_TAKEN = "%s ! what came from the bus was not taken"
+_CALLBACK_FAILED = "%s ! what came from the bus was not taken"
 
 
 @dataclass(frozen=True)
 class BusLink:
-    """The endpoints by which an end comes to the bus.
+    """The endpoints by which an end joins the bus.
 
     Attributes:
         listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
-        connect: endpoints to connect to; with several, whichever answers.
+        connect: endpoints to connect to; of several, one that answers is used.
         certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
-        peer: whether an end that only connects keeps working without the routers at ``connect``, as
-            nodes of rmw_zenoh do, by direct links to the ends on this host that it has found.
+        peer: True if an end that only connects is a peer. A peer, such as a node of rmw_zenoh, also
+            has direct links to the ends that it finds on this host, and keeps working without the
+            routers at ``connect``.
     """
 
     listen: tuple[str, ...] = ()
@@ -131,12 +135,12 @@ class BusLink:
 
     @property
     def mode(self) -> str:
-        """The engine's mode: an end that only connects is a router's client, or a peer."""
+        """The engine's mode: "router" if the end listens, else "peer" or "client"."""
         return "router" if self.listen else "peer" if self.peer else "client"
 
     @property
     def place(self) -> str:
-        """Return the endpoints of the link as a text, those to listen on first."""
+        """The endpoints to listen on as a text, or, without them, those to connect to."""
         return ", ".join(self.listen or self.connect)
 
     def settings(self, timeout: float) -> dict[str, Any]:
@@ -145,7 +149,7 @@ class BusLink:
             "mode": self.mode,
             "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
-            # 0: one try, the engine goes on later; a peer goes on only without a timeout (-1)
+            # 0: one try, then the engine tries again later; a peer does so only with -1, no timeout
             "connect/timeout_ms": -1 if self.mode == "peer" else 0,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
             "connect/exit_on_failure": self.mode == "client",
@@ -158,8 +162,8 @@ class BusLink:
                 1e6 * ROOM_TIMEOUT
             ),
             "routing/interests/timeout": int(1e3 * MAX_LISTING_TIME),
-            # also for each later try: a try that began while a cable was cut repeats its packets
-            # less and less often, so a long timeout would delay the return by as much
+            # also for each later try: a try that began while a cable was cut sends its packets less
+            # and less often, so a long timeout would delay the next successful try
             "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE_TIME))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
@@ -189,7 +193,7 @@ def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
 
 
 def _free_port(endpoint: str) -> int:
-    """Return a free port; the engine reports a host that is not this machine."""
+    """Return a free port; if the host is not this machine, the engine reports it later."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     ports = random.SystemRandom().sample(PORTS, 100)
@@ -205,10 +209,10 @@ def _free_port(endpoint: str) -> int:
 
 
 def _end_lingering(ports: frozenset[int]) -> None:
-    """Make the engine close its connections without waiting.
+    """Make the engine close its connections without waiting for data that is still unsent.
 
-    Otherwise, to close a connection that is cut off, the thread that serves all connections waits
-    10 s for the acknowledgement of the last data.
+    Otherwise the thread that serves all connections waits 10 s when it closes a connection that is
+    cut off, for the acknowledgement of the last data.
     """
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]  # noqa: PTH208 - names are enough
@@ -240,27 +244,27 @@ def engine() -> Any:
 
 
 class _EngineUse:
-    """A record that this process has had a session, so that the engine's threads run in it."""
+    """Records whether this process has had a session, since then the engine's threads run in it."""
 
     def __init__(self) -> None:
-        self.begun: bool = False
-        self.in_a_fork: bool = False
+        self.has_begun: bool = False
+        self.is_forked: bool = False
         notify_of_forks(self)
 
     def forked(self) -> None:
         """Note in a fork that the engine's threads do not run there."""
-        self.in_a_fork = self.begun
+        self.is_forked = self.has_begun
 
 
 _use = _EngineUse()
 
 
 class ZenohSession:
-    """A session for one event loop, in which its callbacks run.
+    """A session whose callbacks run in one event loop.
 
     Args:
         link: endpoints and certificates that the session uses.
-        more: further settings of the engine, by their paths.
+        more: further settings of the engine, by their paths: "transport/link/tx/lease".
         bus_name: name of the bus in texts.
     """
 
@@ -270,24 +274,24 @@ class ZenohSession:
         more: Mapping[str, Any] | None = None,
         bus_name: str = "the fleet's bus",
     ) -> None:
-        self._link, self._more, self._bus_name = link, dict(more or {}), bus_name
+        self._link, self._extra_settings, self._bus_name = link, dict(more or {}), bus_name
         self._zenoh = engine()
         self._session: Any = None
         self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
-        # bytes received, counted by all threads; and the number of handled bytes
-        self._bytes = self._patient_bytes = 0
-        self._taken_bytes = self._taken_patient_bytes = 0
-        self._woken = False
+        # bytes of all calls that were queued, counted in any thread; and of those that were handled
+        self._queued_bytes = self._queued_patient_bytes = 0
+        self._handled_bytes = self._handled_patient_bytes = 0
+        self._wake_pending = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
         self._reported_dropped = False
         self._repliers: ThreadPoolExecutor | None = None
-        self._replying = 0
+        self._reply_count = 0
         self._reopening = False
-        self._look: asyncio.TimerHandle | None = None  # timer for connections that linger
+        self._linger_timer: asyncio.TimerHandle | None = None  # calls _end_lingering again
 
     # ------------------------------------------------------------------ life
 
@@ -300,18 +304,18 @@ class ZenohSession:
             ConfigurationError: the engine refuses a setting.
             LocalProtocolError: this process is a fork of one that had a session before.
         """
-        if _use.in_a_fork:
+        if _use.is_forked:
             raise LocalProtocolError(
                 f"{self._bus_name}: this process is a fork of one in which the engine's threads "
                 "run, and it has none of them: start it by another method, such as "
                 "multiprocessing's 'spawn', or before the first session"
             )
-        _use.begun = True
+        _use.has_begun = True
         self._loop = asyncio.get_running_loop()
         await self._open(timeout)
         self._end_lingering()
         self._forget_waiting()
-        self._woken = False
+        self._wake_pending = False
         self._bell = _LoopBell.on(self._loop, self._drain)
         return self
 
@@ -320,20 +324,20 @@ class ZenohSession:
         try:
             async with asyncio.timeout(timeout):
                 while self._session is None:
-                    begun = loop.time()
+                    begun_at = loop.time()
                     try:
-                        self._session = await self._opened(timeout)
+                        self._session = await self._open_engine_session(timeout)
                     except self._zenoh.ZError as exc:
-                        # a silent end is given up after a lease, so another end may still be tried
-                        if loop.time() - begun < 0.9 * min(timeout, LEASE_TIME):
-                            raise self._connect_error(await self._why(exc)) from exc
+                        # an end that is silent is given up after a lease; then try others again
+                        if loop.time() - begun_at < 0.9 * min(timeout, LEASE_TIME):
+                            raise self._connect_error(await self._failure_reason(exc)) from exc
         except TimeoutError as exc:
             raise self._connect_error(f"no answer within {timeout:g} s") from exc
         if self._link.mode == "peer":
-            await self._meet(min(timeout, ROUTER_TIMEOUT))
+            await self._wait_for_router(min(timeout, ROUTER_TIMEOUT))
 
-    async def _meet(self, timeout: float) -> None:
-        """Wait for a router, so that later queries find all ends; go on without one."""
+    async def _wait_for_router(self, timeout: float) -> None:
+        """Wait for a router, so that later queries reach all ends; warn if none comes in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while not self._session.info.routers_zid():  # noqa: ASYNC110 - nothing tells of it
@@ -345,11 +349,11 @@ class ZenohSession:
             self._link.place,
         )
 
-    async def _opened(self, timeout: float) -> Any:
-        """Return a session; close one that is opened after the caller has given up."""
+    async def _open_engine_session(self, timeout: float) -> Any:
+        """Open a session of the engine; close it if it opens only after the caller has given up."""
         zenoh = self._zenoh
         config = zenoh.Config()
-        settings = {**self._link.settings(timeout), **self._more}
+        settings = {**self._link.settings(timeout), **self._extra_settings}
         for path, value in settings.items():
             try:
                 config.insert_json5(path, json.dumps(value))
@@ -367,21 +371,21 @@ class ZenohSession:
     async def reopen(self, timeout: float) -> None:
         """Replace this session by a new one, with all declarations.
 
-        The other ends see this end leave and return; nothing is sent or received in between. New
-        declarations meanwhile are made with the others.
+        The other ends see this end leave and return; nothing is sent or received in between.
+        Declarations that are requested meanwhile are made with the new session.
 
         Raises:
             ConnectFailedError: the session cannot listen again within ``timeout`` seconds; there is
-                no session until the next try.
+                no session until the next call succeeds.
 
-        Cancellation: as an error.
+        Cancellation: leaves no session either, until the next call succeeds.
         """
         session, self._session = self._session, None
         if session is not None:
             self._reopening = True
-            old = [declared.lose() for declared in tuple(self._declared)]
+            lost = [declared.lose() for declared in tuple(self._declared)]
             closing = self._loop.run_in_executor(
-                None, _lose, session, old, self._link.mode != "client"
+                None, _end_and_release, session, lost, self._link.mode != "client"
             )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CLOSE_TIMEOUT):
@@ -389,21 +393,21 @@ class ZenohSession:
         if not self._reopening:
             raise ConfigurationError(f"{self._bus_name} is not open")
         await self._open(timeout)
-        for number, declared in enumerate(tuple(self._declared)):
-            if number % MAX_DECLARED_AT_ONCE == 0:
+        for index, declared in enumerate(tuple(self._declared)):
+            if index % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
             declared.again()
         self._reopening = False
 
     def _end_lingering(self) -> None:
-        """Close lingering connections now, and again before a new one can outlast its lease."""
-        self._look = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
+        """Keep the engine's connections from lingering; again and again, for new ones."""
+        self._linger_timer = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
         endpoints = (*self._link.listen, *self._link.connect)
         ports = frozenset(int(endpoint.rpartition(":")[2]) for endpoint in endpoints)
         self._loop.run_in_executor(None, _end_lingering, ports)
 
-    async def _why(self, error: Exception) -> str:
-        """Return why nothing was reached; the engine does not report names that do not resolve."""
+    async def _failure_reason(self, error: Exception) -> str:
+        """Return why no end was reached; the engine does not say that a name does not resolve."""
         reason = _reason(error)
         for endpoint in self._link.connect if reason == NOT_ZENOH else ():
             host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
@@ -414,16 +418,16 @@ class ZenohSession:
         return reason
 
     def _connect_error(self, why: str) -> ConnectFailedError:
-        doing = "listen on" if self._link.listen else "reach"
-        text = f"{self._bus_name}: cannot {doing} {self._link.place}: {why}"
+        verb = "listen on" if self._link.listen else "reach"
+        text = f"{self._bus_name}: cannot {verb} {self._link.place}: {why}"
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
         """Close the session, and with it all declarations. Idempotent."""
         session, self._session = self._session, None
         self._reopening = False
-        if self._look is not None:
-            self._look.cancel()
+        if self._linger_timer is not None:
+            self._linger_timer.cancel()
         self._forget_waiting()
         bell, self._bell = self._bell, None
         if bell is not None:
@@ -433,14 +437,14 @@ class ZenohSession:
         for declared in tuple(self._declared):
             declared.close()
         closing = self._loop.run_in_executor(
-            None, _end, session, self._threads(), self._link.mode != "client"
+            None, _end_session, session, self._threads(), self._link.mode != "client"
         )
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
 
     def _threads(self) -> list[ThreadPoolExecutor]:
-        """Return the threads of the session's users; their last messages are sent first."""
+        """Return the pools of threads that still send; they finish before the session ends."""
         repliers, self._repliers = self._repliers, None
         return [] if repliers is None else [repliers]
 
@@ -449,26 +453,29 @@ class ZenohSession:
     def _forget_waiting(self) -> None:
         self._waiting.clear()
         self._patient.clear()
-        self._taken_bytes, self._taken_patient_bytes = self._bytes, self._patient_bytes
+        self._handled_bytes, self._handled_patient_bytes = (
+            self._queued_bytes,
+            self._queued_patient_bytes,
+        )
 
     def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
         """Schedule a call in the event loop, in order; from any thread."""
         with self._lock:
             self._waiting.append((call, arguments, size))
-            self._bytes += size
-            if self._woken:
+            self._queued_bytes += size
+            if self._wake_pending:
                 return
-            self._woken = True
+            self._wake_pending = True
         self._wake()
 
     def in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
         """Schedule a call as :meth:`in_loop` does, but after all calls that are not patient."""
         with self._lock:
             self._patient.append((call, arguments, size))
-            self._patient_bytes += size
-            if self._woken:
+            self._queued_patient_bytes += size
+            if self._wake_pending:
                 return
-            self._woken = True
+            self._wake_pending = True
         self._wake()
 
     def _wake(self) -> None:
@@ -485,37 +492,37 @@ class ZenohSession:
             if not waiting:
                 break
             call, arguments, size = waiting.popleft()
-            self._taken_bytes += size
+            self._handled_bytes += size
             try:
                 call(*arguments)
             except ENDS_PROGRAM:
                 self._loop.call_soon(self._drain)
                 raise
             except BaseException:
-                logger.exception(_NOT_TAKEN, self._link.place)
+                logger.exception(_CALLBACK_FAILED, self._link.place)
         for _ in range(min(PATIENT_CALLBACKS_PER_TURN, len(patient))):
             if not patient:
                 break
             call, arguments, size = patient.popleft()
-            self._taken_patient_bytes += size
+            self._handled_patient_bytes += size
             try:
                 call(*arguments)
             except ENDS_PROGRAM:
                 self._loop.call_soon(self._drain)
                 raise
             except BaseException:
-                logger.exception(_NOT_TAKEN, self._link.place)
+                logger.exception(_CALLBACK_FAILED, self._link.place)
         with self._lock:
-            self._woken = bool(waiting or patient)
-        if self._woken:
+            self._wake_pending = bool(waiting or patient)
+        if self._wake_pending:
             self._loop.call_soon(self._drain)
 
     def full(self, size: int, *, patient: bool = False) -> bool:
-        """Return True if the loop is so far behind that repeatable messages are dropped."""
+        """Return True if too many bytes wait for the loop, so that a message has to be dropped."""
         if patient:
-            waiting = self._patient_bytes - self._taken_patient_bytes
+            waiting = self._queued_patient_bytes - self._handled_patient_bytes
         else:
-            waiting = self._bytes - self._taken_bytes
+            waiting = self._queued_bytes - self._handled_bytes
         if waiting + size <= MAX_WAITING_BYTES:
             return False
         if not self._reported_dropped:
@@ -530,7 +537,7 @@ class ZenohSession:
     def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
         """Answer a query, and end it; never waits.
 
-        The engine may wait for the asker if the query allows it; hence the threads.
+        A thread sends the replies, since the engine may wait for the program that asked.
 
         Args:
             query: query of the engine.
@@ -538,36 +545,44 @@ class ZenohSession:
             **how: the engine's options of a reply.
         """
         if replies:
-            self._in_replier(query, _reply, query, replies, how)
+            self._run_in_replier(query, _reply, query, replies, how)
         else:
             quietly(query.drop)
 
     def refuse(self, query: Any, why: str) -> None:
         """Answer a query with an error, and end it; never waits."""
-        self._in_replier(query, _refuse, query, why)
+        self._run_in_replier(query, _refuse, query, why)
 
-    def _in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
-        if self._session is None or self._replying >= MAX_WAITING_QUERIES:
+    def _run_in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
+        if self._session is None or self._reply_count >= MAX_WAITING_QUERIES:
             quietly(query.drop)
             return
         if self._repliers is None:
             self._repliers = ThreadPoolExecutor(REPLY_THREADS, "smartcam-fleet-reply")
         with self._lock:
-            self._replying += 1
-        self._repliers.submit(call, *arguments).add_done_callback(self._replied)
+            self._reply_count += 1
+        self._repliers.submit(call, *arguments).add_done_callback(self._on_replied)
 
-    def _replied(self, _: object) -> None:
+    def _on_replied(self, _: object) -> None:
         with self._lock:
-            self._replying -= 1
+            self._reply_count -= 1
 
     def declare(self, declared: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
-        """Declare something at the engine; the declaration is closed with this session."""
-        made = None if self._reopening else how(self.session)
+        """Make a declaration at the engine, and remember it; it is closed with this session.
+
+        Args:
+            declared: the owner of the declaration.
+            how: function that gets the engine's session, and returns the engine's declaration.
+
+        Returns:
+            The engine's declaration; None while the session is reopened, which makes it later.
+        """
+        declaration = None if self._reopening else how(self.session)
         self._declared[declared] = None
-        return made
+        return declaration
 
     def forget(self, declared: ZenohDeclared) -> None:
-        """Remove a closed end from those that the session closes."""
+        """Forget a declaration that was closed, so that the session does not close it."""
         self._declared.pop(declared, None)
 
     @property
@@ -592,7 +607,7 @@ class ZenohSession:
         return self._zenoh
 
     def later(self, call: Callable[..., None], *arguments: Any) -> None:
-        """Call something in the event loop; for any thread."""
+        """Schedule a call in the event loop, without counted bytes; from any thread."""
         self.in_loop(call, 0, *arguments)
 
 
@@ -601,11 +616,11 @@ class _LoopBell:
 
     Args:
         loop: the loop.
-        call: function that the loop calls after a ring.
+        call: function that the loop calls after :meth:`ring`.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
-        # a file object knows that it is closed; its number may be another file's by then
+        # a file object knows that it is closed; its descriptor may be another file's by then
         self._file = io.FileIO(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC), "r+")
         self._loop, self._call = loop, call
         loop.add_reader(self._file.fileno(), self._on_ring)
@@ -620,9 +635,9 @@ class _LoopBell:
         return None
 
     def ring(self) -> None:
-        """Make the loop call the function once, however often the bell is rung before."""
+        """Make the loop call the function; several rings before that cause only one call."""
         try:  # noqa: SIM105 - each message does this, and suppress() costs as much as the rest
-            self._file.write(_ONE)
+            self._file.write(_RING)
         except (ValueError, OSError):  # the bell is closed
             pass
 
@@ -641,10 +656,11 @@ class ZenohDeclared:
     """A declaration at the engine, until this object or its session is closed.
 
     Args:
-        end: the session.
-        by_dropping: True if the end is dropped instead of undeclared, since this object has its
-            only reference. To undeclare an advanced end, the binding holds Python's lock while
-            it waits for a thread that may wait for that lock; to drop one, it releases the lock.
+        end: the session for the declaration.
+        by_dropping: True if the engine's declaration ends by dropping its only reference, which is
+            this object's. To undeclare an advanced publisher or subscriber, the binding holds
+            Python's lock while it waits for a thread that may wait for that lock; to drop it, the
+            binding releases the lock.
     """
 
     def __init__(self, end: ZenohSession, *, by_dropping: bool = False) -> None:
@@ -652,39 +668,39 @@ class ZenohDeclared:
         self._end = end
         self._closed = False
         self._declaration: Any = None
-        self._how: Callable[[Any], Any] = _nothing
+        self._how: Callable[[Any], Any] = _declare_nothing
         self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
-        """Declare the object that ``how`` makes with the engine's session."""
+        """Make the declaration: ``how`` gets the engine's session, and returns the declaration."""
         self._how = how
         self._declaration = self._end.declare(self, how)
         return self
 
     def when_lost(self, call: Callable[[], None]) -> Self:
-        """Schedule a call in the event loop for when a new session replaces this one."""
+        """Set the function that the event loop calls when the session is replaced by a new one."""
         self._on_lost = call
         return self
 
     def lose(self) -> Any:
-        """Prepare for the end of the session; return the object to keep until then."""
+        """Prepare for the end of the session; return the declaration to keep until that end."""
         declaration, self._declaration = self._declaration, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
         return None if self._by_dropping else declaration
 
     def again(self) -> None:
-        """Declare the key again at the present session."""
+        """Make the declaration again with the new session."""
         if not self._closed and self._declaration is None:
             self._declaration = self._how(self._end.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
-        """Call back, unless it was closed meanwhile."""
+        """Call a function, unless the declaration was closed meanwhile."""
         if not self._closed:
             call(*arguments)
 
     def close(self) -> None:
-        """Take the declaration back; a second call does nothing."""
+        """End the declaration. Idempotent."""
         if not self._closed:
             self._closed = True
             self._end.forget(self)
@@ -693,12 +709,12 @@ class ZenohDeclared:
                 quietly(declaration.undeclare)
 
 
-def _lose(session: Any, declared: list[Any], router: bool) -> None:
-    _end(session, [], router)
-    declared.clear()  # slow while the session is open
+def _end_and_release(session: Any, declarations: list[Any], router: bool) -> None:
+    _end_session(session, [], router)
+    declarations.clear()  # this is slow while the session is open
 
 
-def _nothing(_: Any) -> None:
+def _declare_nothing(_: Any) -> None:
     pass
 
 
@@ -713,12 +729,12 @@ def _refuse(query: Any, why: str) -> None:
     quietly(query.drop)
 
 
-def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
+def _end_session(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
     """Wait for the threads that still send, then end the session.
 
-    A closed router is never freed, which costs 16 KiB. To drop its last reference would wait for an
-    engine's thread while holding the interpreter lock, and that thread may wait for the lock to
-    call another session of this process.
+    The session of a router is never freed, which costs 16 KiB. Dropping its last reference would
+    wait for a thread of the engine and hold the interpreter lock meanwhile, and that thread may
+    wait for the lock to call another session of this process.
     """
     for pool in threads:
         pool.shutdown()
@@ -730,21 +746,21 @@ def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
 class _EngineThread(threading.local):
     """A thread of the engine that calls back into Python."""
 
-    known: bool = False
+    is_kept: bool = False
 
 
-_thread = _EngineThread()
+_engine_thread = _EngineThread()
 
 
 def keep_thread() -> None:
     """Keep Python's state of this thread of the engine; call this first in a callback.
 
-    The binding enters Python anew for each callback, and making and freeing Python's state of a
-    foreign thread costs a third of a message. A thread that enters once more than it leaves keeps
-    its state until it ends; the engine has a few threads, which end with the process.
+    For each callback the binding would make and free Python's state of the thread, which takes a
+    third of the time of a message. This function enters Python once without leaving it, so the
+    thread keeps its state until it ends. The engine has few threads, which end with the process.
     """
-    if not _thread.known:
-        _thread.known = True
+    if not _engine_thread.is_kept:
+        _engine_thread.is_kept = True
         ctypes.pythonapi.PyGILState_Ensure()
 
 
@@ -754,18 +770,18 @@ def direct(call: Callable[[Any], None], ended: Callable[[], None] | None = None)
     ``ended`` is called when no more calls will come.
     """
 
-    def called(received: Any) -> None:
-        if not _thread.known:
+    def callback(received: Any) -> None:
+        if not _engine_thread.is_kept:
             keep_thread()
         call(received)
 
-    return engine().handlers.Callback(called, ended, indirect=False)
+    return engine().handlers.Callback(callback, ended, indirect=False)
 
 
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
-    """Call the engine; a session that ends meanwhile is no error of the caller.
+    """Call the engine; log an error that only means that the session has ended meanwhile.
 
-    An object that another thread is using is released when that thread drops its reference.
+    An object that another thread is using cannot be released now; it is when that thread drops it.
     """
     try:
         call(*arguments, **named)
@@ -780,15 +796,18 @@ def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
 def _close_late(router: bool, opening: asyncio.Future[Any]) -> None:
     """Close a session that was opened after the caller had given up.
 
-    The interpreter waits for this thread when it exits. Otherwise a thread inside the engine could
-    not return to Python, and the engine would abort the process.
+    The thread that closes it is no daemon, so that the interpreter waits for it at its exit.
+    Otherwise the thread could not return from the engine to Python, and the engine would abort the
+    process.
     """
     if not opening.cancelled() and opening.exception() is None:
-        threading.Thread(target=_end, args=(opening.result(), [], router), daemon=False).start()
+        threading.Thread(
+            target=_end_session, args=(opening.result(), [], router), daemon=False
+        ).start()
 
 
 def _reason(error: Exception) -> str:
-    """Return an error's text without the engine's source lines, or the system's own words."""
+    """Return an error's text: the system's own text in it, or else all but the engine's line."""
     text = str(error).partition(" at /")[0].strip(" .")
     system = re.search(r": ([^:]+) \(os error \d+\)", text)
     if system is not None:

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["Backoff"]
 
 MAX_FACTOR = sys.float_info.max
-"""Largest factor between two delays: with it, the longest delay follows the first at once."""
+"""Largest factor between two delays: with it, the second delay is the longest already."""
 
 
 def is_transient(error: BaseException) -> bool:
     """Return True if another try may succeed.
 
-    Faults of links are transient: nothing listens, no route to the host, a name that does not
+    Faults of links are transient: nothing listens, no route to the host, a host name that does not
     resolve while the name server is away, silence, a peer that breaks the protocol. Errors in the
     user's options or in a plug-in are not, nor is a camera that refuses the session: a wrong
     password stays wrong, and many tries may lock the account.
@@ -47,14 +47,14 @@ def is_transient(error: BaseException) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backoff:
-    """Delays between tries to reach a camera again, which grow up to a maximum.
+    """Delays between tries to reach a lost camera again, which grow up to a maximum.
 
     Attributes:
         initial: the first delay, seconds. A link that was cut is often back at once.
         factor: ratio of each delay to the one before, until ``maximum``.
         maximum: the longest delay, seconds. A rebooting camera is away for about 30 s.
-        jitter: share of each delay that is left to chance, so that many clients do not come all at
-            the same instant: 0 (none) to 1.
+        jitter: share of each delay that is random, so that many clients do not try at the same
+            time: 0 (none) to 1.
         attempts: number of tries before giving up; None for no limit.
         transient: function that returns whether another try may help after an error; otherwise the
             client gives up.
@@ -93,9 +93,9 @@ class Backoff:
         """Yield the delay before each try, seconds; end after ``attempts``.
 
         Args:
-            short_lived: number of sessions in a row that were lost soon. The delays begin that many
-                steps later; otherwise a link that breaks at once would be opened again without a
-                pause.
+            short_lived: number of the last sessions in a row that were lost soon. The first delay
+                is as long as if so many tries had failed; otherwise a link that always breaks at
+                once would be opened again and again without a pause.
             chance: random source of the jitter; seed it to get the same delays again.
         """
         check_integer(short_lived, "short_lived", 0, owner="Backoff")

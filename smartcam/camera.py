@@ -1,7 +1,7 @@
-"""The camera as the user sees it, whether at the wire or in a fleet.
+"""The interface of every camera: connected to this program, or shared by a fleet.
 
-:class:`Camera` has the methods of every camera. :class:`~smartcam.SmartCamera` has a session
-of its own.
+:class:`Camera` has the methods of every camera. :class:`~smartcam.SmartCamera` is the one with its
+own session.
 """
 
 from __future__ import annotations
@@ -59,46 +59,46 @@ QueueT = TypeVar("QueueT", bound=Queue[Any])
 T = TypeVar("T")
 
 DEFAULT_MAX_QUEUE = 1024
-"""Items a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
+"""Items that a subscriber's queue holds: half a minute of results at 30 a second, about 1 MB."""
 
 DEFAULT_MAX_QUEUE_BYTES = 1 << 26
-"""Bytes of containers that a subscriber's queue holds: 1024 of 64 kB, the most that known cameras
-send. The interpreted values may take several times as much."""
+"""Bytes of containers that a subscriber's queue holds: 1024 containers of 64 kB, the largest that
+known cameras send. The interpreted values may need several times as many bytes."""
 
 MAX_INTERPRETATIONS = 32
-"""Largest number of texts given as ``interpret_as`` whose interpreters a client keeps."""
+"""Largest number of values of ``interpret_as`` that are texts whose interpreters a client keeps."""
 
 DEFAULT_TRIGGER_TIMEOUT = 5.0
 """Seconds for a trigger: inspections take tens to hundreds of milliseconds, some a few seconds."""
 
 WAIT = "wait"
-"""Value of ``when_busy`` by which a trigger waits until the camera takes it."""
+"""Value of ``when_busy`` with which a trigger waits until the camera is ready for it."""
 
 DEFAULT_RECONNECT_TIMEOUT = 60.0
-"""Seconds for a session to be there again: a reboot takes about 30 (mvBlueGEMINI manual p. 31,
-published for the sibling)."""
+"""Seconds to wait for a new session: a reboot takes about 30 (mvBlueGEMINI manual p. 31, published
+for the sibling)."""
 
 
 FRAME_TIMEOUT = 5.0
-"""Seconds that a frame is waited for."""
+"""Seconds to wait for a frame."""
 
 FrameEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl"]
 StreamEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl", "h264"]
-"""Encodings in which frames may come."""
+"""Encodings of frames: of a single frame, and in a stream."""
 
 FRAME_ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
 STREAM_ENCODINGS = (*FRAME_ENCODINGS, "h264")
 
 MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
-"""Largest number of a run that a request has room for, 32 bits."""
+"""Largest number of a run that a request can hold, 32 bits."""
 
 MAX_RESULTS_PER_TRIGGER = 10_000
-"""Largest number of results of one trigger that may be asked for: a camera has a few "send results"
-tools."""
+"""Largest number of results of one trigger that a caller may ask for: a camera has only a few "send
+results" tools."""
 
 
 class FrameRequest(NamedTuple):
-    """The form in which frames are asked for.
+    """The encoding and quality in which a caller wants frames.
 
     Attributes:
         encoding: name of the encoding.
@@ -110,15 +110,15 @@ class FrameRequest(NamedTuple):
 
 
 class StreamRequest(NamedTuple):
-    """The stream of frames that is asked for; fields as the arguments of :meth:`Camera.frames`.
+    """The stream of frames that a caller wants; fields as the arguments of :meth:`Camera.frames`.
 
     Attributes:
         encoding: name of the encoding.
         quality: quality of JPEGs; None for the agent's default.
         bitrate: bits per second; None for no limit.
         latency: seconds; None for no limit.
-        decode: whether encoded frames are decoded here.
-        timeout: seconds that an iteration waits; None for no limit.
+        decode: True if H.264 frames are decoded here.
+        timeout: seconds that an iteration waits for a frame; None for no limit.
     """
 
     encoding: str
@@ -130,54 +130,55 @@ class StreamRequest(NamedTuple):
 
 
 class Camera(abc.ABC, Generic[ValueT]):
-    """A camera, wherever it is; made by :func:`smartcam.connect`.
+    """A camera; :func:`smartcam.connect` makes it.
 
-    It outlives its links: a lost link is replaced by the rules of ``reconnect``. Until then every
-    method that talks to the camera raises :exc:`~smartcam.ConnectionLostError` at once,
-    with the first cause chained; nothing is sent again by itself. Before ``open()`` and after
-    ``close()`` the error is :exc:`~smartcam.ConnectionClosedError`.
+    The object stays usable after its link was lost: the option ``reconnect`` says when it tries to
+    make a new link. Until then every method that talks to the camera raises
+    :exc:`~smartcam.ConnectionLostError` at once, with the first cause chained. No command is sent
+    again by itself. Before ``open()`` and after ``close()`` the error is
+    :exc:`~smartcam.ConnectionClosedError`.
 
     Args:
         settings: validated options.
-        observers: objects that see its frames, events, results and errors.
+        observers: objects that are called with its frames, events, results and errors.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:
         self.settings: CameraSettings = settings
         self._observers = Observers(observers)
-        self._observed = bool(self._observers)
-        # interpretations by the text that was given for them
+        self._has_observers = bool(self._observers)
+        # interpretations by the text of ``interpret_as``
         self._interpretations: dict[str, Interpretation] = {}
         self._counters = ClientCounters()
         self._listeners = self._make_listeners()
         self._default_spec: object = settings.interpret_as
         self._default = self._interpretation(self._default_spec, of_camera=True)
-        self._usual_trigger = TriggerRequest(self._default, None, 1, wait=True)
+        self._default_request = TriggerRequest(self._default, None, 1, wait=True)
 
     # ------------------------------------------------------------------ for each kind of camera
 
     @abc.abstractmethod
     def _require_session(self) -> object:
-        """Raise the reason why there is no session, if there is none."""
+        """Do nothing while there is a session; else raise the error that says why there is none."""
 
     @abc.abstractmethod
     def _deadline(self, timeout: float) -> float:
-        """Return the loop time in ``timeout`` seconds; ConfigurationError if there is none."""
+        """Return the loop's time after ``timeout`` seconds; ConfigurationError if it cannot be."""
 
     @abc.abstractmethod
-    def _listens(self, subscribers: object) -> None:
-        """Note that ``subscribers`` has a listener from now on."""
+    def _on_listener_added(self, subscribers: object) -> None:
+        """Note that ``subscribers`` got a subscriber, or a caller waits for its next item."""
 
-    def _abandoned(self) -> bool:
-        """Release a camera without any reference; return whether it was open.
+    def _release_unreferenced(self) -> bool:
+        """Release a camera to which nothing refers; return True if it was open.
 
         Any thread may call it, also after ``__init__`` has failed.
         """
         return False
 
     @abc.abstractmethod
-    def _over(self) -> tuple[SmartCamError | None] | None:
-        """Return the reason why the camera's streams ended, None if more items may come."""
+    def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
+        """Return the error with which streams ended, or None, in a tuple; None if they go on."""
 
     @abc.abstractmethod
     async def _trigger(
@@ -209,7 +210,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """
 
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session, and the state that ``restore`` asks for.
+        """Wait until there is a session, and the camera has the state that ``restore`` asks for.
 
         Args:
             timeout: seconds.
@@ -247,7 +248,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def __exit__(self, *_: object) -> None: ...
 
     def __del__(self) -> None:
-        if self._abandoned():
+        if self._release_unreferenced():
             warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
 
     def __repr__(self) -> str:
@@ -272,7 +273,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @property
     def trouble(self) -> SmartCamError | None:
-        """The error that a call would raise now without a session; None while there is one.
+        """The error that a call would raise now; None while there is a session.
 
         The error has no traceback; its cause is in ``__cause__``.
         """
@@ -311,7 +312,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """
 
     def statistics(self) -> Statistics:
-        """Return everything counted so far, over all sessions. The accounts balance at any time."""
+        """Return all counters, over all sessions. Their sums agree at any time."""
         streams = self._listeners.streams()
         return self._counters.statistics(s.statistics() for s in streams if not s.ended)
 
@@ -348,22 +349,23 @@ class Camera(abc.ABC, Generic[ValueT]):
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Subscription[Result[ValueT]] | BatchSubscription[Result[ValueT]]:
-        """Subscribe to everything the camera sends, triggered or not; subscribed when called.
+        """Subscribe to every result, triggered or not; the call subscribes, not the iteration.
 
-        The stream continues after a reconnect; results that the camera sent in between are lost.
+        The stream goes on after a reconnect; results that the camera sent in between are lost.
 
-        A container that does not fit its layout, or its calibration, is raised from the iterator as
-        :exc:`~smartcam.InterpretationError`; the iterator stays usable. Results of
-        another application than the one named are counted, not delivered.
+        For a container that does not fit its layout, or its calibration, the iterator raises
+        :exc:`~smartcam.InterpretationError`; it stays usable. Results of another application than
+        the one that was named, by the option or a switch, are counted, but not delivered.
 
         Args:
-            batch: give lists of all waiting results, at least one, instead of single results: for a
-                camera that sends thousands a second. ``max_queue`` counts results.
-            min_interval: seconds; results that come sooner after the last one are dropped.
+            batch: return lists of all waiting results, at least one, instead of single results: for
+                a camera that sends thousands a second. ``max_queue`` counts results, not lists.
+            min_interval: seconds; results that come sooner after the last kept result are dropped.
             max_queue: results kept for a slow reader. One read of the link brings up to 32 KiB.
-            max_queue_bytes: largest number of bytes of their containers together (``Result.raw``;
-                values may be larger). A larger single container is kept if the queue is empty.
-            overflow: consequence of reaching either limit.
+            max_queue_bytes: largest number of bytes of the kept containers together
+                (``Result.raw``; values may be larger). A larger single container is kept if the
+                queue is empty.
+            overflow: what happens when one of the two limits is reached.
         """
         check_flag(batch, "batch", self.name)
         kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
@@ -399,7 +401,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Subscribe to the camera's events, in order.
 
         The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged``,
-        ``ApplicationChanged`` and ``NoticeReceived``. Subscribe before :meth:`open` to see the
+        ``ApplicationChanged`` and ``NoticeReceived``. Subscribe before :meth:`open` to get the
         first ones.
         """
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
@@ -408,9 +410,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def wait_status(
         self, predicate: Callable[[Status], bool], timeout: float = 10.0
     ) -> Status:
-        """Return the first status, the present one included, that ``predicate`` accepts.
+        """Return the first status that ``predicate`` accepts, beginning with the present status.
 
-        The predicate sees every status in order, not only the last.
+        The predicate is called with every status in order, not only with the last.
 
         Raises:
             ResponseTimeoutError: after ``timeout`` seconds.
@@ -424,7 +426,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _wait_status(self, predicate: Callable[[Status], bool], timeout: float) -> Status: ...
 
     async def wait_ready(self, timeout: float = 10.0) -> Status:
-        """Wait until the camera is not BUSY, and Running if a start was asked for.
+        """Wait until the camera is not BUSY, and is Running if it was started.
 
         Raises:
             ResponseTimeoutError: after ``timeout`` seconds.
@@ -439,9 +441,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
     ) -> Coroutine[Any, Any, Result[ValueT]]:
-        """Wait for the next result, whatever triggers it; registered when called, not when awaited.
+        """Wait for the next result, whatever triggers it; the call registers, not the ``await``.
 
-        A result that is known to belong to a trigger that was given up is left out.
+        A result that certainly belongs to a trigger that was given up is left out.
 
         ``waiting = camera.next_result(); start_conveyor(); result = await waiting``
 
@@ -458,7 +460,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._require_session()
         deadline = self._deadline(timeout)
         future = self._listeners.next_result()
-        self._listens(self._listeners.results)
+        self._on_listener_added(self._listeners.results)
         return self._await_next(future, deadline, timeout)
 
     # ------------------------------------------------------------------ commands
@@ -571,36 +573,38 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> Result[Any] | list[Result[Any]]:
         """Trigger one inspection and return its result.
 
-        Waits until the camera waits for a trigger, then sends. One trigger at a time: a second
-        caller waits its turn, within its own ``timeout``. A trigger is never sent twice.
+        The method waits until the camera is ready for a trigger, and then sends one. There is one
+        trigger at a time: a second caller waits for its turn, within its own ``timeout``. A trigger
+        is never sent twice.
 
         If the layout has an ``@sequence`` field, the number of the run is set right before the
         trigger, and only the container with this number is the result. Otherwise, over TCP, a Query
-        is sent before the trigger: containers that arrive before its answer are older. An
-        earlier trigger that was given up is settled first: its result is awaited a moment, or
-        prevented (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP without
-        ``@sequence`` a late result can pass for the next trigger's: the wire does not show it.
+        is sent before the trigger: containers that arrive before its answer are older. Before that,
+        the client handles an earlier trigger that was given up: it waits a moment for the result,
+        or prevents it (Stop, Query, Start; that Stop voids an inspection is inferred). Over UDP
+        without ``@sequence`` a late result can be mistaken for that of the next trigger: no message
+        tells them apart.
 
         Args:
             application: id, or name in ``application_names``, of the application to run for this
-                trigger. The camera returns to the present one afterwards, also after an error or a
-                cancellation. Each switch has ``switch_timeout`` of its own.
-            interpret_as: how to read this result; default as given to :func:`connect`.
+                trigger. The camera returns to the present application afterwards, also after an
+                error or a cancellation. Each of the switches may take ``switch_timeout``.
+            interpret_as: how to interpret this result; by default as given to :func:`connect`.
             input: input data for this inspection, sent right before the trigger.
-            timeout: seconds, for the turn, the readiness and the result together.
-            when_busy: ``refuse`` raises CameraBusyError instead of waiting for readiness.
-            results_per_trigger: how many results the application sends for a trigger (one for each
-                "send results" tool); they are returned as a list then. By default one is expected,
-                and more are counted as ``extra_results``.
+            timeout: seconds for the turn, the readiness and the result together.
+            when_busy: with ``refuse`` raise CameraBusyError instead of waiting for readiness.
+            results_per_trigger: number of results that the application sends for a trigger (one for
+                each "send results" tool); a list of them is returned. By default one result is
+                expected, and further ones are counted as ``extra_results``.
 
         Raises:
             ConfigurationError: an argument cannot work; nothing was sent.
             NotRunningError: the application is stopped (neither BUSY nor Running), or was stopped
                 from elsewhere during the inspection.
-            TriggerTimeoutError: no result in time; the error names the status. An application
-                that runs free never waits for a trigger and ends here, and so does a switch to
-                ``application`` that takes too long. If other callers had the camera for so long
-                that no time is left for a result, no trigger was sent.
+            TriggerTimeoutError: no result in time; the error names the status. This is also raised
+                for an application that runs free, which never waits for a trigger, and if the
+                switch to ``application`` takes too long. If other callers had the camera for so
+                long that no time is left for a result, no trigger was sent.
             OvertriggeredError: the camera dropped a trigger meanwhile.
             CameraBusyError: with ``when_busy="refuse"``.
             CameraFaultError: the camera reports System Error.
@@ -608,41 +612,41 @@ class Camera(abc.ABC, Generic[ValueT]):
                 input of an earlier trigger without a result may still be queued in the camera;
                 loading an application (:meth:`switch_application`) empties its queue (inferred).
             InterpretationError: the result does not fit its layout, or its calibration.
-            WrongApplicationError: the result is another application's, or another application is
+            WrongApplicationError: the result is of another application, or another application is
                 active than the one that was named.
             CommandRejectedError: with ``application``: the camera does not have it.
             ConnectionLostError: the link was lost; whether the camera got the trigger is unknown.
 
-        Cancellation: safe. A result still under way is never taken for the next trigger's, and
-        counted as late if it comes.
+        Cancellation: safe. A result that comes later is never taken for that of the next trigger;
+        it is counted as late.
         """
         interpretation = (
             self._default if interpret_as is None else self._interpretation(interpret_as)
         )
         owner = self.settings.name
         if application is not None:
-            application = check_application(self._named(application), owner=owner)
+            application = check_application(self._application_id(application), owner=owner)
         wait = (
             when_busy is WAIT
             or check_choice(when_busy, "when_busy", (WAIT, "refuse"), owner) == WAIT
         )
-        wanted = 1
+        result_count = 1
         if results_per_trigger is not None:
-            wanted = check_integer(
+            result_count = check_integer(
                 results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, owner
             )
         data = None if input is None else check_bytes(input, "input", owner)
         if timeout is not DEFAULT_TRIGGER_TIMEOUT:
             timeout = check_seconds(timeout, "timeout", owner)
-        request = self._usual_trigger
+        request = self._default_request
         if (
             data is not None
-            or wanted != 1
+            or result_count != 1
             or not wait
             or request.interpretation is not interpretation
         ):
-            request = TriggerRequest(interpretation, data, wanted, wait)
-        called_at = datetime.now(UTC) if self._observed else None
+            request = TriggerRequest(interpretation, data, result_count, wait)
+        called_at = datetime.now(UTC) if self._has_observers else None
         try:
             results = await self._trigger(application, request, timeout)
         except SmartCamError as error:
@@ -653,27 +657,27 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def switch_application(
         self, application: int | str, *, timeout: float | None = None
     ) -> None:
-        """Load another application; returns when the camera is ready for it.
+        """Load another application, and wait until the camera is ready.
 
-        A running application is stopped first (the camera demands it) and the new one started.
-        Results are expected from the new application from then on. After a refusal the old one
-        runs again, if it ran, before the error is raised.
+        A running application is stopped first (the camera demands it), and the new one is started.
+        From then on, results are expected from the new application. If the camera refuses, the old
+        application is started again, if it ran, before the error is raised.
 
         Args:
             application: id of the application, its name in ``application_names``, or the name of
-                its file if the camera can load by that.
-            timeout: seconds for the whole; default ``switch_timeout``.
+                its file if the camera can load an application by such a name.
+            timeout: seconds for all steps together; default ``switch_timeout``.
 
         Raises:
-            UnsupportedError: a name, to a camera that knows ids only.
+            UnsupportedError: a name was given, and the camera knows only ids.
             CommandRejectedError: the id is unknown, or 0; the error names the active id.
             ResponseTimeoutError: the camera did not answer, or stayed BUSY.
 
-        Cancellation: safe; the camera may be in either application, and stopped.
+        Cancellation: safe; the camera may have either application, and may be stopped.
         Source: SC manual p. 34 (published).
         """
         application = check_application_or_name(
-            self._named(application, file=True), owner=self.name
+            self._application_id(application, file=True), owner=self.name
         )
         limit = self._limit(timeout, self.settings.switch_timeout)
         await self._switch_application(application, limit)
@@ -682,24 +686,26 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _switch_application(self, application: int | str, timeout: float) -> None: ...
 
     def application(self, application: int | str) -> contextlib.AbstractAsyncContextManager[Self]:
-        """Run an application inside the ``async with``, then return to the one before.
+        """Run an application inside the ``async with``, then return to the previous application.
 
         Raises:
             CommandRejectedError, ResponseTimeoutError: as :meth:`switch_application`.
 
-        Cancellation: the client's supervisor finishes the return; the next call waits for it.
+        Cancellation: the return is finished in the background; the next call waits for it.
         """
-        return self._in_application(check_application(self._named(application), owner=self.name))
+        return self._in_application(
+            check_application(self._application_id(application), owner=self.name)
+        )
 
-    def _named(self, application: object, *, file: bool = False) -> object:
-        """Return the id of an application's name; anything else as it is.
+    def _application_id(self, application: object, *, file: bool = False) -> object:
+        """Return the id for an application's name; any other value unchanged.
 
         Args:
             application: the user's value.
-            file: whether an unknown name may be the name of a file.
+            file: True if an unknown name may be the name of a file.
 
         Raises:
-            ConfigurationError: there are names, and this one is not among them.
+            ConfigurationError: ``application_names`` has names, but not this one.
         """
         names = self.settings.application_names
         if not names or not isinstance(application, str) or (file and application not in names):
@@ -710,11 +716,11 @@ class Camera(abc.ABC, Generic[ValueT]):
     def _in_application(self, application: int) -> contextlib.AbstractAsyncContextManager[Self]: ...
 
     async def start(self, *, timeout: float = 10.0) -> None:
-        """Enter run mode; returns when the camera reports Running and is not BUSY.
+        """Enter run mode; return when the camera reports Running and is not BUSY.
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: the camera did not report so within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not report this within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -724,13 +730,13 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _start(self, timeout: float) -> None: ...
 
     async def stop(self, *, timeout: float = 10.0) -> None:
-        """Leave run mode; returns when the camera no longer reports Running.
+        """Leave run mode; return when the camera no longer reports Running.
 
-        An inspection under way is voided (inferred).
+        A running inspection gives no result (inferred).
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: the camera did not report so within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not report this within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -743,8 +749,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Ask the camera which application is active.
 
         Raises:
-            ResponseTimeoutError: no answer. The next request waits for the late answer first, so
-                that it is not taken for another; after ``request_timeout`` the link is dropped.
+            ResponseTimeoutError: no answer. The next request first waits for the late answer, so
+                that it is not taken for its own; after ``request_timeout`` the link is dropped.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
@@ -768,9 +774,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def _query_status(self, timeout: float) -> Status: ...
 
     async def reset_errors(self, *, timeout: float | None = None) -> Status:
-        """Clear the error bits that stay set until then; return the status after it.
+        """Clear the error bits that stay set until a reset; return the status after the reset.
 
-        :meth:`trigger` does so by itself if an earlier Trigger Error would hide its own.
+        :meth:`trigger` does this by itself if an earlier Trigger Error would hide a new one.
 
         Raises:
             UnsupportedError: the camera clears its bits by itself.
@@ -788,7 +794,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the last picture, as a file's bytes.
 
         Raises:
-            UnsupportedError: the protocol has no message for it, such as BVS.
+            UnsupportedError: the protocol, such as BVS, has no message for it.
             CommandRejectedError: the camera refused.
             ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
@@ -811,22 +817,24 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> contextlib.AbstractAsyncContextManager[FrameReader]:
         """Read the camera's frames: ``async with camera.frames() as frames``, then iterate.
 
-        The reader is a :class:`smartcam.frames.FrameReader`: it gives the newest frame, and counts
-        skipped and lost frames. The device streams while there is a reader, and the bus carries
-        one frame at a time for each reader.
+        The reader is a :class:`smartcam.frames.FrameReader`: it returns the newest frame, and
+        counts skipped and lost frames. The device streams while there is a reader. Only one frame
+        at a time is sent to each reader.
 
         Only a camera of a fleet has frames, if its entry in the fleet file has ``frames``.
 
         Args:
-            encoding: ``raw``, as the device gives them; ``jpeg``; or ``png`` and ``jpegxl``,
-                without loss. Frames stay encoded until their pixels are read. ``h264`` is decoded
-                here, and only whole pictures are given.
+            encoding: ``raw`` for frames as the device sends them; ``jpeg``; or ``png`` and
+                ``jpegxl``, without loss. Frames stay encoded until their pixels are read. ``h264``
+                is decoded here, and only whole pictures are returned.
             quality: quality of JPEG, 1 to 100.
-            bitrate: bits per second that JPEGs are limited to, first by quality, then by frame rate
-                (each frame's ``rate`` says how); for H.264 the bit rate of its encoder.
-            latency: seconds from a JPEG's capture to its arrival, limited in the same way.
-            decode: False: give H.264 frames encoded. A reader that skips one has no picture until
-                the next key frame.
+            bitrate: largest number of bits per second of JPEGs: first their quality is reduced for
+                it, then the frame rate (each frame's ``rate`` says how); for H.264 the bit rate of
+                its encoder.
+            latency: largest number of seconds from a JPEG's capture to its arrival, kept in the
+                same way.
+            decode: False: return H.264 frames encoded. A reader that skips a frame has no picture
+                until the next key frame.
             timeout: seconds that an iteration waits for a frame; None: without limit.
 
         Raises:
@@ -854,8 +862,8 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             max_age: largest age of the frame in seconds; ``inf``: any age.
-            encoding: as :meth:`frames` has it.
-            quality: as :meth:`frames` has the argument.
+            encoding: as for :meth:`frames`.
+            quality: as for :meth:`frames`.
             timeout: seconds.
 
         Raises:
@@ -879,14 +887,14 @@ class Camera(abc.ABC, Generic[ValueT]):
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
     ) -> FleetFrame:
-        """Return the first frame whose exposure began after a moment, or after this call.
+        """Return the first frame whose exposure began after ``moment``, or after this call.
 
-        If clocks or the source leave a doubt, return the first frame that is surely late enough.
+        If clocks or the source make that uncertain, return the first frame that certainly did.
 
         Args:
-            moment: time of ``time.monotonic()``; None: now.
-            encoding: as :meth:`frames` has it.
-            quality: as :meth:`frames` has the argument.
+            moment: a time of ``time.monotonic()``; None: now.
+            encoding: as for :meth:`frames`.
+            quality: as for :meth:`frames`.
             timeout: seconds.
 
         Raises:
@@ -917,26 +925,26 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Keep the commands of other programs out while the body of the block runs.
 
         Other programs wait within their own timeouts, and then fail with an error that names this
-        program. The reservation ends with the block or with this program; if the program is killed
-        or cut off, within the lease of the engine. The tasks of this program use the camera as
-        before, and may reserve it, too.
+        program. The reservation ends with the block or with this program. If the program is killed
+        or cut off, it ends after the lease time of the bus at the latest. The tasks of this program
+        use the camera as before, and may reserve it, too.
 
-        Only a camera of a fleet can be reserved: one at the wire serves one client, and the
-        newcomer wins.
+        Only a camera of a fleet can be reserved. A camera without a fleet serves one client, and a
+        new client takes it from the old one.
 
         Args:
-            timeout: seconds to wait for the reservation; earlier ones come first.
+            timeout: seconds to wait for the reservation; earlier requests come first.
 
-        A reservation may be lost before: its agent ends or is restarted, another agent takes the
-        camera over, this program was cut off or stopped for longer than the lease. Then every
-        command of this object is refused until the block has ended, and so is the block's end,
-        unless the block raises another error.
+        A reservation may be lost before the block ends: its agent ends or is restarted, another
+        agent takes over the camera, or this program was cut off or stopped for longer than the
+        lease. Then every command of this object raises ReservationLostError until the block has
+        ended. The end of the block raises it, too, unless the block raises another error.
 
         Raises:
             UnsupportedError: the camera is not in a fleet.
             ResponseTimeoutError: another program has the camera; the error names it.
             ConnectionLostError: the agent is away, or was restarted meanwhile.
-            ReservationLostError: at the end of the block: it was, or may have been, lost.
+            ReservationLostError: the reservation was lost, or may have been lost.
 
         Cancellation: safe; the reservation is given back.
         """
@@ -948,14 +956,14 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def take_back(self, *, timeout: float | None = None) -> None:
         """Make the agent take the camera back from another client, and wait for the session.
 
-        By itself an agent tries a camera that was taken again after 30 s, then less and less often.
-        Do nothing if the agent has a session.
+        By itself an agent tries to get a taken camera back after 30 s, then less and less often.
+        This method does nothing if the agent has a session.
 
         Args:
             timeout: seconds, ``request_timeout`` by default.
 
         Raises:
-            UnsupportedError: the camera is not in a fleet; a new connection takes it.
+            UnsupportedError: the camera is not in a fleet; a new connection takes it back.
             LinkError: there is no agent.
             ResponseTimeoutError: there was no session within ``timeout``.
         """
@@ -1007,8 +1015,8 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def set_input(self, data: bytes) -> None:
         """Send input data for the next inspection; only result codes confirm it.
 
-        ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
-        inspections; the Input Container bit shows that they are out of step.
+        ``trigger(input=...)`` sends the data of its own trigger. The camera queues input containers
+        for its inspections; the Input Container bit shows that their numbers differ.
         """
         await self._set_input(check_bytes(data, "data", self.name))
 
@@ -1018,14 +1026,14 @@ class Camera(abc.ABC, Generic[ValueT]):
     async def set_sequence_number(self, number: int) -> None:
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
-        If the layout has an ``@sequence`` field, :meth:`trigger` uses this number for the next run;
-        otherwise it picks numbers of its own there. A run that is triggered by something else in
-        between would use this number: then leave the numbers to :meth:`trigger`.
+        If the layout has an ``@sequence`` field, the next :meth:`trigger` uses this number; without
+        this call, :meth:`trigger` chooses its own numbers. If something else triggers a run before,
+        that run gets this number: then do not call this method.
 
         Raises:
             ConfigurationError: the number has more than 32 bits.
             UnsupportedError: the dialect has no such request (``bid``).
-            LocalProtocolError: the dialect's own field is narrower, and the number does not fit.
+            LocalProtocolError: the dialect's field is too small for the number.
         """
         number = check_integer(number, "number", 0, MAX_SEQUENCE_NUMBER, self.name)
         await self._set_sequence_number(number)
@@ -1035,7 +1043,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     async def reboot(self) -> None:
-        """Restart the camera; returns when the session is over.
+        """Restart the camera; return when the session has ended.
 
         The camera is away for about 30 seconds then (published for a sibling) and comes back with
         the last application, stopped. :meth:`wait_connected` waits for it.
@@ -1054,12 +1062,12 @@ class Camera(abc.ABC, Generic[ValueT]):
         answered: bool | None = None,
         timeout: float | None = None,
     ) -> bytes | None:
-        """Send any message; for requests that have no method here.
+        """Send any message; for requests without a method of their own.
 
         Args:
             message_id: id of the message; a command's text if the protocol has commands.
             payload: body of the message.
-            answered: whether to wait for an answer under the same id; default: as in the
+            answered: True to wait for an answer with the same id; default: as in the
                 message table, True for an unknown id.
             timeout: seconds for the answer.
 
@@ -1088,14 +1096,14 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     # ------------------------------------------------------------------ small helpers
 
-    def _limit(self, timeout: float | None, usual: float) -> float:
-        """Return a call's timeout in seconds: the given one, or the usual one."""
-        return usual if timeout is None else check_seconds(timeout, "timeout", self.name)
+    def _limit(self, timeout: float | None, default: float) -> float:
+        """Return the timeout of a call in seconds: as given, or the default."""
+        return default if timeout is None else check_seconds(timeout, "timeout", self.name)
 
     def _check_form(
         self, encoding: str, quality: int | None, encodings: Collection[str]
     ) -> FrameRequest:
-        """Return the encoding and quality of frames; the agent checks whether they go together."""
+        """Check an encoding and a quality; the agent checks whether they fit together."""
         if quality is not None:
             quality = check_integer(quality, "quality", 1, 100, self.name)
         encoding = check_choice(encoding, "encoding", STREAM_ENCODINGS, self.name)
@@ -1108,7 +1116,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     def _check_rate(
         self, bitrate: float | None, latency: float | None
     ) -> tuple[float | None, float | None]:
-        """Return the limits of a stream's bit rate and latency, checked."""
+        """Check the limits of a stream's bit rate and latency."""
         if bitrate is not None:
             bitrate = check_number(bitrate, "bitrate", 1e3, 1e11, self.name)
         if latency is not None:
@@ -1124,9 +1132,9 @@ class Camera(abc.ABC, Generic[ValueT]):
         return self.settings.address
 
     def _read_by(self, spec: object) -> None:
-        """Read results by ``spec`` from now on; None: by the settings.
+        """Interpret results by ``spec`` from now on; None: by the settings.
 
-        Every user of this object gets results that are read so.
+        This holds for every user of this object.
 
         Raises:
             ConfigurationError: ``spec`` is not valid, or does not fit the calibration.
@@ -1140,24 +1148,24 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Args:
             spec: as ``interpret_as``.
-            of_camera: whether ``spec`` is the camera's own setting, next to its calibration.
+            of_camera: True if ``spec`` is the camera's setting, which its calibration has to fit.
 
         Raises:
             ConfigurationError: ``spec`` is not valid, or does not fit the calibration.
         """
         if isinstance(spec, Interpretation):
             return spec
-        known = self._interpretations.get(spec) if isinstance(spec, str) else None
-        if known is not None:
-            return known
+        cached = self._interpretations.get(spec) if isinstance(spec, str) else None
+        if cached is not None:
+            return cached
         lenient, y_down = self.settings.lenient, self.settings.y_down
         calibration = self.settings.calibration
-        made = Interpretation(
+        interpretation = Interpretation(
             spec, lenient=lenient, y_down=y_down, calibration=calibration, own=of_camera
         )
         if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
-            self._interpretations[spec] = made
-        return made
+            self._interpretations[spec] = interpretation
+        return interpretation
 
     async def _await_next(
         self, future: asyncio.Future[Result], deadline: float, timeout: float
@@ -1174,13 +1182,13 @@ class Camera(abc.ABC, Generic[ValueT]):
             ) from exc
 
     def _subscribed(self, subscribers: Subscribers[Any], queue: QueueT) -> QueueT:
-        """Offer a queue all new items; end it at once if none will come."""
-        over = self._over()
-        if over is not None:
-            queue.end(over[0])
+        """Add a queue to the subscribers; end it at once if no more items will come."""
+        end = self._end_of_streams()
+        if end is not None:
+            queue.end(end[0])
         queue.keep(self)
         subscribers.add(queue)
-        self._listens(subscribers)
+        self._on_listener_added(subscribers)
         return queue
 
 

@@ -107,27 +107,27 @@ class SmartCamera(Camera[ValueT]):
     def _deadline(self, timeout: float) -> float:
         return self._connection.deadline(timeout)
 
-    def _listens(self, subscribers: object) -> None:
-        self._status.wanted()
+    def _on_listener_added(self, subscribers: object) -> None:
+        self._status.start_polling()
 
-    def _abandoned(self) -> bool:
+    def _release_unreferenced(self) -> bool:
         supervisor: Supervisor | None = getattr(self, "_supervisor", None)
         return supervisor is not None and supervisor.abandon()
 
-    def _over(self) -> tuple[SmartCamError | None] | None:
-        end = self._waits.end
-        if end is None or not self._supervisor.over:  # between sessions, streams wait for the next
-            return None
+    def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
+        end = self._waits.end_reason
+        if end is None or not self._supervisor.has_ended:
+            return None  # between two sessions, streams wait for the next one
         return (None if isinstance(end, ConnectionClosedError) else end,)
 
     async def open(self) -> Self:
-        if self._supervisor.started or self._waits.end is not None:
+        if self._supervisor.started or self._waits.end_reason is not None:
             raise LocalProtocolError(f"{self.name}: opened or closed before; make a new one")
         try:
             await self._supervisor.open()
             if self.settings.application is not None:
                 async with self._lock.hold(self.settings.switch_timeout) as deadline:
-                    await self._commands.ensure(self.settings.application, deadline)
+                    await self._commands.ensure_running(self.settings.application, deadline)
         except BaseException:
             await self.close()
             raise
@@ -173,7 +173,7 @@ class SmartCamera(Camera[ValueT]):
         deadline = self._connection.deadline(timeout)
         self._connection.require_link()
         await self._status.refresh(deadline)
-        return await self._status.until(predicate, deadline, "the status wanted", insist=False)
+        return await self._status.until(predicate, deadline, "the status wanted", asks_again=False)
 
     async def _wait_ready(self, timeout: float) -> Status:
         deadline = self._connection.deadline(timeout)
@@ -190,31 +190,31 @@ class SmartCamera(Camera[ValueT]):
             if application is not None:
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline, timeout)
-            deadline = self._connection.in_seconds(timeout)
-            await lock.turn(deadline, timeout)  # same effect as hold(), without an object
+            deadline = self._connection.unchecked_deadline(timeout)
+            await lock.wait_for_turn(deadline, timeout)  # same effect as hold(), without an object
             try:
                 return await triggers.trigger(request, deadline, timeout)
             finally:
-                lock.give_back()
+                lock.release_turn()
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 
     async def _switch_application(self, application: int | str, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
-            self._commands.load_request(application)
+            self._commands.make_load_request(application)
             await self._status.refresh(deadline)
-            await self._commands.switch(application, deadline, start=self._commands.runs)
+            await self._commands.switch(application, deadline, start=self._commands.is_in_run_mode)
 
     @contextlib.asynccontextmanager
     async def _in_application(self, application: int) -> AsyncGenerator[Self]:
         async with self._lock.hold(self.settings.switch_timeout) as deadline:
-            before = await self._lock.enter(application, deadline)
+            state_before = await self._lock.enter_application(application, deadline)
         try:
             yield self
         except BaseException:
-            self._lock.leave(before)
+            self._lock.go_back(state_before)
             raise
-        await self._lock.leave_and_wait(before)
+        await self._lock.go_back_and_wait(state_before)
 
     async def _start(self, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
@@ -225,7 +225,7 @@ class SmartCamera(Camera[ValueT]):
             await self._commands.stop(deadline)
 
     def _query_application(self, timeout: float) -> Coroutine[Any, Any, int]:
-        return self._commands.query(self._connection.in_seconds(timeout))
+        return self._commands.query_application(self._connection.unchecked_deadline(timeout))
 
     async def _query_status(self, timeout: float) -> Status:
         self._connection.require(m.GetStatus)
@@ -277,7 +277,7 @@ class SmartCamera(Camera[ValueT]):
 
     async def _set_sequence_number(self, number: int) -> None:
         await self._send(m.SetSequenceNumber(number=number))
-        self._triggers.give_number(number)
+        self._triggers.set_next_number(number)
 
     async def reboot(self) -> None:
         link = self._connection.require_link()

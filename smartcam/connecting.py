@@ -93,7 +93,7 @@ def connect(
             (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
             are inspected in this process, by a cell file (:mod:`smartcam.inspection`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
-        observers: objects that see frames, events, results and errors:
+        observers: objects that are called with frames, events, results and errors:
             :class:`~smartcam.Observer`.
         **options: ``name``, ``application``, ``application_names``,
             ``interpret_as``, ``calibration``, ``y_down``,

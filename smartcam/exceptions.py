@@ -47,8 +47,8 @@
     └── InterpretationError (ValueError)       field, offset, expected, got; the link stays up
         └── WrongApplicationError              the result is another application's: both ids
 
-All of them survive ``pickle``. Texts name the attempt, the received value and the expected one; at
-most 64 bytes of a peer's data stand in a text.
+All errors can be pickled. Texts name the attempt, the received and the expected value; they have at
+most 64 bytes of a peer's data.
 """
 
 from __future__ import annotations
@@ -276,7 +276,7 @@ class NotAllowedError(SmartCamError, PermissionError):
 
 
 class ReservationLostError(SmartCamError):
-    """A reservation ended, or may have ended, before its block; others may have come between.
+    """A reservation ended, or may have ended, before its block; others may have used the camera.
 
     A command that raises this error was not carried out.
     """
@@ -352,7 +352,7 @@ class EntryRefusedError(OutletError):
     """The far end of an outlet will never take one of the entries.
 
     Attributes:
-        place: place of the entry among those delivered; the entries before it were taken.
+        place: index of the entry among the entries to deliver; the entries before it were taken.
     """
 
     def __init__(self, message: str = "", *, place: int = 0) -> None:
@@ -413,7 +413,7 @@ class CameraBusyError(TriggerError):
 
 
 class InputContainerError(TriggerError):
-    """Input data and inspections are out of step (Input Container bit)."""
+    """The numbers of input containers and of inspections differ (Input Container bit)."""
 
 
 class FrameLostError(TriggerError):

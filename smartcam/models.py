@@ -1,7 +1,7 @@
 """Public values: the camera's data, and the values made of them.
 
-They are NamedTuples, slots dataclasses and an ``IntFlag``: cheap to make, immutable if many
-readers share them, and turned to JSON by :func:`jsonable` with their field names.
+They are NamedTuples, dataclasses with slots and an ``IntFlag``: cheap to make, and immutable if
+many readers share them. :func:`jsonable` makes JSON of them, with their field names.
 Lengths are metres, angles radians, times seconds unless a name has another unit.
 """
 
@@ -84,8 +84,8 @@ class Status(enum.IntFlag):
     def _missing_(cls, value: object) -> Any:
         """Make the member for a word with unnamed bits, without keeping it.
 
-        ``enum`` keeps every word it has seen: up to four thousand million of them, as the peer
-        likes.
+        ``enum`` would keep every word that it has made, and the peer may send up to four thousand
+        million different ones.
         """
         if not isinstance(value, int) or value < 0 or not value & ~_NAMED_BITS:
             return super()._missing_(value)
@@ -175,12 +175,12 @@ class Quaternion(NamedTuple):
 
 
 class Header(NamedTuple):
-    """The place and time at which a pose was seen.
+    """The frame of a pose, and the time at which it arrived.
 
     Attributes:
         seq: the client's count of results (:attr:`Result.number`).
         stamp: time of arrival, UTC.
-        frame_id: name of the frame the pose is given in; the camera's name.
+        frame_id: name of the frame in which the pose is given: the camera's name.
     """
 
     seq: int
@@ -268,7 +268,7 @@ class Localization(NamedTuple):
         feature_id: name of the taught feature.
         quality: 0 to 1.
         photo_index: index of the photo it was found in.
-        pose: place of the part: x right, y up, theta counter-clockwise. ``pose.sigma`` is the
+        pose: pose of the part: x right, y up, theta counter-clockwise. ``pose.sigma`` is the
             error that the pose may have, if the camera sends it.
     """
 
@@ -282,7 +282,7 @@ class Localization(NamedTuple):
 
 
 class Calibration(Protocol):
-    """An object that brings localizations into a robot's frame.
+    """An object that transforms localizations into a robot's frame.
 
     The option ``calibration`` takes any object with this method, such as a
     :class:`~smartcam.calibration.PlaneCalibration`. If it has an attribute ``y_down`` that is not
@@ -486,14 +486,14 @@ class SubscriberStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """The number of times in each of a row of bins.
+    """A histogram of durations.
 
     Attributes:
-        bounds: upper bounds of the bins, seconds, each included; a last bin has none.
-        counts: number of times in each bin; one more than bounds.
-        total: sum of all times, seconds.
-        shortest: the shortest time, seconds; None before the first.
-        longest: the longest time, seconds; None before the first.
+        bounds: upper bounds of the bins, seconds, each included; the last bin has no bound.
+        counts: number of durations in each bin; one more item than ``bounds``.
+        total: sum of all durations, seconds.
+        shortest: the shortest duration, seconds; None before the first.
+        longest: the longest duration, seconds; None before the first.
     """
 
     bounds: tuple[float, ...]
@@ -504,7 +504,7 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """Number of all values."""
+        """Number of all durations."""
         return sum(self.counts)
 
 
@@ -520,9 +520,9 @@ def _empty_histogram() -> Histogram:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistics:
-    """Everything counted since the client was made, over all its sessions.
+    """The counts since the client was made, over all its sessions.
 
-    Each result container that arrives has exactly one fate, so ``received == triggered +
+    Each result container that arrives is counted in exactly one way, so ``received == triggered +
     streamed + late + wrong_application + uninterpretable + unclaimed``.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""The interface for monitoring tools: one class, no dependencies."""
+"""The interface for monitoring tools: one class to derive from, without dependencies."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _FAILED = "! an observer failed: %r"
 
 
 class TraceEntry(NamedTuple):
-    """One frame as ``--trace`` writes it.
+    """One decoded frame, as ``--trace`` writes it.
 
     Attributes:
         at: time, UTC.
         camera: name of the camera.
-        direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
-            unfinished frame when the link ended.
-        message_id: id on the wire, None for broken bytes, and if the protocol has no ids.
+        direction: ``>`` out, ``<`` in, ``!`` for broken bytes: they broke the protocol, or are part
+            of a frame that was unfinished when the link ended.
+        message_id: id on the wire; None for broken bytes, and if the protocol has no ids.
         message: name of the message, or the error's text for broken bytes.
         fields: decoded body, None if it cannot be decoded.
         hex: the bytes.
@@ -53,14 +53,14 @@ class TraceEntry(NamedTuple):
 
 
 class RawFrame(NamedTuple):
-    """One frame as it went over the wire, not yet decoded.
+    """One frame that went over the wire, not yet decoded.
 
     Attributes:
         at: time, UTC; frames that came or went together share it.
         camera: name of the camera.
         dialect: dialect that the frame is decoded in.
         sender: side that sent the frame.
-        frame: the frame; for bytes that make no frame, their entry.
+        frame: the frame; for broken bytes, a TraceEntry.
     """
 
     at: datetime
@@ -76,7 +76,7 @@ class RawFrame(NamedTuple):
         return len(frame.hex) // 2 if isinstance(frame, TraceEntry) else len(frame.payload)
 
     def entry(self) -> TraceEntry:
-        """Return the frame decoded; in any thread."""
+        """Decode the frame; any thread may call this."""
         frame = self.frame
         if isinstance(frame, TraceEntry):
             return frame
@@ -86,7 +86,7 @@ class RawFrame(NamedTuple):
 
 
 class Observer:
-    """Base of classes that observe a client; override the methods of interest.
+    """Base of classes that observe a client; a subclass overrides the methods that it needs.
 
     Give one or more to :func:`smartcam.connect` (``observers=[...]``). They are called in the
     event loop, in order, and must return at once; errors that one raises are only logged.
@@ -124,11 +124,11 @@ class Observer:
     def on_result(self, result: Result) -> None:
         """Handle an interpreted result: for a trigger, a stream or ``next_result()``.
 
-        Results that came together are counted and interpreted before the first call, and statuses
-        between them may be reported after the last one.
+        Results that came together are counted and interpreted before the first call. A status that
+        came between them may be reported after the last result.
 
-        The result of a trigger has ``triggered_at`` and ``latency``. A container without a caller
-        or a subscriber is counted and not interpreted.
+        The result of a trigger has ``triggered_at`` and ``latency``. A container that no
+        caller and no subscriber waits for is counted, but not interpreted.
         """
 
     def on_results(self, results: Sequence[Result]) -> None:
@@ -143,7 +143,7 @@ class Observer:
     def on_picture(self, result: Result, frame: Picture) -> None:
         """Handle the picture that a result was made of, right before the result.
 
-        Only software cameras have it and call this.
+        Only software cameras have such pictures, and call this.
         """
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
@@ -153,7 +153,7 @@ class Observer:
             camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
                link, a reconnect that failed.
-            triggered_at: when ``trigger()`` was called, UTC; None if the error ended no trigger.
+            triggered_at: time of the call of ``trigger()`` that failed, UTC; None if none did.
         """
 
 
@@ -164,46 +164,47 @@ class Observers:
         observers: observers in the order in which they are called.
 
     Attributes:
-        see_states: whether an observer handles events.
-        see_results: whether an observer handles results.
-        see_each: whether an observer handles single results.
-        see_pictures: whether an observer handles the pictures of results.
+        see_states: True if an observer handles events.
+        see_results: True if an observer handles results, single or together.
+        see_single_results: True if an observer handles single results.
+        see_pictures: True if an observer handles the pictures of results.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
         self._all: tuple[Observer, ...] = ()
         self._on_state: tuple[Callable[..., None], ...] = ()
+        # each hook for results, and whether it takes several at once
         self._on_result: list[tuple[Callable[..., None], bool]] = []
         self._on_picture: tuple[Callable[..., None], ...] = ()
         self.see_pictures: bool = False
         self.see_states: bool = False
         self.see_results: bool = False
-        self.see_each: bool = False
+        self.see_single_results: bool = False
         if type(observers) is not tuple or observers:
-            self._take(observers)
+            self._add_observers(observers)
 
-    def _take(self, observers: Iterable[Observer]) -> None:
+    def _add_observers(self, observers: Iterable[Observer]) -> None:
         self._all = check_all(observers, "observers", "a list of observers")
         for observer in self._all:
             hooks = (getattr(observer, hook, None) for hook in _HOOKS)
             if isinstance(observer, type) or not all(map(callable, hooks)):
                 raise wrong_argument("observers", "objects of classes of Observer", observer)
         self._on_state = self._overriding("on_state")
-        seen = self._looking_at("on_results", "on_result")
-        self._on_result = [(hook, name == "on_results") for hook, name in seen]
+        result_hooks = self._overridden_hooks("on_results", "on_result")
+        self._on_result = [(hook, name == "on_results") for hook, name in result_hooks]
         self._on_picture = self._overriding("on_picture")
         self.see_pictures = bool(self._on_picture)
         self.see_states = bool(self._on_state)
         self.see_results = bool(self._on_result)
-        self.see_each = not all(together for _, together in self._on_result)
+        self.see_single_results = not all(takes_several for _, takes_several in self._on_result)
 
     def __bool__(self) -> bool:
         return bool(self._all)
 
     @property
     def trace(self) -> Callable[[Sequence[RawFrame]], None] | None:
-        """Function to call with frames that came or went together; None if nobody wants any."""
-        hooks = list(self._looking_at("on_raw_frames", "on_raw_frame", "on_frame"))
+        """Function to call with frames that came or went together; None without such observers."""
+        hooks = list(self._overridden_hooks("on_raw_frames", "on_raw_frame", "on_frame"))
         if not hooks:
             return None
 
@@ -230,12 +231,12 @@ class Observers:
 
     def result(self, result: Result) -> None:
         """Report a result to all observers."""
-        for hook, together in self._on_result:
-            self._call(hook, (result,) if together else result)
+        for hook, takes_several in self._on_result:
+            self._call(hook, (result,) if takes_several else result)
 
     def results(self, results: Sequence[Result]) -> None:
         """Report results that came together; one by one if an observer wants single results."""
-        if self.see_each:
+        if self.see_single_results:
             for _ in self.each(results):
                 pass
             return
@@ -243,12 +244,12 @@ class Observers:
             self._call(hook, results)
 
     def each(self, results: Sequence[Result]) -> Iterator[Result]:
-        """Report results one by one, and yield each when all observers have seen it."""
+        """Report results one by one, and yield each after all observers were called with it."""
         hooks = self._on_result
         for result in results:
-            for hook, together in hooks:
+            for hook, takes_several in hooks:
                 try:
-                    hook((result,) if together else result)
+                    hook((result,) if takes_several else result)
                 except ENDS_PROGRAM:
                     raise
                 except BaseException:  # an observer must not end the receive task
@@ -272,10 +273,11 @@ class Observers:
         hooks = [_own_hook(observer, name) for observer in self._all]
         return tuple(hook for hook in hooks if hook is not None)
 
-    def _looking_at(self, *names: str) -> Iterator[tuple[Callable[..., None], str]]:
-        """Yield the overridden one of several methods of each observer, and its name.
+    def _overridden_hooks(self, *names: str) -> Iterator[tuple[Callable[..., None], str]]:
+        """Yield one overridden method of each observer, and its name; nothing if it overrides none.
 
-        The method that is overridden last counts; the first one of those that a class overrides.
+        Of several overridden methods, it is the one of the most derived class; of several in one
+        class, the first in ``names``.
         """
         for observer in self._all:
             hooks = [
@@ -296,14 +298,14 @@ class Observers:
 
 
 def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:
-    """Return a method that an observer overrides; None if it does not."""
+    """Return an observer's method if it overrides the method of Observer, else None."""
     hook: Callable[..., None] | None = getattr(observer, name, None)
     return None if getattr(hook, "__func__", None) is getattr(Observer, name) else hook
 
 
 def _depth(observer: Observer, name: str) -> int:
-    """Return the index of the class that defines a method; -1 for the object itself."""
+    """Return the index in the MRO of the class that defines a method; -1: the object itself."""
     if name in getattr(observer, "__dict__", ()):
         return -1
     classes = type(observer).__mro__
-    return next((at for at, class_ in enumerate(classes) if name in vars(class_)), len(classes))
+    return next((i for i, class_ in enumerate(classes) if name in vars(class_)), len(classes))

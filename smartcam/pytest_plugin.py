@@ -39,16 +39,19 @@ __all__ = ["camera", "emulated_camera", "emulated_fleet"]
 PROTOCOL = "bvs"
 """The default protocol of the emulated camera."""
 
-TO_CAMERA = frozenset({"protocol", "manual_clock"})
+FORWARDED_OPTIONS = frozenset({"protocol", "manual_clock"})
+"""Options of the marker itself that the emulated camera gets, too."""
 
-OWN = TO_CAMERA | frozenset({"application", "interpret_as", "connect", "cameras"})
-"""Options of the marker that are its own; the others are the emulated camera's."""
+MARKER_OPTIONS = FORWARDED_OPTIONS | frozenset(
+    {"application", "interpret_as", "connect", "cameras"}
+)
+"""Options of the marker itself; all others are options of the emulated camera."""
 
 FLEET_OPTIONS = frozenset({"scenario", "quirks", "dialect", "transport"})
-"""Options of the marker that an emulated fleet takes, beside ``cameras``."""
+"""Options of the marker that an emulated fleet gets."""
 
-CAMERAS = 2
-"""Number of cameras of an emulated fleet by default."""
+DEFAULT_CAMERA_COUNT = 2
+"""Number of cameras of an emulated fleet if the marker gives none."""
 
 MARKER = (
     "smartcam(application=None, interpret_as=None, connect={}, cameras=2, protocol='bvs', "
@@ -97,12 +100,16 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 
     given = _given_options(request)
     protocol = given.get("protocol", PROTOCOL)
-    options = {key: value for key, value in given.items() if key not in OWN or key in TO_CAMERA}
+    options = {
+        key: value
+        for key, value in given.items()
+        if key not in MARKER_OPTIONS or key in FORWARDED_OPTIONS
+    }
     application = given.get("application")
     if application is not None:
         options = {**emulated_class(protocol).state_options(application, running=True), **options}
     with contextlib.ExitStack() as stack:
-        yield _made(lambda: stack.enter_context(ThreadedCamera(**options)))
+        yield _make_or_fail(lambda: stack.enter_context(ThreadedCamera(**options)))
 
 
 @pytest.fixture
@@ -117,23 +124,23 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
         application = given.get("application")
         scenarios = [
             _scenario(given.get("protocol", PROTOCOL), application, number)
-            for number in range(1, 1 + given.get("cameras", CAMERAS))
+            for number in range(1, 1 + given.get("cameras", DEFAULT_CAMERA_COUNT))
         ]
     with contextlib.ExitStack() as stack:
-        yield _made(lambda: stack.enter_context(ThreadedFleet(scenarios, **options)))
+        yield _make_or_fail(lambda: stack.enter_context(ThreadedFleet(scenarios, **options)))
 
 
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
-    """Return a camera of a fleet, with a running application if the camera can have one."""
+    """Return the scenario of a camera of a fleet, with a running application if it can have one."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
-    able = emulated_class(protocol).state_options(application, running=True)
+    state = emulated_class(protocol).state_options(application, running=True)
     return Scenario(
         name=f"camera{number}",
         protocol=protocol,
-        active=application if able else None,
-        running=bool(able) and application is not None,
+        active=application if state else None,
+        running=bool(state) and application is not None,
         seed=number,
     )
 
@@ -143,7 +150,7 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> C
     """A client of the emulated camera, connected while an asynchronous test runs.
 
     The client is opened in the test's own task right before the test, and closed right after it.
-    So it uses the event loop of the test, whichever plugin made that. A fixture that needs the
+    So it uses the event loop of the test, whichever plugin made the loop. A fixture that needs the
     client earlier opens it with ``await camera``.
     """
     from smartcam.connecting import connect
@@ -155,20 +162,20 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> C
         **given.get("connect", {}),
     }
     given = {key: value for key, value in options.items() if value is not None}
-    client = _made(lambda: connect(emulated_camera.url, **given))
+    client = _make_or_fail(lambda: connect(emulated_camera.url, **given))
     request.node.stash[_CLIENT] = client
     return client
 
 
-def _made(make: Callable[[], T]) -> T:
-    """Return the object made; a marker with an impossible option fails the test with its text."""
+def _make_or_fail(make: Callable[[], T]) -> T:
+    """Call ``make``; if the marker has a wrong option, fail the test with the error's text."""
     from smartcam.exceptions import SmartCamError
 
     try:
         return make()
     except (SmartCamError, TypeError, OSError) as exc:
-        wrong = f"the marker smartcam: {exc}"
-    pytest.fail(wrong, pytrace=False)  # outside of the except block, which pytest would show
+        text = f"the marker smartcam: {exc}"
+    pytest.fail(text, pytrace=False)  # outside of the except block, which pytest would show
 
 
 def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
@@ -178,7 +185,7 @@ def _given_options(request: pytest.FixtureRequest) -> dict[str, Any]:
         if marker.args:
             pytest.fail("the marker smartcam takes names only: application=7", pytrace=False)
         given |= marker.kwargs
-    known = OWN | _options(given)
+    known = MARKER_OPTIONS | _options(given)
     unknown = sorted(given.keys() - known)
     if unknown:
         from smartcam._suggestions import did_you_mean
@@ -206,7 +213,7 @@ def _options(given: dict[str, Any]) -> frozenset[str]:
 
 
 def _scenario_path(request: pytest.FixtureRequest, given: str | Path) -> Path:
-    """Return a scenario's path: beside the test, below the project's root, or as given."""
+    """Return a scenario's path: in the test's folder, below the project's root, or as given."""
     folders = (request.path.parent, request.config.rootpath)
     paths = (folder / given for folder in folders)
     return next((path for path in paths if path.exists()), Path(given))
@@ -235,7 +242,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, None]:
 
 
 def _with_client(test: Callable[..., Any], client: Camera) -> Callable[..., Any]:
-    """Return the test with the client open around it, in its own event loop and task."""
+    """Return the test with the client opened and closed around it, in its own loop and task."""
 
     @functools.wraps(test)
     async def with_client(*args: Any, **kwargs: Any) -> Any:

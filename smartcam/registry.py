@@ -1,8 +1,8 @@
 """Find plug-ins by name: built-ins and entry points in one place.
 
-Names are listed without importing anything, a plug-in is loaded when it is first asked for, and a
-broken plug-in makes only its own name unusable. A distribution whose metadata cannot be read loses
-only its own plug-ins; the log names it.
+Names are listed without importing anything, and a plug-in is loaded at its first use. A broken
+plug-in makes only its own name unusable. If the metadata of a distribution cannot be read, only its
+own plug-ins are missing; the log names it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Registry:
         aliases: other accepted names of built-ins.
 
     Attributes:
-        revision: number that changes when a plug-in is registered, or a search begins anew.
+        revision: number that changes when a plug-in is registered, and at :meth:`refresh`.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Registry:
         return self._points_found
 
     def _load(self, name: str) -> object:
-        if name in self._builtins:  # without a slow look at the installed packages
+        if name in self._builtins:  # without a slow search of the installed packages
             module, _, attribute = self._builtins[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
         points = self._entry_points().get(name, [])
@@ -153,16 +153,16 @@ def _distribution(point: EntryPoint) -> str:
 
 
 def _points(group: str) -> Iterator[EntryPoint]:
-    """Yield the entry points of a group; for a distribution found twice, the first one's."""
+    """Yield the entry points of a group; a distribution that is found twice counts once."""
     distributions = [(each, _entry_points_text(each)) for each in _distributions()]
     if not any(text is None or group in text for _, text in distributions):
-        return  # the usual case; names are slow to read
+        return  # the usual case; to read names is slow
     seen: set[str] = set()
     for distribution, text in distributions:
         try:
             name = _key(distribution)
-            wanted = name not in seen and (text is None or group in text)
-            points = list(distribution.entry_points.select(group=group)) if wanted else []
+            is_wanted = name not in seen and (text is None or group in text)
+            points = list(distribution.entry_points.select(group=group)) if is_wanted else []
             seen.add(name or str(id(distribution)))
         except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
             _log.warning(

@@ -42,21 +42,21 @@ if TYPE_CHECKING:
 __all__ = ["CameraOptions", "CameraSettings"]
 
 FLEET_SCHEMES = ("fleet", "fleet+tls")
-"""URL schemes of cameras that an agent shares."""
+"""URL schemes of cameras in a fleet, which an agent shares."""
 
 M = TypeVar("M", bound="BaseModel")
 
 
 class Address(NamedTuple):
-    """The address of a camera, and the known facts about its protocol.
+    """The address of a camera, and the parts of its protocol that are fixed in advance.
 
     Attributes:
         protocol: name of the protocol.
         scheme: scheme of the URL, which decides the transport.
         host: name or address of the camera.
         port: port of the camera.
-        dialect: pinned dialect, None to find it out.
-        quirks: pinned deviations from the dialect.
+        dialect: the dialect; None if the client has to find it.
+        quirks: the camera's deviations from the dialect.
         parameters: other parts of the URL by name, which the protocol interprets. They include
             ``user`` and ``password`` if the protocol has a login.
         path: part of the URL after the host: a camera's name in a fleet.
@@ -73,7 +73,7 @@ class Address(NamedTuple):
 
     @property
     def url(self) -> str:
-        """The address as a URL, with everything pinned that is known; never with a password."""
+        """The address as a URL, with dialect and quirks if known; never with a password."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         user = query = ""
         if self.parameters or self.quirks:
@@ -86,12 +86,12 @@ class Address(NamedTuple):
             )
         elif self.dialect:
             query = f"dialect={quote_plus(self.dialect, safe=',:')}"
-        place = f"{user}{host}:{self.port}" if host else ""
+        authority = f"{user}{host}:{self.port}" if host else ""
         path = f"/{self.path}" if self.path else ""
-        return f"{self.scheme}://{place}{path}{'?' if query else ''}{query}"
+        return f"{self.scheme}://{authority}{path}{'?' if query else ''}{query}"
 
     def __repr__(self) -> str:
-        """Return the address as a text without the password, which is not for logs."""
+        """Return the address as a text for logs, without the password."""
         shown = tuple((key, "***" if key == PASSWORD else value) for key, value in self.parameters)
         fields = zip(self._fields, self._replace(parameters=shown), strict=True)
         return f"Address({', '.join(f'{name}={value!r}' for name, value in fields)})"
@@ -104,16 +104,16 @@ def is_fleet(url: str) -> bool:
 
 
 SOFTWARE_SCHEME = "software:"
-"""The beginning of addresses of cameras whose pictures are inspected in this process."""
+"""The beginning of an address of a software camera: this process inspects its pictures."""
 
 
 def is_software(url: str) -> bool:
-    """Return True if pictures of the camera are inspected in this process."""
+    """Return True if a URL is the address of a software camera."""
     return check_text(url, "url").strip().lower().startswith(SOFTWARE_SCHEME)
 
 
 MAX_KNOWN_ADDRESSES = 256
-"""Largest number of URLs whose address is kept, for cameras that are opened again."""
+"""Largest number of URLs whose parsed address is kept, for cameras that are opened again."""
 
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
@@ -136,7 +136,7 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
 
 @functools.lru_cache(maxsize=MAX_KNOWN_ADDRESSES)
 def _known_address(url: str, model: str | None, revision: int) -> Address:
-    """Return the address of a URL, by the protocols of this ``revision``."""
+    """Return the address of a URL; cached as long as the registry's ``revision`` is the same."""
     return _read_address(url, model)
 
 
@@ -157,9 +157,9 @@ def _read_address(url: str, model: str | None) -> Address:
         port = protocol.default_port
     if not host:
         raise ConfigurationError(f"camera address {shown!r} has no host")
-    # urlsplit accepts some of these, and which ones depends on the version of Python
-    place = parts.netloc.rpartition("@")[2]
-    if "[" in host or "]" in host or place.rfind("[") > 0:
+    # urlsplit accepts some brackets; which of them depends on the version of Python
+    host_and_port = parts.netloc.rpartition("@")[2]
+    if "[" in host or "]" in host or host_and_port.rfind("[") > 0:
         raise ConfigurationError(f"camera address {shown!r} has a bracket inside its host")
     if port == 0:
         raise ConfigurationError(f"camera address {shown!r}: port 0 is no camera's port")
@@ -206,7 +206,7 @@ def _read_address(url: str, model: str | None) -> Address:
 
 
 USER, PASSWORD = "user", "password"
-"""Parameters that stand before the host in a URL."""
+"""Names of the parameters that are before the host in a URL."""
 
 
 def _query(shown: str, query: str, protocol: Protocol) -> dict[str, str]:
@@ -234,10 +234,10 @@ def masked(url: str) -> str:
     login, at, host = url[begin:].rpartition("@")
     user, colon, _ = login.partition(":")
     shown = f"{url[:begin]}{user}:***@{host}" if at and colon else url
-    return _PASSWORD_SAID.sub(r"\1***", shown)
+    return _PASSWORD_IN_QUERY.sub(r"\1***", shown)
 
 
-_PASSWORD_SAID = re.compile(rf"(\b{PASSWORD}=)[^&#]*", re.IGNORECASE)
+_PASSWORD_IN_QUERY = re.compile(rf"(\b{PASSWORD}=)[^&#]*", re.IGNORECASE)
 
 
 def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
@@ -248,9 +248,9 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         )
     if "://" in url:
         scheme = url.partition("://")[0].lower()
-        usual = cast("Protocol", PROTOCOLS.load("bvs"))
-        if scheme in usual.schemes:  # whatever else is installed, which takes long to list
-            return usual, url
+        bvs = cast("Protocol", PROTOCOLS.load("bvs"))
+        if scheme in bvs.schemes:  # first, since listing what is installed takes long
+            return bvs, url
         for protocol in known_protocols():
             if scheme in protocol.schemes:
                 return protocol, url
@@ -287,8 +287,8 @@ def known_protocols() -> Iterator[Protocol]:
         except PluginError:
             if info.origin == "built-in":
                 raise
-            continue  # a broken plug-in is only left out
-        if hasattr(protocol, "schemes"):  # so is a plug-in that provides something else
+            continue  # a broken plug-in is left out
+        if hasattr(protocol, "schemes"):  # a plug-in that is no protocol is left out, too
             yield protocol
 
 
@@ -313,16 +313,16 @@ class OtherOptions(TypedDict, total=False):
 
 
 class CameraOptions(OtherOptions, total=False):
-    """The options that ``connect()`` takes; :class:`CameraSettings` has defaults and meanings."""
+    """The options of ``connect()``; :class:`CameraSettings` has their defaults."""
 
     interpret_as: Spec | Mapping[int, Spec]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Options of one client, checked by :meth:`make` or :meth:`of`, which make it.
+    """Options of one client. :meth:`make` and :meth:`of` check them, and make the object.
 
-    Times are seconds, each bounds one step.
+    Times are seconds; each limits one step.
 
     Attributes:
         given: names of the options that were given.
@@ -365,24 +365,24 @@ class CameraSettings:
         Raises:
             ConfigurationError: names the option, the given value and the expected one.
         """
-        usual = address.path or f"{address.host}:{address.port}"
+        default_name = address.path or f"{address.host}:{address.port}"
         try:
             given = with_ids(cast("dict[str, Any]", options))
         except TypeError as exc:
             raise ConfigurationError(f"connect: {exc!s:.200}") from exc
-        if "name" not in given and len(usual) <= MAX_NAME_CHARACTERS:
-            given = {**given, "name": usual}
-        used = {option: _as_usual(option, value) for option, value in given.items()}
-        if any(value is _UNUSUAL for value in used.values()):
-            used = _validated(given)
-        used["name"] = used.get("name") or usual
-        made = object.__new__(cls)  # in a fifth of the steps of the frozen class's own constructor
-        values = vars(made)
+        if "name" not in given and len(default_name) <= MAX_NAME_CHARACTERS:
+            given = {**given, "name": default_name}
+        checked = {option: _accept_usual(option, value) for option, value in given.items()}
+        if any(value is _UNUSUAL for value in checked.values()):
+            checked = _validated(given)
+        checked["name"] = checked.get("name") or default_name
+        settings = object.__new__(cls)  # in a fifth of the steps of the class's own constructor
+        values = vars(settings)
         values.update(_DEFAULTS)
         values["application_names"] = {}
-        values.update(used)
+        values.update(checked)
         values["address"], values["given"] = address, frozenset(given)
-        return made
+        return settings
 
 
 _DEFAULTS = {
@@ -392,12 +392,15 @@ _DEFAULTS = {
 }
 
 _UNUSUAL = object()
-"""Stands for a value about which pydantic has to decide."""
+"""Returned for a value that pydantic has to check."""
 
 _SECONDS = (float, sys.float_info.min, MAX_OPTION_SECONDS)
 _BOUNDS: dict[str, tuple[type[float], float, float]] = {
     **dict.fromkeys(("y_down", "lenient", "restore"), (bool, 0, 1)),
-    **{f"{of}_timeout": _SECONDS for of in ("connect", "switch", "request", "close", "liveness")},
+    **{
+        f"{step}_timeout": _SECONDS
+        for step in ("connect", "switch", "request", "close", "liveness")
+    },
     "application": (int, 0, MAX_APPLICATION_ID),
     "connect_attempts": (int, 1, MAX_CONNECT_ATTEMPTS),
     "max_length": (int, MIN_PAYLOAD_LIMIT_BYTES, MAX_DATA_BYTES),
@@ -405,24 +408,24 @@ _BOUNDS: dict[str, tuple[type[float], float, float]] = {
 """Type, least and largest value of options that are numbers or truth values."""
 
 
-def _as_usual(option: str, value: Any) -> Any:
-    """Return the value of an option as it is used if it certainly is valid, else ``_UNUSUAL``."""
+def _accept_usual(option: str, value: Any) -> Any:
+    """Return an option's plain value if it is certainly valid, else ``_UNUSUAL``."""
     if option in _BOUNDS:
         kind, least, most = _BOUNDS[option]
         if type(value) is kind or (kind is float and type(value) is int):
             return kind(value) if least <= value <= most else _UNUSUAL
-        none = value is None and option in {"application", "liveness_timeout"}
-        return None if none else _UNUSUAL
+        is_allowed_none = value is None and option in {"application", "liveness_timeout"}
+        return None if is_allowed_none else _UNUSUAL
     if option == "name":
-        short = type(value) is str and value.isascii() and len(value) <= MAX_NAME_CHARACTERS
-        return value if short else _UNUSUAL
+        is_valid = type(value) is str and value.isascii() and len(value) <= MAX_NAME_CHARACTERS
+        return value if is_valid else _UNUSUAL
     if option == "reconnect":
         return value if value is None or isinstance(value, Backoff) else _UNUSUAL
     return value if option in {"interpret_as", "calibration"} else _UNUSUAL
 
 
 def _validated(given: dict[str, Any]) -> dict[str, Any]:
-    """Return options as pydantic's model reads them, which judges unusual values.
+    """Return options as pydantic's model reads them.
 
     Raises:
         ConfigurationError: names the option, the given value and the expected one.
@@ -439,7 +442,7 @@ def _validated(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_ids(options: dict[str, Any]) -> dict[str, Any]:
-    """Return options in which ids stand for the names of applications.
+    """Return options with the ids of applications in place of their names.
 
     Raises:
         ConfigurationError: a name is not known.
@@ -453,10 +456,10 @@ def with_ids(options: dict[str, Any]) -> dict[str, Any]:
     for option in ("interpret_as", "calibration"):
         given: Any = changed.get(option)
         if isinstance(given, Mapping):
-            each: Mapping[Any, Any] = given
+            by_application: Mapping[Any, Any] = given
             changed[option] = {
                 id_of(key, names) if isinstance(key, str) else key: value
-                for key, value in each.items()
+                for key, value in by_application.items()
             }
     return changed
 
@@ -476,7 +479,7 @@ def id_of(application: str, names: Mapping[str, int]) -> int:
 
 
 def validated(kind: type[M], given: M | Mapping[str, Any], label: str) -> M:
-    """Return ``given`` as a model; a mapping has its fields.
+    """Return ``given`` as a model; if it is a mapping, it has the model's fields.
 
     Raises:
         ConfigurationError: a field is wrong; the text begins with ``label`` and names the field.
@@ -493,14 +496,14 @@ def validated(kind: type[M], given: M | Mapping[str, Any], label: str) -> M:
 def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
     """Return pydantic's findings as one line: field, expected value, given value.
 
-    ``known``: names of the fields at the top, of which one may have been meant.
+    ``known``: names of the fields at the top level, for suggestions.
     """
     return "; ".join(
         f"{'.'.join(f'{part!s:.80}' for part in item['loc']) or 'value'}: {item['msg']}"
-        f"{_meant(item, known)} (got {shown(item['input'])})"
+        f"{_suggestion(item, known)} (got {shown(item['input'])})"
         for item in error.errors()
     )
 
 
-def _meant(item: ErrorDetails, known: Iterable[str]) -> str:
+def _suggestion(item: ErrorDetails, known: Iterable[str]) -> str:
     return hint(item, known if len(item["loc"]) == 1 else ())

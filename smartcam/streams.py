@@ -1,4 +1,4 @@
-"""Bounded streams: a camera's items for any number of independent subscribers."""
+"""Bounded streams, by which any number of independent subscribers get a camera's items."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ class Overflow(enum.Enum):
 _OVERFLOWS = [overflow.value for overflow in Overflow]
 
 
-def _weightless(_item: object) -> int:
+def _zero_bytes(_item: object) -> int:
     return 0
 
 
 class Queue(Generic[T]):
-    """Base of both kinds of subscription: a bounded queue that counts what it drops.
+    """Base of both kinds of subscription: a bounded queue that counts the items that it drops.
 
     Args:
         name: kind of the subscribed items.
         max_queue: number of items kept for a slow reader.
         overflow: value of :class:`Overflow`, the consequence of a full queue.
-        min_interval: seconds after a kept item in which further items are dropped.
+        min_interval: seconds after a kept item during which further items are dropped.
         max_queue_bytes: largest number of bytes of all kept items. A larger single item is kept if
             the queue is empty: otherwise it could never be delivered.
-        size_of: function that returns the bytes of an item that is no error.
+        size_of: function that returns the number of bytes of an item; not called for errors.
 
     Raises:
         ConfigurationError: an argument cannot work.
@@ -66,7 +66,7 @@ class Queue(Generic[T]):
         overflow: str,
         min_interval: float = 0.0,
         max_queue_bytes: int = sys.maxsize,
-        size_of: Callable[[T], int] = _weightless,
+        size_of: Callable[[T], int] = _zero_bytes,
     ) -> None:
         owner = f"{name}()"
         self._name = name
@@ -80,16 +80,17 @@ class Queue(Generic[T]):
         self._ended = False
         self._end_error: SmartCamError | None = None
         self._source: object = None
-        self._last = float("-inf")
+        self._last_kept_at = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # number of errors among the items
-        # Bytes are counted, and the bytes of taken items subtracted, when items come, so that
-        # taking costs nothing. A parcel came together: number of its last item, items, bytes.
+        # Only new items change the count of bytes, so that taking costs nothing: the bytes of taken
+        # items are subtracted then. A parcel stands for items that came together: the number of
+        # its last item, the number of items, their bytes.
         self._parcels: collections.deque[tuple[int, int, int]] = collections.deque()
-        self._bytes = 0  # bytes of all parcels, some of which may belong to dropped items
+        self._bytes = 0  # bytes of all parcels, part of which may belong to items that are gone
         self._missed = 0
         self.since: float = -math.inf  # time of the subscription, on the clock of the items
-        self._evicted = 0  # dropped items that were queued before: only these have numbers
+        self._evicted = 0  # dropped items that had been queued; only queued items have numbers
 
     @property
     def ended(self) -> bool:
@@ -98,23 +99,23 @@ class Queue(Generic[T]):
 
     @property
     def waiting(self) -> bool:
-        """True if something is there to be taken."""
+        """True if an item or an error is queued."""
         return bool(self._items)
 
     def share(self, ready: asyncio.Event) -> None:
-        """Set this event when an item comes, or the stream ends; for readers of several streams."""
+        """Set this event when an item comes or the stream ends; several streams may share it."""
         self._ready = ready
         if self._items or self._ended:
             ready.set()
 
     def keep(self, source: object) -> None:
-        """Keep a reference to the items' source, for a program that keeps the stream alone."""
+        """Keep a reference to the items' source, since a program may keep only the stream."""
         if not self._ended:
             self._source = source
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
-        self._weigh()
+        self._recount_bytes()
         return SubscriberStatistics(
             name=self._name,
             policy=self._overflow.value,
@@ -136,7 +137,7 @@ class Queue(Generic[T]):
         self.end(None)
 
     async def _wait(self) -> None:
-        """Wait until an item is there.
+        """Wait until an item is queued.
 
         Raises:
             StopAsyncIteration: the stream is closed.
@@ -145,7 +146,7 @@ class Queue(Generic[T]):
         while not self._items:
             if self._ended:
                 if self._end_error is not None:
-                    raise self._end_error.with_traceback(None)  # else it grows with each raise
+                    raise self._end_error.with_traceback(None)  # else its traceback grows each time
                 raise StopAsyncIteration
             self._ready.clear()
             await self._ready.wait()
@@ -170,14 +171,14 @@ class Queue(Generic[T]):
         if self._ended:
             return
         self._offered += 1
-        if now - self._last < self._min_interval:
+        if now - self._last_kept_at < self._min_interval:
             self._dropped += 1
             return
         items = self._items
         full = len(items) >= self._max_queue or self._bytes + size > self._max_queue_bytes
         if full and not self._make_room(size):
             return
-        self._last = now
+        self._last_kept_at = now
         self._errors += isinstance(item, SmartCamError)
         items.append(item)
         if size:
@@ -185,36 +186,36 @@ class Queue(Generic[T]):
         self._ready.set()
 
     def offer_all(self, items: Sequence[T], now: float, size: int = 0) -> None:
-        """Hand several items over that came together; as :meth:`offer` for each.
+        """Hand over several items that came together, as :meth:`offer` does for each.
 
         Args:
             items: the items.
-            now: when they came.
-            size: bytes of all of them.
+            now: time at which they came.
+            size: bytes of all items together.
         """
         queued = self._items
         if (
             self._min_interval
             or len(queued) + len(items) > self._max_queue
-            or self._exceeded_by(size)
+            or self._would_exceed(size)
         ):
             for item in items:
                 self.offer(item, now, self._size_of(item))
         elif items and not self._ended:
             self._offered += len(items)
-            self._last = now
+            self._last_kept_at = now
             queued.extend(items)
             if size:
                 self._add_parcel(len(items), size)
             self._ready.set()
 
     def miss(self, count: int) -> None:
-        """Count items that were sent and cannot come any more."""
+        """Count items that the camera sent and that were lost on their way."""
         if not self._ended:
             self._missed += count
 
     def end(self, error: SmartCamError | None) -> None:
-        """End the stream after the queued items; the first reason stays."""
+        """End the stream after the queued items; if it has ended already, its reason stays."""
         if not self._ended:
             self._ended = True
             self._end_error = error
@@ -229,7 +230,7 @@ class Queue(Generic[T]):
         while items:
             if len(items) >= self._max_queue:
                 bound = f"{self._max_queue} items"
-            elif self._exceeded_by(size):
+            elif self._would_exceed(size):
                 bound = f"{self._max_queue_bytes} bytes"
             else:
                 break
@@ -241,42 +242,42 @@ class Queue(Generic[T]):
             self._errors -= isinstance(items.popleft(), SmartCamError)
         return True
 
-    def _exceeded_by(self, size: int) -> bool:
-        """Return True if ``size`` bytes more are too many for the queue."""
+    def _would_exceed(self, size: int) -> bool:
+        """Return True if the queue has no room for ``size`` more bytes."""
         if self._bytes + size <= self._max_queue_bytes:
             return False
-        self._weigh()
+        self._recount_bytes()
         return self._bytes + size > self._max_queue_bytes
 
     def _add_parcel(self, count: int, size: int) -> None:
-        """Count the bytes of the last ``count`` items, which are queued by now."""
+        """Count the bytes of the last ``count`` items, which have just been queued."""
         parcels, queued = self._parcels, len(self._items)
         if queued == count:  # nothing else is queued
             parcels.clear()
             self._bytes = size
         else:
-            if len(parcels) >= queued:  # some are of items that are gone
-                self._subtract_gone()
+            if len(parcels) >= queued:  # some parcels have no queued item any more
+                self._forget_gone_parcels()
             self._bytes += size
         parcels.append((self._taken + self._evicted + queued, count, size))
 
-    def _subtract_gone(self) -> int:
-        """Forget parcels without queued items; return the number of all items gone so far."""
+    def _forget_gone_parcels(self) -> int:
+        """Forget parcels without queued items; return the number of the last item that is gone."""
         parcels, gone = self._parcels, self._taken + self._evicted
         while parcels and parcels[0][0] <= gone:
             self._bytes -= parcels.popleft()[2]
         return gone
 
-    def _weigh(self) -> None:
-        """Recount the bytes of all parcels from the items that are queued."""
-        gone, parcels = self._subtract_gone(), self._parcels
+    def _recount_bytes(self) -> None:
+        """Make the bytes of all parcels those of the items that are queued now."""
+        gone, parcels = self._forget_gone_parcels(), self._parcels
         if parcels and parcels[0][0] - parcels[0][1] < gone:
-            # partly taken: from now on each of its other items is a parcel
+            # the first parcel is partly gone: each of its other items becomes a parcel
             last, _, size = parcels.popleft()
-            left = cast("list[T]", list(itertools.islice(self._items, last - gone)))
-            sizes = [self._size_of(item) for item in left]
-            each = zip(range(gone + 1, last + 1), itertools.repeat(1), sizes, strict=False)
-            parcels.extendleft(reversed([*each]))
+            remaining = cast("list[T]", list(itertools.islice(self._items, last - gone)))
+            sizes = [self._size_of(item) for item in remaining]
+            singles = zip(range(gone + 1, last + 1), itertools.repeat(1), sizes, strict=False)
+            parcels.extendleft(reversed([*singles]))
             self._bytes += sum(sizes) - size
 
 
@@ -348,39 +349,39 @@ class BatchSubscription(Queue[T]):
 
 
 class Subscribers(Generic[T]):
-    """The queues that are offered items; a queue without other references is removed.
+    """The queues that get items; a queue to which nothing else refers is removed.
 
-    The work to subscribe and to leave does not depend on the number of queues.
+    Adding and removing a queue take the same time for any number of queues.
     """
 
-    __slots__ = ("_in_order", "horizon", "joined", "references")
+    __slots__ = ("_references_copy", "added_count", "horizon", "references")
 
     def __init__(self) -> None:
-        self.joined: int = 0  # number of subscribers so far
-        # age of the items offered now; later subscribers do not get them
+        self.added_count: int = 0  # number of queues added so far
+        # time of the items that are offered now; queues with a later ``since`` do not get them
         self.horizon: float = math.inf
-        # empty without subscribers: looked at for every message
+        # the queues; every message tests whether there is one
         self.references: dict[weakref.ref[Queue[T]], None] = {}
-        # copy to iterate over while some leave; None if it must be made again
-        self._in_order: list[weakref.ref[Queue[T]]] | None = None
+        # copy to iterate over while queues are removed; None if it has to be made again
+        self._references_copy: list[weakref.ref[Queue[T]]] | None = None
 
     def add(self, queue: Queue[T]) -> None:
         """Offer a subscriber all items from now on."""
         self.references[weakref.ref(queue, self._discard)] = None
-        self._in_order = None
-        self.joined += 1
+        self._references_copy = None
+        self.added_count += 1
 
     def _discard(self, reference: weakref.ref[Queue[T]]) -> None:
         self.references.pop(reference, None)
-        self._in_order = None
+        self._references_copy = None
 
     def __bool__(self) -> bool:
         return bool(self.references)
 
     @property
-    def any_open(self) -> bool:
-        """True if something that is offered now would be queued."""
-        for reference in self._in_order or self._ordered():
+    def has_open_queue(self) -> bool:
+        """True if a queue would take an item that is offered now."""
+        for reference in self._references_copy or self._copy_references():
             queue = reference()
             if queue is not None and not queue.ended and queue.since <= self.horizon:
                 return True
@@ -388,18 +389,18 @@ class Subscribers(Generic[T]):
 
     def offer(self, item: T | SmartCamError, now: float, size: int = 0) -> None:
         """Hand an item of ``size`` bytes to each queue."""
-        for reference in self._in_order or self._ordered():
+        for reference in self._references_copy or self._copy_references():
             queue = reference()
             if queue is not None and queue.since <= self.horizon:
                 queue.offer(item, now, size)
 
     def __iter__(self) -> Iterator[Queue[T]]:
-        for reference in self._in_order or self._ordered():
+        for reference in self._references_copy or self._copy_references():
             queue = reference()
             if queue is not None and queue.since <= self.horizon:
                 yield queue
 
-    def _ordered(self) -> list[weakref.ref[Queue[T]]]:
-        """Return the references, in a list that stays as it is while some leave."""
-        self._in_order = references = list(self.references)
+    def _copy_references(self) -> list[weakref.ref[Queue[T]]]:
+        """Return the references in a list that does not change while queues are removed."""
+        self._references_copy = references = list(self.references)
         return references

@@ -138,7 +138,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
     """
 
     def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
-        """Wait until there is a session, and the state that ``restore`` asks for.
+        """Wait until there is a session, and the camera has the state that ``restore`` asks for.
 
         As :meth:`smartcam.Camera.wait_connected`.
         """
@@ -151,10 +151,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
 
     @property
     def trouble(self) -> SmartCamError | None:
-        """The error that a call would raise now without a session.
-
-        As :attr:`smartcam.Camera.trouble`.
-        """
+        """The error that a call would raise now, as :attr:`smartcam.Camera.trouble`."""
         return self._camera.trouble
 
     @property
@@ -187,10 +184,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         return self._camera.capabilities
 
     def statistics(self) -> Statistics:
-        """Return everything counted so far, over all sessions.
-
-        As :meth:`smartcam.Camera.statistics`.
-        """
+        """Return all counters, over all sessions: :meth:`smartcam.Camera.statistics`."""
         return self._do(self._camera.statistics)
 
     @overload
@@ -224,10 +218,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         max_queue_bytes: int = DEFAULT_MAX_QUEUE_BYTES,
         overflow: Literal["drop_oldest", "error"] = "drop_oldest",
     ) -> Any:
-        """Subscribe to everything the camera sends, triggered or not.
-
-        As :meth:`smartcam.Camera.results`.
-        """
+        """Subscribe to every result, triggered or not: :meth:`smartcam.Camera.results`."""
         results: Callable[..., Any] = self._camera.results
         return self._subscribed(
             results,
@@ -263,14 +254,14 @@ class SyncCamera(SyncCameraBase[ValueT]):
         return self._subscribed(self._camera.events, max_queue=max_queue, overflow=overflow)
 
     def wait_status(self, predicate: Callable[[Status], bool], timeout: float = 10.0) -> Status:
-        """Return the first status, the present one included, that ``predicate`` accepts.
+        """Return the first status that ``predicate`` accepts, beginning with the present status.
 
         As :meth:`smartcam.Camera.wait_status`.
         """
         return self._wait(self._camera.wait_status, predicate, timeout)
 
     def wait_ready(self, timeout: float = 10.0) -> Status:
-        """Wait until the camera is not BUSY, and Running if a start was asked for.
+        """Wait until the camera is not BUSY, and is Running if it was started.
 
         As :meth:`smartcam.Camera.wait_ready`.
         """
@@ -406,12 +397,15 @@ class SyncCamera(SyncCameraBase[ValueT]):
         )
 
     def switch_application(self, application: int | str, *, timeout: float | None = None) -> None:
-        """Load another application: :meth:`smartcam.Camera.switch_application`."""
+        """Load another application, and wait until the camera is ready.
+
+        As :meth:`smartcam.Camera.switch_application`.
+        """
         self._wait(self._camera.switch_application, application, timeout=timeout)
 
     @contextlib.contextmanager
     def application(self, application: int | str) -> Generator[Self]:
-        """Run an application inside the ``with``, then return to the one before.
+        """Run an application inside the ``with``, then return to the previous application.
 
         As :meth:`smartcam.Camera.application`.
         """
@@ -435,7 +429,10 @@ class SyncCamera(SyncCameraBase[ValueT]):
         return self._wait(self._camera.query_status, timeout=timeout)
 
     def reset_errors(self, *, timeout: float | None = None) -> Status:
-        """Clear the error bits that stay set until then: :meth:`smartcam.Camera.reset_errors`."""
+        """Clear the error bits that stay set until a reset.
+
+        As :meth:`smartcam.Camera.reset_errors`.
+        """
         return self._wait(self._camera.reset_errors, timeout=timeout)
 
     def read_image(self, *, timeout: float | None = None) -> bytes:
@@ -490,7 +487,7 @@ class SyncCamera(SyncCameraBase[ValueT]):
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
     ) -> FleetFrame:
-        """Return the first frame whose exposure began after a moment, or after this call.
+        """Return the first frame whose exposure began after ``moment``, or after this call.
 
         As :meth:`smartcam.Camera.frame_after`.
         """

@@ -255,7 +255,7 @@ class Together(Everything):
 def test_results_come_together_if_nobody_wants_them_one_by_one() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers([Together("one", calls), Blind(), Together("two", calls)])
-    assert (observers.see_results, observers.see_each) == (True, False)
+    assert (observers.see_results, observers.see_single_results) == (True, False)
     observers.results(OTHERS)
     observers.result(RESULT)
     assert calls == [
@@ -267,7 +267,7 @@ def test_results_come_together_if_nobody_wants_them_one_by_one() -> None:
 def test_results_come_one_by_one_to_all_where_one_wants_that() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers([Together("one", calls), Everything("two", calls)])
-    assert observers.see_each
+    assert observers.see_single_results
     observers.results(OTHERS)
     assert calls == [
         (name, what, one)

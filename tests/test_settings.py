@@ -22,7 +22,7 @@ from smartcam.settings import (
     Address,
     CameraOptions,
     CameraSettings,
-    _as_usual,
+    _accept_usual,
     parse_address,
     validation_text,
 )
@@ -489,12 +489,12 @@ def test_options_are_those_of_the_settings() -> None:
 @pytest.mark.parametrize("option", [*OPTION_VALUES])
 def test_options_that_are_taken_at_once_are_those_that_the_model_takes(option: str) -> None:
     for value in OPTION_VALUES[option]:
-        taken = _as_usual(option, value)
+        taken = _accept_usual(option, value)
         if taken is _UNUSUAL:
             continue
         judged = getattr(SettingsModel(**{option: value}), option)
         assert (judged, type(judged)) == (taken, type(taken)), value
-    assert any(_as_usual(option, value) is not _UNUSUAL for value in OPTION_VALUES[option])
+    assert any(_accept_usual(option, value) is not _UNUSUAL for value in OPTION_VALUES[option])
 
 
 def test_usual_options_need_no_pydantic() -> None:

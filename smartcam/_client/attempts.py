@@ -32,7 +32,7 @@ _ERRNO = re.compile(r"\[Errno (-?\d+)\]")
 
 
 class SessionRefusedError(RemoteProtocolError):
-    """The answer to Connect is a refusal; a camera of another dialect may mean something else."""
+    """The answer to Connect is a refusal, if the camera speaks the expected dialect."""
 
 
 @dataclass(slots=True)
@@ -62,17 +62,17 @@ class Try:
 
     @property
     def opened(self) -> bool:
-        """True if there was a link at all."""
+        """True if the link was opened."""
         return self.step != OPENING
 
     def reach(self, step: str) -> None:
-        """Note the step that begins now."""
+        """Note that a step begins, and call ``on_step``."""
         self.step = step
         if self.on_step is not None:
             self.on_step(step)
 
     def end(self, error: Exception, waited: float) -> None:
-        """Note the error that ended the attempt; ``UnicodeError``: the host's name is not valid."""
+        """Note the error that ended the attempt; a ``UnicodeError`` means an invalid host name."""
         self.error = error
         timeout = isinstance(error, TimeoutError)
         self.hung_up = self.step == CONNECTING and not timeout and not self.received
@@ -90,7 +90,7 @@ class Try:
             self.outcome = str(error)
 
     def failed_with(self, *numbers: int) -> bool:
-        """Return True if one of these system errors is the cause; a name has several addresses."""
+        """Return True if one of these system errors is the cause, at any address of the host."""
         error = self.error
         if error is not None and isinstance(error.__cause__, OSError):
             error = error.__cause__
@@ -113,7 +113,7 @@ class Reason(NamedTuple):
     cure: str  # text of the cure
 
 
-_NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
+_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)
 
 REASONS: tuple[Reason, ...] = (
     Reason(
@@ -135,7 +135,7 @@ REASONS: tuple[Reason, ...] = (
         "minute.",
     ),
     Reason(
-        lambda attempt: attempt.failed_with(*_NO_WAY),
+        lambda attempt: attempt.failed_with(*_UNREACHABLE),
         "there is no way to {where}: {outcome}",
         "Look at the address, at this machine's network and mask, the cable and the camera's "
         "power: both must be in one network, or have a route.",
@@ -182,7 +182,8 @@ REASONS: tuple[Reason, ...] = (
         "{interface}, and for another client or dialect.",
     ),
 )
-"""Causes; the first that fits an attempt counts, and received bytes come before silence."""
+"""Causes in order: the first that fits any attempt counts. Causes with received bytes come before
+silence."""
 
 
 def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
@@ -193,7 +194,7 @@ def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
 
 
 def words(attempt: Try, address: Address, protocol: Protocol) -> dict[str, str]:
-    """Return the words for the placeholders in a reason's texts."""
+    """Return the values for the placeholders in a reason's texts."""
     names = [transport.value for transport in protocol.schemes.values()]
     this, others = attempt.transport.upper(), [name for name in names if name != attempt.transport]
     return {

@@ -1,4 +1,4 @@
-"""Keep the camera's known state and the state asked of it, over all sessions of a client."""
+"""Keep the camera's known state and its wanted state, over all sessions of a client."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Wanted(NamedTuple):
     """The application and run state that the program has set.
 
     Attributes:
-        application: the application that was named, None without one.
-        running: the run state that was requested, None without one.
+        application: the application that was named; None if none was.
+        running: the run state that was requested; None if none was.
     """
 
     application: int | None
@@ -44,10 +44,9 @@ class CameraState:
         status: last status, also after the link is lost; None before the first.
         bits: last status as a plain integer, 0 before the first.
         endian: byte order in the last status.
-        active: id of the application that is active as far as is known.
-        wanted: id of the application that the camera was asked to load.
-        expected: id of the application that all results must come from; None for
-            any.
+        active: id of the application that was active by the camera's last message about it.
+        wanted: application and run state that the program has set.
+        expected: id of the application that all results must come from; None for any.
         active_in_doubt: True after another client or a person loaded an application.
         loads_by_others: number of times that another client or a person loaded one.
         statuses_received: number of statuses received.
@@ -62,7 +61,7 @@ class CameraState:
         self.endian: int = 0
         self.active: int | None = None
         self.shared: bool = shared
-        self.want(Wanted(application, None))
+        self.set_wanted(Wanted(application, None))
         self.active_in_doubt: bool = False
         self.loads_by_others: int = 0
         self.statuses_received: int = 0
@@ -78,47 +77,47 @@ class CameraState:
         self._last_status, self.active_in_doubt = None, False
         self._statuses_due = self.statuses_received
 
-    def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
+    def note_status(self, report: StatusReport, awaited: Container[object]) -> int | None:
         """Handle a status.
 
         Args:
             report: report of the status.
-            awaited: kinds of the pending answers; a switch by this client shows by the kind of its
-                answer.
+            awaited: types of the pending answers; ``SwitchAnswer`` among them shows that this
+                client has asked for the switch.
 
         Returns:
             The status before, None if this session had none.
         """
         status = report.status
         # int(status) costs three times as much, with each status that comes
-        bits, was = status._value_, self._last_status
+        bits, old_bits = status._value_, self._last_status
         self.statuses_received += 1
         self.status, self.endian = status, report.endian
         self.bits = self._last_status = bits
         if bits & _RUNNING_OR_BUSY == _BUSY:  # the camera loads an application
             self._loaded_by_us = False
         elif (
-            was is not None
-            and was & _RUNNING_OR_BUSY == _BUSY
+            old_bits is not None
+            and old_bits & _RUNNING_OR_BUSY == _BUSY
             and not (self._loaded_by_us or SwitchAnswer in awaited)
         ):
             self.active_in_doubt = True
             self.loads_by_others += 1
-        return was
+        return old_bits
 
-    def stays(self, application: int, bits: int, endian: int) -> bool:
-        """Return True if this is the last status that the camera has sent in this session."""
+    def is_unchanged(self, application: int, bits: int, endian: int) -> bool:
+        """Return True if the known status and application of this session equal the arguments."""
         same = self.bits == bits and self._last_status == bits and self.endian == endian
         return same and self.active == application
 
-    def report_round(self, report: StatusReport) -> None:
-        """Handle two statuses of a running camera; the second equals the present status."""
+    def note_usual_statuses(self, report: StatusReport) -> None:
+        """Handle the two statuses around a result; the second equals the present status."""
         self.statuses_received += 2
         self.status = report.status
 
     @property
     def loading(self) -> bool:
-        """True while an application is being loaded, as :attr:`Status.loading` of the status."""
+        """True while an application is being loaded, like :attr:`Status.loading`."""
         return self.bits & _RUNNING_OR_BUSY == _BUSY
 
     @property
@@ -128,52 +127,52 @@ class CameraState:
 
     @property
     def statuses_due(self) -> int:
-        """Number of statuses received once all requests are answered."""
+        """Number of statuses that will have been received when all requests are answered."""
         return max(self._statuses_due, self.statuses_received)
 
-    def status_asked(self, now: float, count: int = 1) -> None:
+    def note_status_request(self, now: float, count: int = 1) -> None:
         """Note ``count`` requests for the status, whose answers are pending."""
         self.status_asked_at = now
         self._statuses_due = self.statuses_due + count
 
-    def status_lost(self) -> None:
+    def note_statuses_lost(self) -> None:
         """Note that the pending statuses will not come."""
         self._statuses_due = self.statuses_received
 
     @property
     def active_text(self) -> str:
-        """Name of the active application for texts; a camera's job may have no id."""
+        """The active application in texts; an In-Sight camera's job may have no id."""
         unnamed = self.active is None or self.active == UNNAMED_APPLICATION
         return "the active application" if unnamed else f"application {self.active}"
 
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""
         previous, self.active = self.active, application
-        if previous != application and self._listeners.hears_changes:
+        if previous != application and self._listeners.wants_changes:
             self._listeners.publish(
                 ApplicationChanged(
                     camera=self._name, at=at, application=application, previous=previous
                 )
             )
 
-    def switched(self, application: int) -> None:
+    def note_switch(self, application: int) -> None:
         """Note that the camera has done a switch by this client."""
         self.want_application(application)
         self._loaded_by_us = True
 
     def clear_active_doubt(self) -> None:
-        """Note that the camera was asked which application is active."""
+        """End the doubt: the camera was asked which application is active."""
         self.active_in_doubt = False
 
-    def want(self, wanted: Wanted) -> None:
+    def set_wanted(self, wanted: Wanted) -> None:
         """Note the application and run state that the program has set."""
         self.wanted: Wanted = wanted
         self.expected: int | None = None if self.shared else wanted.application
 
     def want_application(self, application: int) -> None:
         """Note the application that results are expected from."""
-        self.want(self.wanted._replace(application=application))
+        self.set_wanted(self.wanted._replace(application=application))
 
     def want_running(self, running: bool) -> None:
         """Note the requested run state."""
-        self.want(self.wanted._replace(running=running))
+        self.set_wanted(self.wanted._replace(running=running))

@@ -1,8 +1,8 @@
 """Run one command at a time, and go back after a temporary switch.
 
-Going back to the former application is a job of the session's task group: it is finished even if
-the caller is cancelled, it is bounded, and every later command waits for it. A switch back that a
-lost link prevented is done first in the next session; so is restoring the wanted state.
+Going back to the former application is a job, a task of the session's task group: it is finished
+even if the caller is cancelled, it has a time limit, and every later command waits for it. If a
+lost link prevented it, it is the first step of the next session. So is restoring the wanted state.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
-    """The state to go back to.
+class PreviousState:
+    """The camera's state before a switch, to which a job goes back.
 
     Attributes:
         application: id of the application that was active.
@@ -53,17 +53,17 @@ class Hold:
     _timeout: float
 
     def __aenter__(self) -> Coroutine[Any, Any, float]:
-        return self._lock.take(self._timeout)
+        return self._lock.take_turn(self._timeout)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
     ) -> None:
-        self._lock.give_back()
+        self._lock.release_turn()
 
 
 @dataclass(eq=False)
 class CommandLock:
-    """Gives commands their turn."""
+    """Lets one command after the other use the camera."""
 
     _connection: Connection
     _commands: Commands
@@ -74,35 +74,35 @@ class CommandLock:
 
     def __post_init__(self) -> None:
         # tasks of the session; None between two sessions
-        self._jobs: asyncio.TaskGroup | None = None
-        self._to_restore: Before | None = None  # state to restore in the next session
+        self._task_group: asyncio.TaskGroup | None = None
+        self._state_to_restore: PreviousState | None = None  # state to restore in the next session
         self._lock = asyncio.Lock()
         self._waiting_commands = 0  # commands that wait for the lock
-        self._leaving: set[asyncio.Task[None]] = set()
-        self._failed: SmartCamError | None = None
+        self._running_jobs: set[asyncio.Task[None]] = set()
+        self._job_error: SmartCamError | None = None
 
     # ------------------------------------------------------------------ for the supervisor
 
-    def begin_session(self, jobs: asyncio.TaskGroup, *, restore: bool) -> None:
-        """Begin a session; call :meth:`end_session` before its tasks are waited for.
+    def begin_session(self, task_group: asyncio.TaskGroup, *, restore: bool) -> None:
+        """Begin a session; :meth:`end_session` must be called before its tasks are awaited.
 
         Args:
-            jobs: group of the session's tasks.
+            task_group: group of the session's tasks.
             restore: whether to restore the wanted application and run state.
         """
-        self._jobs = jobs
-        before, self._to_restore = self._to_restore, None
+        self._task_group = task_group
+        before, self._state_to_restore = self._state_to_restore, None
         if before is not None:
             self._start_job("going_back", self._restore_earlier(before))
         elif restore:
-            self._start_job("restoring", self._restore())
+            self._start_job("restoring", self._restore_wanted())
 
     def end_session(self) -> None:
-        """Begin no jobs until the next session."""
-        self._jobs = None
+        """Start no jobs until the next session."""
+        self._task_group = None
 
-    async def vacated(self) -> None:
-        """Wait until every command of the ended session has ended, too; bounded."""
+    async def wait_until_free(self) -> None:
+        """Wait until every command of the ended session has ended, or the time limit is over."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._switch_timeout), self._lock:
                 pass
@@ -113,7 +113,7 @@ class CommandLock:
         """Hold the turn with ``async with``; it gives the deadline, which includes the wait.
 
         Raises:
-            ResponseTimeoutError: others had it for ``timeout`` seconds.
+            ResponseTimeoutError: other commands had the turn for ``timeout`` seconds.
             SmartCamError: the reason why going back failed before this command.
         """
         return Hold(self, timeout)
@@ -122,45 +122,45 @@ class CommandLock:
     async def hold_in(self, application: int, timeout: float) -> AsyncGenerator[float]:
         """Hold the turn with ``application`` running; gives the deadline.
 
-        Afterwards the former application is back; after an error or a cancellation this goes on in
-        the background.
+        Afterwards a job goes back to the former application. It is awaited, except after an error
+        or a cancellation.
         """
         # an unknown application is refused before anything is switched
         self._connection.deadline(timeout)
         async with self.hold(self._switch_timeout) as switch_deadline:
-            before = await self.enter(application, switch_deadline)
+            before = await self.enter_application(application, switch_deadline)
             try:
                 yield self._connection.deadline(timeout)
             finally:
-                going_back = self.leave(before)
-        if going_back is not None:
-            await asyncio.wait({going_back})
+                back_job = self.go_back(before)
+        if back_job is not None:
+            await asyncio.wait({back_job})
 
-    async def take(self, timeout: float) -> float:
-        """Take the turn and return the deadline; for :class:`Hold`, which gives it back."""
+    async def take_turn(self, timeout: float) -> float:
+        """Wait for the turn and return the deadline; for :class:`Hold`, which releases the turn."""
         deadline = self._connection.deadline(timeout)
-        await self.turn(deadline, timeout)
+        await self.wait_for_turn(deadline, timeout)
         return deadline
 
-    def turn(self, deadline: float, timeout: float) -> Coroutine[Any, Any, object]:
-        """Return a coroutine that waits for the turn; after it call :meth:`give_back`.
+    def wait_for_turn(self, deadline: float, timeout: float) -> Coroutine[Any, Any, object]:
+        """Return a coroutine that waits for the turn; after it call :meth:`release_turn`.
 
         Raises:
             LinkError: there is no session.
         """
         self._connection.require_link()
         lock = self._lock
-        if lock.locked() or self._waiting_commands or self._leaving:
-            return self._wait_for_turn(deadline, timeout)
-        if self._failed is not None or self._commands.unconfirmed:
-            return self._wait_for_turn(deadline, timeout)
+        if lock.locked() or self._waiting_commands or self._running_jobs:
+            return self._wait_in_line(deadline, timeout)
+        if self._job_error is not None or self._commands.unconfirmed:
+            return self._wait_in_line(deadline, timeout)
         return lock.acquire()  # the lock is free: no wait
 
-    def give_back(self) -> None:
+    def release_turn(self) -> None:
         """Give the turn to the next waiting command."""
         self._lock.release()
 
-    async def _wait_for_turn(self, deadline: float, timeout: float) -> None:
+    async def _wait_in_line(self, deadline: float, timeout: float) -> None:
         self._waiting_commands += 1
         try:
             async with asyncio.timeout_at(deadline):
@@ -174,67 +174,68 @@ class CommandLock:
             self._waiting_commands -= 1
         try:
             self._connection.require_link()  # the link may have been lost meanwhile
-            self._raise_failed()
+            self._raise_job_error()
             if self._commands.unconfirmed:
-                await self._commands.catch_up(deadline)
+                await self._commands.confirm_run_state(deadline)
         except BaseException:
             self._lock.release()
             raise
 
-    async def enter(self, application: int, deadline: float) -> Before:
+    async def enter_application(self, application: int, deadline: float) -> PreviousState:
         """Start ``application`` while the turn is held; go back if that fails."""
         commands = self._commands
         commands.check_id(application)
         active = await commands.query_loaded(deadline)
-        before = Before(active, commands.runs, self._state.wanted)
+        before = PreviousState(active, commands.is_in_run_mode, self._state.wanted)
         try:
-            await commands.ensure(application, deadline)
+            await commands.ensure_running(application, deadline)
         except BaseException:
-            self.leave(before)
+            self.go_back(before)
             raise
         return before
 
-    def leave(self, before: Before) -> asyncio.Task[None] | None:
-        """Go back once the turn is free; without a session return None, and go back in the next.
+    def go_back(self, before: PreviousState) -> asyncio.Task[None] | None:
+        """Start a job that goes back when the turn is free, and return it.
 
-        If several switches back are due, the one to the outermost block's application counts.
+        Without a session return None; then the next session goes back. If several calls are made
+        before that, the last one counts, which is of the outermost block.
         """
-        if self._jobs is None or self._waits.end is not None:
+        if self._task_group is None or self._waits.end_reason is not None:
             self._restore_later(before)
             return None
         return self._start_job("going_back", self._restore_earlier(before))
 
     def _start_job(self, label: str, job: Coroutine[Any, Any, None]) -> asyncio.Task[None] | None:
-        if self._jobs is None:
+        if self._task_group is None:
             job.close()
             return None
-        task = self._jobs.create_task(job, name=f"smartcam[{self._connection.name}].{label}")
-        self._leaving.add(task)
-        task.add_done_callback(self._leaving.discard)
+        task = self._task_group.create_task(job, name=f"smartcam[{self._connection.name}].{label}")
+        self._running_jobs.add(task)
+        task.add_done_callback(self._running_jobs.discard)
         return task
 
-    async def leave_and_wait(self, before: Before) -> None:
-        """Go back, and raise the error that prevented it.
+    async def go_back_and_wait(self, before: PreviousState) -> None:
+        """Go back, or raise the error that prevented it.
 
-        Cancellation: going back is finished nevertheless.
+        Cancellation: the job is finished nevertheless.
         """
-        job = self.leave(before)
+        job = self.go_back(before)
         if job is not None:
             await asyncio.wait({job})
-            self._raise_failed()
+            self._raise_job_error()
 
     async def load_again(self, needed: Callable[[], bool], timeout: float) -> None:
         """Load the active application again, which empties the camera's queue of input data.
 
         Args:
-            needed: function that returns, once the turn is held, whether this must still be done.
-            timeout: seconds to wait for it.
+            needed: function that returns, when the turn is held, whether loading is still needed.
+            timeout: seconds to wait until it is done.
 
         Raises:
             SmartCamError: the reason why the application could not be loaded.
             ResponseTimeoutError: loading takes longer.
 
-        Cancellation: it is finished nevertheless, as after the timeout.
+        Cancellation: the job is finished nevertheless, as after the timeout.
         """
         job = self._start_job("loading_again", self._load_again(needed))
         if job is None:
@@ -246,7 +247,7 @@ class CommandLock:
                 f"loading the application again, which empties the queue, takes over {timeout:g} s",
                 waited=timeout,
             )
-        self._raise_failed()
+        self._raise_job_error()
 
     async def _load_again(self, needed: Callable[[], bool]) -> None:
         """Load the active application again, and start it if it ran; never raises."""
@@ -258,68 +259,68 @@ class CommandLock:
             try:
                 deadline = self._connection.deadline(self._switch_timeout)
                 active = await commands.query_loaded(deadline)
-                await commands.switch(active, deadline, start=commands.runs)
+                await commands.switch(active, deadline, start=commands.is_in_run_mode)
             except SmartCamError as error:
                 logger.warning("%s ! loading again failed: %s", self._connection.name, error)
                 if not self._is_loss(error):
-                    self._failed = error
+                    self._job_error = error
             finally:
-                self._state.want(wanted)
+                self._state.set_wanted(wanted)
 
     @property
-    def goes_back(self) -> bool:
-        """True while a job goes back: :meth:`settle` would wait."""
-        return bool(self._leaving)
+    def has_jobs(self) -> bool:
+        """True while there is a job, so that :meth:`wait_for_jobs` would wait."""
+        return bool(self._running_jobs)
 
-    async def settle(self) -> None:
-        """Wait until every job that goes back is done.
+    async def wait_for_jobs(self) -> None:
+        """Wait until every job is done.
 
-        Each is bounded by the switch timeout once it has the turn; the earlier holder may take
-        longer, so the caller has its own deadline.
+        Each takes at most the switch timeout when it has the turn. A command that has the turn
+        before may take longer, so the caller needs its own deadline.
         """
-        while self._leaving:
-            await asyncio.wait(self._leaving)
+        while self._running_jobs:
+            await asyncio.wait(self._running_jobs)
 
-    def _restore_later(self, before: Before) -> None:
+    def _restore_later(self, before: PreviousState) -> None:
         """Keep the state that the next session must restore."""
-        self._to_restore = before
-        self._state.want(before.wanted)
+        self._state_to_restore = before
+        self._state.set_wanted(before.wanted)
 
-    async def _restore_earlier(self, before: Before) -> None:
-        """Restore application and run state; never raises."""
-        await self._adopted()
+    async def _restore_earlier(self, before: PreviousState) -> None:
+        """Go back to an earlier application and run state; never raises."""
+        await self._wait_adopted()
         async with self._lock:
             try:
-                await self._reach(before.application, before.running)
+                await self._reach_state(before.application, before.running)
             except SmartCamError as error:
                 logger.warning("%s ! going back failed: %s", self._connection.name, error)
                 if self._is_loss(error):
                     self._restore_later(before)
                 else:
-                    self._failed = error
+                    self._job_error = error
             finally:
-                self._state.want(before.wanted)
+                self._state.set_wanted(before.wanted)
 
-    async def _restore(self) -> None:
+    async def _restore_wanted(self) -> None:
         """Restore the named application and the wanted run state; never raises.
 
         If the link is lost again, the next session does it.
         """
-        await self._adopted()
+        await self._wait_adopted()
         wanted = self._state.wanted
         async with self._lock:
             try:
-                await self._reach(*wanted)
+                await self._reach_state(*wanted)
             except SmartCamError as error:
                 logger.warning("%s ! restoring failed: %s", self._connection.name, error)
                 if not self._is_loss(error):
-                    self._failed = error
+                    self._job_error = error
             finally:
-                self._state.want(wanted)
+                self._state.set_wanted(wanted)
 
-    async def _adopted(self) -> None:
-        """Wait until the session of a job is adopted: an eager task begins earlier."""
-        if self._waits.end is not None:
+    async def _wait_adopted(self) -> None:
+        """Wait until the session of a job has begun: an eager task starts before that."""
+        if self._waits.end_reason is not None:
             await asyncio.sleep(0)
 
     def _is_loss(self, error: SmartCamError) -> bool:
@@ -327,7 +328,7 @@ class CommandLock:
         link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 
-    async def _reach(self, application: int | None, running: bool | None) -> None:
+    async def _reach_state(self, application: int | None, running: bool | None) -> None:
         """Reach an application and run state with the fewest commands; None leaves it unchanged."""
         commands, status = self._commands, self._status
         deadline = self._connection.deadline(self._switch_timeout)
@@ -340,19 +341,18 @@ class CommandLock:
             await commands.stop(deadline)
 
     async def _acquire(self) -> None:
-        """Take the lock after every job that goes back.
+        """Acquire the lock after all jobs.
 
-        The command with the turn before may have started such a job while this command was in
-        line.
+        The command that had the turn may have started a job while this command waited in line.
         """
         while True:
-            await self.settle()
+            await self.wait_for_jobs()
             await self._lock.acquire()
-            if not self._leaving:
+            if not self._running_jobs:
                 return
             self._lock.release()
 
-    def _raise_failed(self) -> None:
-        error, self._failed = self._failed, None
+    def _raise_job_error(self) -> None:
+        error, self._job_error = self._job_error, None
         if error is not None:
             raise error

@@ -33,7 +33,7 @@ class Commands:
     """Changes the application and the run state of the camera.
 
     Attributes:
-        unconfirmed: a Start or Stop was sent whose status has not come.
+        unconfirmed: True if a Start or Stop was sent, and the status has not confirmed it.
     """
 
     _connection: Connection
@@ -43,7 +43,9 @@ class Commands:
 
     def __post_init__(self) -> None:
         self.unconfirmed: bool = False
-        self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
+        # number of loads by others when void_inspection() stopped the camera; None if it has
+        # started it again
+        self._loads_when_halted: int | None = None
 
     def begin_session(self, link: Link) -> None:
         """Begin a session: no answer is pending, and its status was received."""
@@ -57,13 +59,13 @@ class Commands:
         self._status.end_session()
 
     @property
-    def runs(self) -> bool:
-        """Running, or stopped only by a trigger that was interrupted before it started again."""
+    def is_in_run_mode(self) -> bool:
+        """True if the application runs, or :meth:`void_inspection` has stopped it for a while."""
         return self.is_halted() or Status.RUNNING in self._status.last
 
     def is_halted(self) -> bool:
-        """Return True if a trigger's fence has stopped the camera, and nothing restarted it."""
-        return self._halted_at == self._state.loads_by_others
+        """Return True if :meth:`void_inspection` was interrupted, and nothing started it again."""
+        return self._loads_when_halted == self._state.loads_by_others
 
     # ------------------------------------------------------------------ run state
 
@@ -80,27 +82,29 @@ class Commands:
         await self._leave_run_mode(deadline)
 
     async def void_inspection(self, deadline: float) -> None:
-        """Stop and start again; receive everything that the camera sent before the start.
+        """Stop, receive everything that the camera has sent, and start again.
 
-        Cancellation: it may stay stopped; it is halted then.
+        Cancellation: the camera may stay stopped (:meth:`is_halted`).
         """
-        self._halted_at = self._state.loads_by_others
+        self._loads_when_halted = self._state.loads_by_others
         await self._confirm_stop(deadline)
         await self._requests.fence(deadline)
         await self._enter_run_mode(deadline)
 
     async def _enter_run_mode(self, deadline: float) -> None:
-        await self._confirm(m.Start(), is_ready, deadline, "Running and not BUSY after Start")
-        self._halted_at = None
+        await self._command_and_wait(
+            m.Start(), is_ready, deadline, "Running and not BUSY after Start"
+        )
+        self._loads_when_halted = None
 
     async def _leave_run_mode(self, deadline: float) -> None:
-        self._halted_at = None
+        self._loads_when_halted = None
         await self._confirm_stop(deadline)
 
     async def _confirm_stop(self, deadline: float) -> None:
-        await self._confirm(m.Stop(), _is_not_running, deadline, "not Running after Stop")
+        await self._command_and_wait(m.Stop(), _is_not_running, deadline, "not Running after Stop")
 
-    async def _confirm(
+    async def _command_and_wait(
         self, command: m.Request, predicate: Callable[[Status], bool], deadline: float, awaited: str
     ) -> None:
         self.unconfirmed = True  # and it stays True if the wait is interrupted
@@ -109,11 +113,10 @@ class Commands:
         await self._status.until(predicate, deadline, awaited)
         self.unconfirmed = False
 
-    async def catch_up(self, deadline: float) -> None:
-        """Learn the status again if a start or stop was interrupted.
+    async def confirm_run_state(self, deadline: float) -> None:
+        """Get the status that follows an interrupted start or stop.
 
-        Statuses caused by these two come before the answer to a later Query, or must be
-        requested.
+        The camera sends it before the answer to a later Query, or it must be requested.
         """
         if self._connection.features.polled:
             await self._status.refresh(deadline)
@@ -123,11 +126,11 @@ class Commands:
 
     # ------------------------------------------------------------------ application
 
-    async def query(self, deadline: float) -> int:
+    async def query_application(self, deadline: float) -> int:
         """Return the active application.
 
-        During a switch a Query reports the old id, so a pending switch answer is awaited first; or
-        the camera is too busy, and is asked again.
+        During a switch a Query reports the old id, so a pending answer to a switch is awaited
+        first. A camera that is too busy is asked again.
 
         Raises:
             ResponseTimeoutError: no answer, or the camera was busy all the time.
@@ -145,12 +148,12 @@ class Commands:
             await self._status.pause(deadline, "the busy camera to name its application")
 
     async def query_loaded(self, deadline: float) -> int:
-        """Return the active application; while another is being loaded, that is the old one."""
+        """Wait until no application is being loaded, and return the active one."""
         await self._status.refresh(deadline)  # the run state is needed next
         await self._status.until(_is_not_loading, deadline, "the application to be loaded")
-        return await self.query(deadline)
+        return await self.query_application(deadline)
 
-    async def ensure(self, application: int, deadline: float) -> None:
+    async def ensure_running(self, application: int, deadline: float) -> None:
         """Make sure that an application is running and ready, with the fewest commands."""
         self.check_id(application)
         if await self.query_loaded(deadline) != application:
@@ -174,31 +177,31 @@ class Commands:
             UnsupportedError: the dialect loads no applications, or none by name.
             CommandRejectedError: the camera refused; the old application runs again if it ran.
         """
-        request = self.load_request(application)
+        request = self.make_load_request(application)
         dialect = self._connection.dialect
-        stops = dialect.has(m.Stop)
-        was_running = self.runs and stops
-        # 0 is never allowed: several applications may have it (SC manual p. 34, published). So
-        # nothing is stopped for it.
-        never = application == 0 and 0 not in dialect.application_ids
+        can_stop = dialect.has(m.Stop)
+        was_running = self.is_in_run_mode and can_stop
+        # 0 is forbidden, since several applications may have it (SC manual p. 34, published), so
+        # the camera need not be stopped
+        is_forbidden = application == 0 and 0 not in dialect.application_ids
         active: int | None
-        if stops and never:
-            code, active = 1, await self.query(deadline)
+        if can_stop and is_forbidden:
+            code, active = 1, await self.query_application(deadline)
         else:
             if was_running:
                 await self._leave_run_mode(deadline)
             code, active = await self._load(request, application, deadline)
-        done = dialect.code(code).verdict is Verdict.DONE
-        if not done or (isinstance(application, int) and active != application):
+        is_done = dialect.code(code).verdict is Verdict.DONE
+        if not is_done or (isinstance(application, int) and active != application):
             if was_running and Status.RUNNING not in self._status.last:
                 await self._enter_run_mode(deadline)
             refusal = (
                 f"the camera refused to switch to application {application}: "
                 f"{code_text(dialect, code, type(request))}"
             )
-            if never:
+            if is_forbidden:
                 refusal = "no application may have the id 0"
-            elif done:
+            elif is_done:
                 refusal = f"the camera says it switched, but not to application {application}"
             raise CommandRejectedError(
                 f"{self._connection.name}: {refusal}; application {active} is active",
@@ -208,7 +211,7 @@ class Commands:
             )
         await self._status.refresh(deadline)
         await self._status.until(_is_not_busy, deadline, "not BUSY")
-        if start and stops:
+        if start and can_stop:
             await self.start(deadline)
 
     async def _load(
@@ -223,7 +226,7 @@ class Commands:
         is_known = answer.application in self._connection.dialect.application_ids
         return answer.code, answer.application if is_known else self._state.active
 
-    def load_request(self, application: int | str) -> m.Request:
+    def make_load_request(self, application: int | str) -> m.Request:
         """Return the request that loads an application; send nothing.
 
         Raises:
@@ -241,7 +244,7 @@ class Commands:
         return m.SwitchApplication(application=application)
 
     def check_id(self, application: int) -> None:
-        """Check that the dialect may have an application; 0 is the camera's to refuse.
+        """Check that an id is one of the dialect's; 0 is not checked, since the camera refuses it.
 
         Raises:
             ConfigurationError: the dialect has no such id.

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
 
 MAX_KNOWN_FEATURES = 64
-"""Largest number of dialects whose features are kept: there are some twenty, and those with a
-camera's own layout are made anew."""
+"""Largest number of dialects whose features are cached. There are some twenty, but a dialect with a
+layout is made for each camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +27,13 @@ class Features:
 
     Attributes:
         ordered: messages arrive in order and none is lost (TCP).
-        numbered: a trigger may be given a sequence number.
-        acknowledged: a trigger is answered.
-        polled: the status is sent on request, not by itself.
+        numbered: the sequence number of a trigger can be set.
+        acknowledged: the camera answers a trigger.
+        polled: the camera sends the status only on request.
         fences: a Query is sent with each trigger; the messages around its answer show whether
             the camera accepted the trigger.
         shows_triggers: the status shows each accepted trigger.
-        ends_triggers: a trigger without a result is ended before its deadline.
+        ends_triggers: the client ends a trigger without a result before the trigger's deadline.
         tells_all: every change of the status is sent, in order, and nothing else shows the outcome
             of a trigger.
     """
@@ -49,7 +49,7 @@ class Features:
 
     @staticmethod
     def of(link: Link) -> Features:
-        """Return the features of a link's session; a dialect's features are found out once."""
+        """Return the features of a link's session; they are cached for each dialect."""
         dialect, ordered = link.machine.dialect, link.machine.transport is Transport.TCP
         known = _known_features.get((id(dialect), ordered))
         if known is not None:
@@ -64,7 +64,7 @@ class Features:
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
         ends = dialect.has(m.EndTrigger)
-        # if answers come in order, the answer itself is enough
+        # a camera that answers in order needs no Query: the trigger's answer is enough
         fences = ordered and not dialect.in_order
         tells_all = fences and dialect.shows_triggers and not (polled or acknowledged or ends)
         return Features(
@@ -83,8 +83,7 @@ NO_FEATURES = Features()
 """The features before the first session."""
 
 _known_features: dict[tuple[int, bool], tuple[Dialect, Features]] = {}
-"""Features by the id of their dialect, which is kept beside them, and whether messages come in
-order."""
+"""Features, with their dialect, by the id of the dialect and whether messages come in order."""
 
 
 @dataclass(eq=False)
@@ -122,7 +121,7 @@ class Connection:
         Raises:
             LinkError: the reason why there is no session.
         """
-        if self._waits.end is not None:
+        if self._waits.end_reason is not None:
             self._waits.raise_end()
         if self.link is None:
             raise ConnectionClosedError(f"{self.name}: not connected: open it first")
@@ -153,8 +152,8 @@ class Connection:
         Raises:
             ConfigurationError: the timeout is no finite number of seconds, 0 or more.
         """
-        return self.in_seconds(check_seconds(timeout, "timeout", self.name))
+        return self.unchecked_deadline(check_seconds(timeout, "timeout", self.name))
 
-    def in_seconds(self, timeout: float) -> float:
+    def unchecked_deadline(self, timeout: float) -> float:
         """Return the loop time in ``timeout`` seconds, without a check."""
         return (self._loop or asyncio.get_running_loop()).time() + timeout

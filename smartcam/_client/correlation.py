@@ -1,7 +1,8 @@
 """Decide to which trigger a result belongs, since the wire carries no correlation.
 
-A container is a trigger's result only if the camera's messages show that it accepted this trigger
-(:class:`TriggerEvidence` and its subclasses). The absence of contrary evidence is not enough.
+A container is a trigger's result only if the camera's messages show that the camera accepted this
+trigger (:class:`TriggerEvidence` and its subclasses). Messages that merely do not contradict are
+not enough.
 
 If every status is sent (TCP, all dialects but ``bid``), one Query is sent before the trigger and
 one after it, in the same write. The camera handles one message after the other and sends in order
@@ -19,9 +20,9 @@ has dropped none, since that bit stays until it is reset.
 If the layout of the trigger has an ``@sequence`` field, the number must be right, too. The client
 sets it by Set sequence number right before the trigger.
 
-A trigger that was given up leaves an *owed* result. The next trigger waits for it, or makes it
-impossible (:meth:`~smartcam._client.triggering.Triggers.trigger`). Only a container after the
-beginning of the given-up trigger's inspection can be the owed result.
+A trigger that was given up leaves an *owed* result. The next trigger waits for this result, or
+makes it impossible (:meth:`~smartcam._client.triggering.Triggers.trigger`). Only a container after
+the beginning of the given-up trigger's inspection can be the owed result.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ from typing import Literal
 
 from smartcam.models import Status
 
-Debt = Literal["late", "streamed"]
+OwedFate = Literal["late", "streamed"]
 
 NUMBER_STEP = 1000
 """Step by which each trigger's number is lower than the number of the trigger before.
 
-Runs that others trigger in between count up from this number, away from the next number.
+Inspections that others trigger meanwhile count up from this number, away from the next one.
 """
 
 FEWEST_NUMBERS = 64
-"""Least number of triggers before the numbers of a narrow field repeat, by a smaller step."""
+"""Least number of triggers until numbers repeat; for that, a narrow field has a smaller step."""
 
 RANGE_OF_FIRST_NUMBER = (1 << 31) - 1
 """Number of values from which a new client draws its first number at random."""
@@ -50,23 +51,24 @@ MAX_OWED = 1024
 
 
 class TriggerEvidence:
-    """Evidence that the camera accepted a trigger; this class is for cameras without evidence.
+    """Evidence that the camera accepted a trigger; this base class needs none.
 
-    Such cameras use UDP, where statuses and their order may be lost, or handle commands one after
-    the other, so that an answer needs no proof (In-Sight).
+    It is for UDP, where statuses and their order may be lost, and for cameras that handle commands
+    one after the other, so that an answer needs no proof (In-Sight).
 
     Attributes:
-        began: number of observed beginnings of inspections that may belong to the trigger. If every
-            status is reported and ``proven`` is True, the first of them does.
+        begin_count: number of observed beginnings of inspections that may belong to the trigger. If
+            the client gets every status and ``proven`` is True, the first inspection is the
+            trigger's.
         reached: True if containers that arrive now are not older than the trigger.
         proven: True if the messages prove that the camera accepted this trigger.
         doubtful: True if the messages can no longer show which trigger the camera accepted.
     """
 
-    __slots__ = ("began", "doubtful", "proven", "reached")
+    __slots__ = ("begin_count", "doubtful", "proven", "reached")
 
     def __init__(self) -> None:
-        self.began = 0
+        self.begin_count = 0
         self.reached = self.proven = True
         self.doubtful = False
 
@@ -79,18 +81,18 @@ class TriggerEvidence:
     def on_status(self, status: int) -> None:
         """Note a status."""
 
-    def take_round(self) -> bool:
-        """Note all messages of a trigger together; return False if they must be noted singly."""
+    def note_usual_round(self) -> bool:
+        """Note the usual messages of a trigger together; return False if each must be noted."""
         return False
 
     def on_beginning(self) -> bool:
         """Note that an inspection began; return True if it may be the trigger's."""
-        self.began += 1
-        return self.began == 1
+        self.begin_count += 1
+        return self.begin_count == 1
 
 
 class EvidenceByAcknowledgement(TriggerEvidence):
-    """Evidence of a camera that answers each accepted trigger: containers before it are older."""
+    """Evidence of a camera that answers each accepted trigger: earlier containers are older."""
 
     __slots__ = ()
 
@@ -106,7 +108,7 @@ class EvidenceByAcknowledgement(TriggerEvidence):
 class EvidenceByFence(TriggerEvidence):
     """Evidence without statuses: containers before the Query's answer are older.
 
-    It shows nothing about later containers.
+    About containers after the answer it shows nothing.
     """
 
     __slots__ = ()
@@ -127,58 +129,58 @@ class EvidenceByStatus(TriggerEvidence):
     shows is the trigger's.
     """
 
-    __slots__ = ("_answers",)
+    __slots__ = ("_answer_count",)
 
     def __init__(self) -> None:  # without its base's, to be fast: each trigger makes one
-        self.began = 0
+        self.begin_count = 0
         self.reached = self.proven = self.doubtful = False
-        self._answers = 0  # answers to the Queries before the trigger and after it
+        self._answer_count = 0  # answers to the Queries before the trigger and after it
 
     def on_query_answer(self) -> None:
         """Note an answer; the second one completes the count of inspections between both."""
-        self._answers += 1
-        self.proven = self._answers == 2 and self.began > 0
+        self._answer_count += 1
+        self.proven = self._answer_count == 2 and self.begin_count > 0
 
     def on_beginning(self) -> bool:
-        """Count the inspection; of two between the answers neither is known to be the trigger's."""
-        if not self._answers:
+        """Count the inspection; if two begin between the answers, the trigger's is not known."""
+        if not self._answer_count:
             return False
-        self.began += 1
-        self.reached = self.began == 1
-        if self._answers == 2:
+        self.begin_count += 1
+        self.reached = self.begin_count == 1
+        if self._answer_count == 2:
             self.proven = True
         else:
-            self.doubtful = self.began > 1
+            self.doubtful = self.begin_count > 1
         return self.reached
 
-    def take_round(self) -> bool:
+    def note_usual_round(self) -> bool:
         """Note both answers and one inspection between them, if nothing was noted yet."""
-        if self._answers or self.began:
+        if self._answer_count or self.begin_count:
             return False
-        self._answers, self.began, self.reached, self.proven = 2, 1, True, True
+        self._answer_count, self.begin_count, self.reached, self.proven = 2, 1, True, True
         return True
 
 
 class EvidenceByAnswer(TriggerEvidence):
     """Evidence by the trigger's answer and the requested statuses around it (``bid`` over TCP)."""
 
-    __slots__ = ("_queried", "_waited")
+    __slots__ = ("_query_answered", "_waited_before")
 
     def __init__(self) -> None:
         super().__init__()
         self.reached = self.proven = False
-        self._queried = False
-        # whether the camera waits for a trigger, by the first status after the Query's answer
-        self._waited: bool | None = None
+        self._query_answered = False
+        # whether the camera waited for a trigger, by the first status after the Query's answer
+        self._waited_before: bool | None = None
 
     def on_query_answer(self) -> None:
         """Note that the next status shows the camera's state before the trigger."""
-        self._queried = True
+        self._query_answered = True
 
     def on_trigger_answer(self) -> None:
         """Note the trigger's answer; if the camera is busy, the trigger stays doubtful."""
         self.reached = True
-        self.doubtful = not self._waited
+        self.doubtful = not self._waited_before
 
     def on_status(self, status: int) -> None:
         """Check that the camera waited for the trigger, and dropped no trigger."""
@@ -187,8 +189,8 @@ class EvidenceByAnswer(TriggerEvidence):
                 self.doubtful = True
             else:
                 self.proven = True
-        elif self._queried and self._waited is None:
-            self._waited = status & (_WAITING | _OVERTRIGGERED) == _WAITING
+        elif self._query_answered and self._waited_before is None:
+            self._waited_before = status & (_WAITING | _OVERTRIGGERED) == _WAITING
 
 
 @dataclass(slots=True, eq=False)
@@ -200,7 +202,7 @@ class SentTrigger:
         number: sequence number set for it, None if its layout has none.
         evidence: evidence from the camera's messages.
         received: number of its received results.
-        early: containers received before the camera showed that it had accepted the trigger.
+        early_count: containers received before the camera showed that it had accepted the trigger.
         given_up: True if the trigger was given up; its missing results are owed.
         ended: True if its caller no longer waits.
     """
@@ -209,7 +211,7 @@ class SentTrigger:
     number: int | None
     evidence: TriggerEvidence
     received: int = field(init=False, default=0)
-    early: int = field(init=False, default=0)
+    early_count: int = field(init=False, default=0)
     given_up: bool = field(init=False, default=False)
     ended: bool = field(init=False, default=False)
 
@@ -239,9 +241,9 @@ _OVERTRIGGERED = int(Status.OVERTRIGGERED)
 class _Owed:
     """Results of a given-up trigger, which may still arrive."""
 
-    fate: Debt
+    fate: OwedFate
     number: int | None
-    missing: int
+    missing_count: int
     evidence: TriggerEvidence
 
 
@@ -254,28 +256,28 @@ class Correlation:
 
     Attributes:
         pending: the running trigger.
-        satisfied: whether the last trigger has its results, and no inspection was observed since.
+        satisfied: whether the last trigger has its results, and no inspection has begun since.
         owed: results of given-up triggers, which may still arrive; the oldest first.
-        doubted: whether the status may be older than the last trigger, which was given up. Then it
-            may show that the camera waits although it is inspecting.
+        doubted: whether the status may be older than the last trigger, which was given up. Then the
+            status may show that the camera waits although it is inspecting.
     """
 
     def __init__(self, chance: float) -> None:
         self.pending: SentTrigger | None = None
         self.doubted: bool = False
-        self._complete = False  # whether every status is sent, in order
+        self._gets_every_status = False  # whether every status is sent, in order
         self.satisfied: bool = False
         # evidence of the last trigger, until it has its results
         self._last: TriggerEvidence | None = None
         self.owed: list[_Owed] = []
         # owed results by the triggers' numbers; they are late whenever they arrive
-        self._given_up: dict[int, Debt] = {}
+        self._given_up_fates: dict[int, OwedFate] = {}
         self._last_number: int | None = None  # number of the last trigger that had its results
-        self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
-        self._given_number: int | None = None
+        self._last_own_number = int(chance * RANGE_OF_FIRST_NUMBER)
+        self._user_number: int | None = None
 
     @property
-    def debt(self) -> Debt | None:
+    def owed_fate(self) -> OwedFate | None:
         """Fate of the result of an earlier trigger that may still arrive."""
         return self.owed[0].fate if self.owed else None
 
@@ -287,67 +289,71 @@ class Correlation:
         Args:
             complete: every change of the status is sent, in order.
         """
-        self._complete = complete
+        self._gets_every_status = complete
         self.satisfied = self.doubted = False
         self._last = None
         for owed in self.owed:  # the status with its inspection's beginning may have been lost
             owed.evidence = TriggerEvidence()
-            owed.evidence.began = 1
+            owed.evidence.begin_count = 1
 
-    def settled(self) -> None:
-        """Note that no older result can arrive, since the application was stopped."""
+    def forget_owed(self) -> None:
+        """Forget owed results, since none can arrive: the application was stopped or replaced."""
         self.owed.clear()
         self.satisfied = self.doubted = False
         self._last = None
 
     def note_query_answered(self) -> None:
-        """Note that all earlier messages are received, since a later Query is answered.
+        """Note that a Query is answered, so that all messages of earlier triggers are received.
 
-        A trigger without a sign of an inspection was not accepted: it will have no result.
+        An earlier trigger without a sign of an inspection was not accepted: it has no result.
         """
         self.doubted = False
-        if self._complete:
-            self.owed = [owed for owed in self.owed if owed.evidence.began]
+        if self._gets_every_status:
+            self.owed = [owed for owed in self.owed if owed.evidence.begin_count]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
 
     def take_number(self, highest: int) -> int:
-        """Return the next trigger's number: the number that the user has set, or the client's own.
+        """Return the next trigger's number: the one that the user has set, or the client's own.
 
         Args:
             highest: largest number that the field holds.
         """
-        given, self._given_number = self._given_number, None
-        used = given is None or given in self._given_up or given == self._last_number
-        if given is not None and given <= highest and not used:
-            return given
+        user_number, self._user_number = self._user_number, None
+        used = (
+            user_number is None
+            or user_number in self._given_up_fates
+            or user_number == self._last_number
+        )
+        if user_number is not None and user_number <= highest and not used:
+            return user_number
         step = min(NUMBER_STEP, (highest + 1) // FEWEST_NUMBERS)
-        self._turn -= step
-        return self._turn % (highest + 1)
+        self._last_own_number -= step
+        return self._last_own_number % (highest + 1)
 
-    def give_number(self, number: int) -> None:
-        """Note that the user has set the number of the next run."""
-        self._given_number = number
+    def set_next_number(self, number: int) -> None:
+        """Note that the user has set the number of the next inspection."""
+        self._user_number = number
 
-    def send(self, pending: SentTrigger) -> None:
-        """Note that a trigger is sent now."""
+    def begin_trigger(self, pending: SentTrigger) -> None:
+        """Note that a trigger is sent."""
         self.pending, self.satisfied = pending, False
         self._last = pending.evidence
         if pending.number is None:
-            self._given_number = None  # the trigger's run uses it
+            self._user_number = None  # the trigger's inspection uses it
 
-    def leave(self) -> None:
+    def end_trigger(self) -> None:
         """Note that the trigger's caller no longer waits."""
         self.pending = None
 
-    def done(self, pending: SentTrigger) -> None:
+    def complete(self, pending: SentTrigger) -> None:
         """Note that the trigger has all its results."""
         self.satisfied, self._last_number = True, pending.number
         self._last = None
 
-    def give_up(self, pending: SentTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
-        """End the caller's wait for the trigger, whose results may still arrive.
+    def give_up(self, pending: SentTrigger, fate: OwedFate = "late", *, unread: int = 0) -> None:
+        """Note that the caller no longer waits for the trigger, whose results may still arrive.
 
         Args:
             pending: the trigger.
@@ -356,19 +362,19 @@ class Correlation:
         """
         # without evidence the received results may belong to another trigger
         received = pending.received if pending.evidence.proven else 0
-        missing = pending.wanted - received - unread
-        if pending.given_up or missing <= 0:
+        missing_count = pending.wanted - received - unread
+        if pending.given_up or missing_count <= 0:
             return
         pending.given_up = True
-        self.doubted = self.doubted or not pending.evidence.began
-        self.owed.append(_Owed(fate, pending.number, missing, pending.evidence))
+        self.doubted = self.doubted or not pending.evidence.begin_count
+        self.owed.append(_Owed(fate, pending.number, missing_count, pending.evidence))
         del self.owed[:-MAX_OWED]
         if pending.number is not None:
-            self._given_up[pending.number] = fate
-            if len(self._given_up) > MAX_OWED:
-                del self._given_up[next(iter(self._given_up))]
+            self._given_up_fates[pending.number] = fate
+            if len(self._given_up_fates) > MAX_OWED:
+                del self._given_up_fates[next(iter(self._given_up_fates))]
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ received messages
 
     def on_query_answer(self) -> None:
         """Note that a Query that was sent with the last trigger is answered."""
@@ -380,16 +386,16 @@ class Correlation:
         if self._last is not None:
             self._last.on_trigger_answer()
 
-    def take_round(self, pending: SentTrigger) -> bool:
-        """Note two answers, and one inspection between them; return False in any other case.
+    def note_usual_round(self, pending: SentTrigger) -> bool:
+        """Note two answers and one inspection between them; return False if this is not possible.
 
-        The other cases: the trigger already has a result, an earlier result is owed, or the
-        evidence is of another kind. After True, a container after the inspection is this trigger's.
+        It is not if the trigger already has a result, an earlier result is owed, or the evidence is
+        of another kind. After True, the container of the inspection is this trigger's.
         """
         evidence = pending.evidence
-        if not self._complete or self.owed or self._last is not evidence:
+        if not self._gets_every_status or self.owed or self._last is not evidence:
             return False
-        if not evidence.take_round():
+        if not evidence.note_usual_round():
             return False
         self.doubted = False
         return True
@@ -415,17 +421,17 @@ class Correlation:
             self.doubted = False
             return False
         self.satisfied = False
-        self._given_number = None  # the run of this trigger uses the number
-        return self._complete and previous is not None
+        self._user_number = None  # the inspection uses the number
+        return self._gets_every_status and previous is not None
 
     def judge_marked(self, is_ours: bool) -> Match:
-        """Return the trigger of a container if the wire shows whether it answers this client."""
+        """Return the trigger of a container that the wire marks as this client's or not."""
         pending = self.pending
         if not is_ours:
             return NOBODYS
         if pending is not None and not pending.ended:
             return OURS if pending.received < pending.wanted else EXTRA
-        return Match(self._pay(self.owed[:1]))
+        return Match(self._count_owed(self.owed[:1]))
 
     def judge(self, number: int | None) -> Match:
         """Return the trigger that a container of the right application belongs to.
@@ -440,37 +446,37 @@ class Correlation:
             if not numbered or number == pending.number:
                 if pending.evidence.reached:
                     return OURS if pending.received < pending.wanted else EXTRA
-                if not pending.evidence.began:
-                    pending.early += 1
+                if not pending.evidence.begin_count:
+                    pending.early_count += 1
         return self.judge_older(number)
 
     def judge_older(self, number: int | None) -> Match:
         """Return the trigger of a container that does not belong to the running trigger."""
-        if number is not None and number in self._given_up:
-            self._pay([owed for owed in self.owed if owed.number == number])
-            return Match(self._given_up[number])
+        if number is not None and number in self._given_up_fates:
+            self._count_owed([owed for owed in self.owed if owed.number == number])
+            return Match(self._given_up_fates[number])
         if number is not None and number == self._last_number:
             return EXTRA
         # an unknown number may belong to a trigger that was sent without a number
         if self.owed:
-            open_ = [
+            candidates = [
                 owed
                 for owed in self.owed
-                if (number is None or owed.number is None) and self._may_pay(owed.evidence)
+                if (number is None or owed.number is None) and self._may_be_owed(owed.evidence)
             ]
-            if open_:
-                return Match(self._pay(open_))
+            if candidates:
+                return Match(self._count_owed(candidates))
         return EXTRA if self.satisfied and number is None else NOBODYS
 
-    def _may_pay(self, run: TriggerEvidence) -> bool:
-        """Return True if a container that arrives now may belong to a run that has begun."""
-        return bool(run.began) or (run.reached and not self._complete)
+    def _may_be_owed(self, evidence: TriggerEvidence) -> bool:
+        """Return True if a container that arrives now may be a result of a given-up trigger."""
+        return bool(evidence.begin_count) or (evidence.reached and not self._gets_every_status)
 
-    def _pay(self, owed: list[_Owed]) -> Debt:
-        """Note that the first of these owed results has arrived."""
+    def _count_owed(self, owed: list[_Owed]) -> OwedFate:
+        """Note that the first of these owed results has arrived, and return its fate."""
         if not owed:
             return "late"
-        owed[0].missing -= 1
-        if owed[0].missing == 0:
+        owed[0].missing_count -= 1
+        if owed[0].missing_count == 0:
             self.owed.remove(owed[0])
         return owed[0].fate

@@ -33,7 +33,7 @@ class Times:
         self._longest = float("-inf")
 
     def add(self, seconds: float) -> None:
-        """Count one."""
+        """Count a time."""
         self._counts[bisect.bisect_left(HISTOGRAM_BOUNDS, seconds)] += 1
         self._total += seconds
         if seconds < self._shortest:
@@ -43,13 +43,13 @@ class Times:
 
     def histogram(self) -> Histogram:
         """Return a snapshot of the counts."""
-        has_times = self._longest >= self._shortest
+        any_times = self._longest >= self._shortest
         return Histogram(
             HISTOGRAM_BOUNDS,
             tuple(self._counts),
             self._total,
-            self._shortest if has_times else None,
-            self._longest if has_times else None,
+            self._shortest if any_times else None,
+            self._longest if any_times else None,
         )
 
 
@@ -83,7 +83,7 @@ class ClientCounters:
         self.round_trip: Times = Times()
         self.processing: Times = Times()
         self._wire = Counters()  # counts of the links that have ended
-        self._open: Counters | None = None
+        self._open_wire: Counters | None = None
 
     def count(self, fate: str, containers: int = 1) -> None:
         """Count containers with their fate, in one step: the sum always holds."""
@@ -98,12 +98,12 @@ class ClientCounters:
         """Count containers for a trigger that had its results already."""
         self.extra_results += containers
 
-    def note_other(self) -> None:
+    def note_foreign_inspection(self) -> None:
         """Count an inspection that something else has triggered."""
         self.inspections_by_others += 1
 
     def note_overtrigger(self) -> None:
-        """Count that the Overtriggered bit rose."""
+        """Count a rise of the Overtriggered bit."""
         self.overtriggers += 1
 
     def note_notice(self) -> None:
@@ -118,15 +118,15 @@ class ClientCounters:
         """Count a session, and the traffic of its link from now on."""
         self.end()
         self.sessions += 1
-        self._open = wire
+        self._open_wire = wire
 
     def end(self) -> None:
-        """Keep the counters of a link that is over."""
-        if self._open is not None:
-            # the link's own object may still change
-            first = self.sessions == 1
-            self._wire = Counters(*_read(self._open)) if first else self._wire_total()
-            self._open = None
+        """Add the counters of a link that has ended."""
+        if self._open_wire is not None:
+            # copied, since the link may still change its object
+            is_first = self.sessions == 1
+            self._wire = Counters(*_read(self._open_wire)) if is_first else self._wire_total()
+            self._open_wire = None
 
     def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:
         """Return everything counted so far."""
@@ -150,6 +150,6 @@ class ClientCounters:
         )
 
     def _wire_total(self) -> Counters:
-        if self._open is None:
+        if self._open_wire is None:
             return self._wire
-        return Counters(*map(operator.add, _read(self._wire), _read(self._open)))
+        return Counters(*map(operator.add, _read(self._wire), _read(self._open_wire)))

@@ -1,7 +1,8 @@
-"""A timer for deadlines that are set all the time and hardly ever reached.
+"""A timer for deadlines that are set often and hardly ever reached.
 
-A timer of the event loop costs more than the rest of a wait, and most are cancelled at once. This
-timer stays when a later deadline is set, and is set again only when it fires too soon.
+To make a timer of the event loop costs more than all other steps of a wait, and most timers are
+cancelled at once. This timer is kept when a later deadline is set; when it fires before that, it is
+set again.
 """
 
 from __future__ import annotations
@@ -17,34 +18,34 @@ OwnerT = TypeVar("OwnerT")
 
 
 class DeadlineTimer:
-    """Calls back at a deadline; one deadline at a time.
+    """Calls a function at a deadline; there is one deadline at a time.
 
     Args:
         callback: function that is called in the event loop.
     """
 
-    __slots__ = ("_at", "_callback", "_deadline", "_timer")
+    __slots__ = ("_callback", "_deadline", "_fires_at", "_timer")
 
     def __init__(self, callback: Callable[[], None]) -> None:
         self._callback = callback
         self._deadline: float | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._at = 0.0  # loop time at which the timer fires
+        self._fires_at = 0.0  # loop time at which the timer fires
 
     def set(self, deadline: float) -> None:
-        """Call back at ``deadline`` (loop time), unless it is cleared or set anew before."""
+        """Call the function at ``deadline`` (loop time), unless that is cleared or set again."""
         self._deadline = deadline
-        if self._timer is not None and self._at <= deadline:
+        if self._timer is not None and self._fires_at <= deadline:
             return
         self._stop_timer()
         self._start_timer(deadline)
 
     def clear(self) -> None:
-        """Do not call back."""
+        """Remove the deadline, so that the function is not called."""
         self._deadline = None
 
     def cancel(self) -> None:
-        """Do not call back, and leave nothing in the event loop."""
+        """Remove the deadline and the timer in the event loop."""
         self.clear()
         self._stop_timer()
 
@@ -53,16 +54,16 @@ class DeadlineTimer:
             self._timer.cancel()
             self._timer = None
 
-    def _start_timer(self, at: float) -> None:
-        self._at = at
-        self._timer = asyncio.get_running_loop().call_at(at, self._on_timer)
+    def _start_timer(self, fires_at: float) -> None:
+        self._fires_at = fires_at
+        self._timer = asyncio.get_running_loop().call_at(fires_at, self._on_timer)
 
     def _on_timer(self) -> None:
-        at, deadline = self._at, self._deadline
+        fires_at, deadline = self._fires_at, self._deadline
         self._timer = None
         if deadline is None:
             return
-        if deadline > at:
+        if deadline > fires_at:
             self._start_timer(deadline)
             return
         self._deadline = None
@@ -70,15 +71,15 @@ class DeadlineTimer:
 
 
 def weak_callback(owner: OwnerT, function: Callable[[OwnerT], None]) -> Callable[[], None]:
-    """Return a function that calls ``function`` with ``owner``, as long as the owner lives.
+    """Return a function that calls ``function`` with ``owner``, as long as the owner exists.
 
-    An owner of a timer that called a method of it would be freed by the garbage collector only.
+    The timer does not refer to its owner, which is therefore freed without the garbage collector.
     """
     reference = weakref.ref(owner)
 
     def call() -> None:
-        living = reference()
-        if living is not None:
-            function(living)
+        living_owner = reference()
+        if living_owner is not None:
+            function(living_owner)
 
     return call

@@ -1,8 +1,8 @@
-"""Pass everything that comes from the camera to the tasks that wait for it.
+"""Pass everything that the camera sends to the tasks that wait for it.
 
-The receive task hands every chunk to :meth:`Dispatch.dispatch`, which never waits: an answer
-completes its request, a status is shown to every predicate in order, a result gets exactly one fate
-and goes to its trigger and to the streams.
+The receive task passes every chunk to :meth:`Dispatch.dispatch`, which never waits: an answer
+completes its request, every predicate is called with each status in order, and a result gets
+exactly one fate and goes to its trigger and to the streams.
 """
 
 from __future__ import annotations
@@ -35,17 +35,18 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
     from smartcam.protocols._inside import Event
 
-FEWEST_GATHERED = 6
-"""Least number of events of a chunk to examine: two results, each between statuses."""
+MIN_EVENTS_TO_GATHER = 6
+"""Least number of events of a chunk whose containers are gathered: two results, each between
+statuses."""
 
-ROUND_EVENTS = 5
-"""Events that a trigger brings: two answers to Queries, and between them two statuses around the
-result."""
+EVENTS_PER_TRIGGER = 5
+"""Usual number of events after a trigger: two answers to Queries, and between them the result,
+which is between two statuses."""
 
 MAX_NOTICE_CHARACTERS = 4096
-"""Largest number of characters of a camera's remark that are kept."""
+"""Largest number of characters that are kept of a remark of the camera."""
 
-_LOGGED = (
+_LOGGED_CHANGES = (
     (
         Status.OVERHEAT,
         logging.WARNING,
@@ -55,30 +56,30 @@ _LOGGED = (
     (Status.OVERHEAT, logging.INFO, "no heat", "= the camera is no longer too hot"),
     (Status.SYSTEM_ERROR, logging.ERROR, "System Error", "! the camera reports System Error"),
 )
-"""Bits whose rise is logged; with INFO, their fall is, too."""
+"""Bits whose change is logged: with INFO their fall, otherwise their rise."""
 
-_NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
+_NOTED_BITS = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
 
-class _Round(NamedTuple):
-    """The messages around the result of a trigger: the same objects each time.
+class _UsualRound(NamedTuple):
+    """The messages that usually surround a trigger's result: the same objects each time.
 
     Attributes:
-        first: answer to the Query before the trigger.
-        began: status when the inspection begins.
-        ended: status when the camera waits again.
-        last: answer to the Query after the trigger.
+        first_answer: answer to the Query before the trigger.
+        begin_status: status when the inspection begins.
+        end_status: status when the camera waits again.
+        last_answer: answer to the Query after the trigger.
         application: the application that both answers name.
         bits: bits of the last status, equal to the bits of the status before.
         endian: byte order in both statuses.
     """
 
-    first: Event
-    began: m.StatusReport
-    ended: m.StatusReport
-    last: Event
+    first_answer: Event
+    begin_status: m.StatusReport
+    end_status: m.StatusReport
+    last_answer: Event
     application: int
     bits: int
     endian: int
@@ -99,14 +100,15 @@ class Dispatch:
     def __post_init__(self) -> None:
         self._dialect: Dialect | None = None
         self._remarks = Remarks(self._name)
-        self._round: _Round | None = None  # around the last trigger's result, if that was usual
-        self._notes_events = False  # events are used although there is no subscriber
-        self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
+        # messages around the last trigger's result; None if they were not the usual ones
+        self._usual: _UsualRound | None = None
+        self._observers_want_events = False
+        self._handlers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
             m.ResultContainer: self._results.on_result,
             ResultBurst: self._results.on_burst,
-            m.QueryAnswer: self._on_active,
-            m.SwitchAnswer: self._on_switched,
+            m.QueryAnswer: self._on_query_answer,
+            m.SwitchAnswer: self._on_switch_answer,
             m.TriggerAnswer: self._on_trigger_answer,
             m.Notice: self._on_notice,
         }
@@ -131,120 +133,120 @@ class Dispatch:
         No request is sent before that: an answer among them belongs to the handshake.
         """
         for chunk in chunks:
-            self._hand_on(chunk)
+            self._dispatch_chunk(chunk)
         if self._state.active_in_doubt:
-            self._requests.ask_what_is_active()
+            self._requests.ask_active_application()
 
     def dispatch(self, chunk: Chunk) -> None:
         """Pass on every event of a chunk, in order; never waits, never raises."""
-        self._hand_on(chunk)
+        self._dispatch_chunk(chunk)
         if self._state.active_in_doubt:
-            self._requests.ask_what_is_active()
+            self._requests.ask_active_application()
 
-    def _hand_on(self, chunk: Chunk) -> None:
-        at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
-        events, takers = chunk.events, self._takers
-        self._notes_events = self._listeners.notes_events()
-        if len(events) == ROUND_EVENTS and self._take_round(events, now, at):
+    def _dispatch_chunk(self, chunk: Chunk) -> None:
+        at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.pending_answers
+        events, handlers = chunk.events, self._handlers
+        self._observers_want_events = self._listeners.observers_want_events()
+        if len(events) == EVENTS_PER_TRIGGER and self._handle_usual_round(events, now, at):
             return
-        if len(events) >= FEWEST_GATHERED and self._only_streams():
-            events = gathered(events, self._state.endian)
+        if len(events) >= MIN_EVENTS_TO_GATHER and self._is_streaming_only():
+            events = gather_containers(events, self._state.endian)
         for event in events:
-            take = takers.get(type(event))
-            if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
-                take(event, now, at)
+            handle = handlers.get(type(event))
+            if handle is not None:  # LinkFailed and LinkEnded have none: they end the receive task
+                handle(event, now, at)
             if answers and isinstance(event, m.Message):
                 self._waits.on_message(event, now, chunk.delivery)
 
-    def _take_round(self, events: list[Event], now: float, at: datetime) -> bool:
-        """Handle the answers to the trigger under way in one step, if they are the usual ones.
+    def _handle_usual_round(self, events: list[Event], now: float, at: datetime) -> bool:
+        """Handle the answers to the running trigger in one step, if they are the usual ones.
 
-        Only the trigger's caller and streams of results may use them. The effect is the same as of
-        one event after the other, which
-        ``python -m tests.client.proofs.straight`` shows, or does nothing and returns False.
+        Otherwise do nothing and return False. Nobody but the trigger's caller and the streams of
+        results may use the answers. ``python -m tests.client.proofs.straight`` shows that the
+        effect is the same as of one event after the other.
         """
-        first, began, container, ended, last = events
-        known = self._round
+        first_answer, begin_status, container, end_status, last_answer = events
+        usual = self._usual
         if (
-            known is None
-            or first is not known.first
-            or began is not known.began
-            or ended is not known.ended
-            or last is not known.last
+            usual is None
+            or first_answer is not usual.first_answer
+            or begin_status is not usual.begin_status
+            or end_status is not usual.end_status
+            or last_answer is not usual.last_answer
         ):
-            known = self._round = _round_of(events)
-        if known is None or type(container) is not m.ResultContainer:
+            usual = self._usual = _usual_round(events)
+        if usual is None or type(container) is not m.ResultContainer:
             return False
         state, listeners = self._state, self._listeners
         if (
-            self._notes_events
+            self._observers_want_events
             or listeners.events.references
             or listeners.statuses.references
             or not self._waits.awaits_fences(2)
-            or not state.stays(known.application, known.bits, known.endian)
-            or container.application != known.application
+            or not state.is_unchanged(usual.application, usual.bits, usual.endian)
+            or container.application != usual.application
         ):
             return False
-        owner = self._results.take_round(container)
+        owner = self._results.take_usual_round(container)
         if owner is None:
             return False
         self._waits.expect_fences(0)
-        if listeners.hears_statuses:  # an agent
-            state.report(known.began, ())
-            listeners.offer_status(known.began.status, now)
-            self._results.hand_on(container, owner, "triggered", None, now, at)
-            state.report(known.ended, ())
-            listeners.offer_status(known.ended.status, now)
+        if listeners.wants_statuses:  # an agent
+            state.note_status(usual.begin_status, ())
+            listeners.offer_status(usual.begin_status.status, now)
+            self._results.deliver(container, owner, "triggered", None, now, at)
+            state.note_status(usual.end_status, ())
+            listeners.offer_status(usual.end_status.status, now)
             return True
-        state.report_round(known.ended)
-        self._results.hand_on(container, owner, "triggered", None, now, at)
+        state.note_usual_statuses(usual.end_status)
+        self._results.deliver(container, owner, "triggered", None, now, at)
         return True
 
-    def _only_streams(self) -> bool:
-        """Return True if no task needs statuses, and containers go to streams in any case."""
+    def _is_streaming_only(self) -> bool:
+        """Return True if no task waits for messages but the streams of results."""
         waits, listeners = self._waits, self._listeners
-        awaited = waits.answers or waits.statuses or listeners.hears_statuses
-        return not (awaited or listeners.sees_events) and self._results.only_streams
+        awaited = waits.pending_answers or waits.status_waiters or listeners.wants_statuses
+        return not (awaited or listeners.wants_events) and self._results.is_streaming_only
 
     def fail(self, error: SmartCamError) -> None:
-        """End the session: every wait ends with an error, also one begun before the next session.
+        """End the session: every wait ends with an error, also one that begins between sessions.
 
-        The first reason stays. Streams go on until :meth:`finish`.
+        The first error counts. Streams stay open until :meth:`finish`.
         """
         if self._waits.fail(error):
             self._remarks.end()
-            if self._listeners.may_await:
+            if self._listeners.may_have_waiters:
                 self._listeners.fail(copy_to_raise(error))
             self._results.fail(error)
 
     def finish(self, error: SmartCamError) -> None:
-        """End the streams for good because of ``error``, quietly if this side closed."""
+        """End the streams for good because of ``error``; without an error if this side closed."""
         self.fail(error)
         self._waits.finish(error)
         self._results.finish()
         self._requests.finish()
-        self._takers = {}  # its methods refer to this object, which would wait for the collector
+        self._handlers = {}  # else its methods would keep this object until a garbage collection
         self._listeners.end(None if isinstance(error, ConnectionClosedError) else error)
 
-    # ------------------------------------------------------------------ by the kind of event
+    # ------------------------------------------------------------------ kinds of events
 
     def _verdict(self, code: int) -> Verdict:
         return Verdict.DONE if self._dialect is None else self._dialect.code(code).verdict
 
-    def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
-        if self._waits.take_fence():
+    def _on_query_answer(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
+        if self._waits.count_fence_answer():
             self._results.on_query_answer(now)
         state = self._state
         if answer.application != state.active and self._verdict(answer.code) is Verdict.DONE:
             state.set_active(answer.application, at)
 
-    def _on_switched(self, answer: m.SwitchAnswer, now: float, at: datetime) -> None:
-        done = self._verdict(answer.code) is Verdict.DONE
-        if done:
-            self._state.switched(answer.application)
+    def _on_switch_answer(self, answer: m.SwitchAnswer, now: float, at: datetime) -> None:
+        is_done = self._verdict(answer.code) is Verdict.DONE
+        if is_done:
+            self._state.note_switch(answer.application)
             self._results.on_switched()
-        known = self._dialect is None or answer.application in self._dialect.application_ids
-        if done or known:  # else the camera was too busy, or the answer too short
+        is_valid_id = self._dialect is None or answer.application in self._dialect.application_ids
+        if is_done or is_valid_id:  # else the camera was too busy, or the answer too short
             self._state.set_active(answer.application, at)
 
     def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
@@ -263,53 +265,53 @@ class Dispatch:
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
         before = state.status
-        previous = state.report(report, waits.answers)
-        bits, was = state.bits, previous or 0
-        if (bits ^ was) & _NOTED:
-            self._note_changes(bits, was, now)
+        previous = state.note_status(report, waits.pending_answers)
+        bits, old_bits = state.bits, previous or 0
+        if (bits ^ old_bits) & _NOTED_BITS:
+            self._note_changes(bits, old_bits, now)
         self._results.on_status(previous, bits, now)
-        if status != before and (self._notes_events or listeners.events.references):
+        if status != before and (self._observers_want_events or listeners.events.references):
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
             listeners.publish(event)
         listeners.offer_status(status, now)
-        if waits.statuses:
-            waits.show(status)
+        if waits.status_waiters:
+            waits.show_status(status)
 
-    def _note_changes(self, bits: int, was: int, now: float) -> None:
-        risen, fallen = bits & ~was, was & ~bits
+    def _note_changes(self, bits: int, old_bits: int, now: float) -> None:
+        risen, fallen = bits & ~old_bits, old_bits & ~bits
         if risen & Status.OVERTRIGGERED:
             self._counters.note_overtrigger()
-        for word, level, kind, text in _LOGGED:
-            if (risen if level != logging.INFO else fallen) & word:
+        for bit, level, kind, text in _LOGGED_CHANGES:
+            if (risen if level != logging.INFO else fallen) & bit:
                 self._remarks.log(kind, level, text, now=now)
 
 
-def _round_of(events: list[Event]) -> _Round | None:
+def _usual_round(events: list[Event]) -> _UsualRound | None:
     """Return the messages around a trigger's result; None if they are not the usual ones."""
-    first, began, _, ended, last = events
+    first, begin, _, end, last = events
     if (
-        not isinstance(began, m.StatusReport)
-        or not isinstance(ended, m.StatusReport)
+        not isinstance(begin, m.StatusReport)
+        or not isinstance(end, m.StatusReport)
         or not isinstance(first, m.QueryAnswer)
         or not isinstance(last, m.QueryAnswer)
     ):
         return None
-    bits, application = int(ended.status), first.application
-    plain = bits & (_WAITING | _RUNNING) == _WAITING | _RUNNING
-    if not plain or int(began.status) != bits & ~_WAITING:
+    bits, application = int(end.status), first.application
+    waits = bits & (_WAITING | _RUNNING) == _WAITING | _RUNNING
+    if not waits or int(begin.status) != bits & ~_WAITING:
         return None
-    if began.endian != ended.endian or last.application != application:
+    if begin.endian != end.endian or last.application != application:
         return None
-    return _Round(first, began, ended, last, application, bits, ended.endian)
+    return _UsualRound(first, begin, end, last, application, bits, end.endian)
 
 
-def gathered(events: list[Event], endian: int) -> list[Event]:
-    """Return events of a camera that runs free with its containers as one burst, then the statuses.
+def gather_containers(events: list[Event], endian: int) -> list[Event]:
+    """Return the containers among events as one burst, and after it the statuses.
 
-    It sends statuses around each container, so that containers that came together could not be
-    read together. The events are unchanged if there is anything else among them, or the place of a
-    container matters: it is of another application, or follows a status with another byte order
-    than ``endian``, the present one.
+    A camera that runs free sends statuses around each container, so that containers that were
+    received together could not be interpreted together. The events are returned unchanged if there
+    are other kinds among them, if the containers are of several applications, or if a status has
+    another byte order than ``endian``, the present one.
     """
     statuses: list[Event] = []
     data: list[bytes] = []
@@ -332,6 +334,6 @@ def gathered(events: list[Event], endian: int) -> list[Event]:
 
 
 def _is_plain(container: m.ResultContainer) -> bool:
-    """Return True if a container has only bytes, names its application, and was not asked for."""
+    """Return True if a container has only bytes, names its application, and answers no request."""
     named = container.application >= 0 and not container.asked
     return named and container.cells is None and container.fault is None

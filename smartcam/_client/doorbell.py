@@ -1,9 +1,9 @@
-"""Wake the receive task, and callers that wait for it, without a turn of the event loop.
+"""Wake the receive task, and the callers that it answers, without a turn of the event loop.
 
 A future wakes its task through the event loop, which takes a handle, another turn and another
-system call. That costs more than processing the bytes of a delivery. If a callback of the loop,
-such as a transport's, rings this doorbell, the task continues at once. It is still a task: an
-exception in it ends the task, and never reaches the callback.
+system call. That costs more than processing the received bytes. If a callback of the loop,
+such as a transport's, rings this doorbell, the task continues at once. It still is a task: an
+exception in the task ends the task, and never reaches the callback.
 
 A caller that waits for a :class:`DirectFuture` continues in the same way when the receive task
 sleeps again, since no task can take a step within another task's step. Other outcomes, such as a
@@ -42,12 +42,13 @@ class Doorbell:
     Cancellation: safe; the task is woken by the loop.
     """
 
-    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake", "due")
+    __slots__ = ("_asyncio_future_blocking", "_context", "_loop", "_wake", "to_wake")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop  # asyncio's tasks read it
-        # outcomes of the present delivery; None: outcomes wake their tasks through the loop
-        self.due: list[DirectFuture[Any]] | None = None
+        # outcomes set while the receive task runs, whose tasks are woken after it; None: an
+        # outcome wakes its task through the loop
+        self.to_wake: list[DirectFuture[Any]] | None = None
         self._asyncio_future_blocking = False
         # function that wakes the waiting task; None if no task waits
         self._wake: Callable[[Doorbell], None] | None = None
@@ -65,7 +66,7 @@ class Doorbell:
             self._loop.call_soon(wake, self, context=context)
 
     def deliver(self) -> None:
-        """Make the task continue like :meth:`ring`, then the callers whose outcomes it has set.
+        """Make the task continue as by :meth:`ring`, then the callers whose outcomes it has set.
 
         Exceptions that end the program are raised in the loop, since a transport would handle them
         as errors of its own.
@@ -74,26 +75,26 @@ class Doorbell:
         if wake is None or context is None or asyncio.current_task(loop) is not None:
             self.ring()
             return
-        self._wake, self.due = None, []
+        self._wake, self.to_wake = None, []
         try:
             context.run(wake, self)
         except ENDS_PROGRAM as exc:
             loop.call_soon(_raise, exc)
         finally:
-            due, self.due = self.due, None
-        for outcome in due or ():
+            to_wake, self.to_wake = self.to_wake, None
+        for outcome in to_wake or ():
             try:
                 outcome.wake()
             except ENDS_PROGRAM as exc:
                 loop.call_soon(_raise, exc)
 
     def wake_in_order(self) -> None:
-        """Wake the callers of this delivery through the loop, after the tasks that are ready.
+        """Wake callers through the loop, after the tasks that are ready by now.
 
         So subscribers get a result before its trigger's caller continues.
         """
-        due, self.due = self.due, None
-        for outcome in due or ():
+        to_wake, self.to_wake = self.to_wake, None
+        for outcome in to_wake or ():
             outcome.wake_soon()
 
     def outcome(self) -> DirectFuture[Any]:
@@ -105,15 +106,15 @@ class Doorbell:
         if isinstance(outcome, asyncio.Future) or asyncio.current_task(self._loop) is not None:
             outcome.set_result(value)
             return
-        due, self.due = self.due, []
+        to_wake, self.to_wake = self.to_wake, []
         outcome.set_result(value)
-        self.due = due
+        self.to_wake = to_wake
         try:
             outcome.wake()
         except ENDS_PROGRAM as exc:
             self._loop.call_soon(_raise, exc)
 
-    # ------------------------------------------------------------------ for the task's machinery
+    # ------------------------------------------------------------------ for asyncio's tasks
 
     def __await__(self) -> Generator[Doorbell, None, None]:
         self._asyncio_future_blocking = True
@@ -173,11 +174,11 @@ class DirectFuture(Generic[T]):
         if self._done:
             raise asyncio.InvalidStateError("the outcome is set already")
         self._done, self._value = True, value
-        due = self._bell.due
-        if due is None:
+        to_wake = self._bell.to_wake
+        if to_wake is None:
             self.wake_soon()
         else:
-            due.append(self)
+            to_wake.append(self)
 
     def set_exception(self, error: BaseException) -> None:
         """Make the task continue with an error.
@@ -206,7 +207,7 @@ class DirectFuture(Generic[T]):
         if wake is not None:
             self._loop.call_soon(wake, self, context=self._context)
 
-    # ------------------------------------------------------------------ for the task's machinery
+    # ------------------------------------------------------------------ for asyncio's tasks
 
     def __await__(self) -> Generator[DirectFuture[T], None, T]:
         if not self._done:
@@ -247,7 +248,7 @@ def wake(waiter: Waiter) -> None:
         waiter.set_result(None)
 
 
-async def outlast(task: asyncio.Task[Any]) -> None:
+async def wait_ended(task: asyncio.Task[Any]) -> None:
     """Wait until a task has ended in any way, like ``asyncio.wait`` but in fewer steps.
 
     Cancellation: the task is left alone.
@@ -279,17 +280,17 @@ class PlainDoorbell:
     Cancellation: safe.
     """
 
-    __slots__ = ("_loop", "_ringing")
+    __slots__ = ("_loop", "_waiter")
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         # future of the waiting task; None if no task waits
-        self._ringing: asyncio.Future[None] | None = None
+        self._waiter: asyncio.Future[None] | None = None
 
     def ring(self) -> None:
         """Make the task continue."""
-        if self._ringing is not None and not self._ringing.done():
-            self._ringing.set_result(None)
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
 
     def deliver(self) -> None:
         """Make the task continue; callers continue after it, through the loop."""
@@ -307,11 +308,11 @@ class PlainDoorbell:
         outcome.set_result(value)
 
     def __await__(self) -> Generator[Any, None, None]:
-        self._ringing = self._loop.create_future()
+        self._waiter = self._loop.create_future()
         try:
-            yield from self._ringing
+            yield from self._waiter
         finally:
-            self._ringing = None
+            self._waiter = None
 
 
 Outcome: TypeAlias = DirectFuture[Any] | asyncio.Future[Any]

@@ -2,10 +2,11 @@
 
 Each attempt sends Disconnect (harmless without a session; old sessions confuse the camera, thesis
 3.1.4), then Connect, and awaits the answer with its version, the first status and the answer to a
-Query. Anything unexpected, silence included, ends the attempt: close, fresh link, next attempt. To
-a camera that hangs up without a byte, the next attempt is made without the Disconnect.
-If no dialect is pinned, attempts take turns through the protocol's dialects. Those that begin a
-session alike share an attempt: the answer to Connect, and what follows, tells them apart.
+Query. Anything unexpected, silence included, ends the attempt, and the next one uses a new link.
+If a camera closes the connection without sending a byte, the next attempt is made without the
+Disconnect.
+If no dialect is pinned, the protocol's dialects are tried in turn. Dialects that begin a session
+alike share an attempt; the answer to Connect and the messages after it show which one it is.
 """
 
 from __future__ import annotations
@@ -51,21 +52,22 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
 DETECTION_TIMEOUT = 0.5
-"""Seconds for the answer to Connect in the first round while other dialects are still untried. A
-camera answers in milliseconds, one that speaks another dialect is silent; later rounds have the
-rest of the time, for slow links."""
+"""Seconds for the answer to Connect in the first round while other dialects are untried. A camera
+answers in milliseconds, or not at all if it speaks another dialect. Later rounds have the remaining
+time, for slow links."""
 
-TELLING_ROUNDS = 3
-"""Number of requests for the status that a camera must answer to count as one that answers."""
+MIN_STATUS_ANSWERS = 3
+"""Number of requests for the status that a camera must answer until its dialect has that request: a
+status may also come by itself."""
 
 BUSY_PAUSE = 0.05
 """Seconds until a camera that was too busy to name its application is asked again."""
 
 
 MAX_EARLY_BYTES = 1 << 20
-"""Largest number of bytes that may come while a session is made, beside one frame of
-``max_length``. Making one takes a few round trips, and the fastest camera sends a fraction of it
-meanwhile."""
+"""Largest number of bytes that may come while a session is made, in addition to one frame of
+``max_length``. A session takes a few round trips, in which the fastest camera sends a fraction of
+this number."""
 
 
 class Session(NamedTuple):
@@ -76,8 +78,8 @@ class Session(NamedTuple):
         address: address of the attempt, with the dialect pinned.
         dialect: dialect of the session.
         version: protocol version from the Connect answer.
-        early: every chunk that came meanwhile, in order: the first status, and any other
-            messages.
+        early: chunks received while the session was made, in order: the first status, and any
+            other messages.
     """
 
     link: Link
@@ -89,27 +91,32 @@ class Session(NamedTuple):
 
 @dataclass(slots=True)
 class _Collector:
-    """Takes events until a wanted one is there; keeps the rest for the client.
+    """Receives chunks while a session is made, and keeps them for the client.
 
     Attributes:
-        link: link that the events come from.
-        most: largest number of bytes that may come meanwhile.
+        link: link that the chunks come from.
+        max_bytes: largest number of bytes that may come until there is a session.
+        early: the chunks received.
+        version: protocol version in the answer to Connect.
+        statuses: number of statuses.
+        answers: number of answers to Query, successful or not.
+        application: application in the last answer to Query, if that was successful.
     """
 
     link: Link
-    most: int
+    max_bytes: int
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
-    answers: int = 0  # number of answers to Query, whatever their contents
+    answers: int = 0
     application: int | None = None
 
-    async def take(self) -> None:
+    async def receive_chunk(self) -> None:
         chunk = await self.link.receive()
         received = self.link.machine.counters.bytes_received
-        if received > self.most:
+        if received > self.max_bytes:
             raise RemoteProtocolError(
-                f"{received} bytes came before there was a session; {self.most} are accepted"
+                f"{received} bytes came before there was a session; {self.max_bytes} are accepted"
             )
         self.early.append(chunk)
         dialect = self.link.machine.dialect
@@ -141,41 +148,45 @@ class _Collector:
                 case _:
                     logger.debug("%s ! %s during connect", self.link.name, type(event).__name__)
 
-    async def ask(self, *first: Message) -> None:
-        """Send a Query after ``first`` and wait for its answer."""
+    async def query(self, *messages_before: Message) -> None:
+        """Send a Query after ``messages_before`` and wait for its answer."""
         before = self.answers
-        for message in first:
+        for message in messages_before:
             self.link.send(message, answered=False)
         self.link.send(Query())
         while self.answers == before:
-            await self.take()
+            await self.receive_chunk()
 
-    async def tell_apart(self) -> None:
-        """Find out which dialect of its kin the camera speaks, by an answer to Get status, or none.
+    async def find_dialect(self) -> None:
+        """Find out which of the machine's dialects the camera speaks: does it answer Get status?
 
-        A status may also come by itself, so it must come to each of several questions.
+        A status may also come by itself, so it must come after each of several requests.
         """
-        machine, reader = self.link.machine, self.link.machine.dialect
-        asking = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
-        others = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
-        if asking and others:
-            # a missing answer is certain if no message is lost
-            certain = 1 if machine.transport is Transport.TCP else 2
-            number = asking[0].message_id(GetStatus)
-            known = reader.has(GetStatus)
-            question = GetStatus() if known else UnknownMessage(message_id=number, payload=b"")
+        machine, first_dialect = self.link.machine, self.link.machine.dialect
+        with_status = [dialect for dialect in machine.kin if dialect.has(GetStatus)]
+        without_status = [dialect for dialect in machine.kin if not dialect.has(GetStatus)]
+        if with_status and without_status:
+            # one missing answer is enough if no message can be lost
+            silences_needed = 1 if machine.transport is Transport.TCP else 2
+            message_id = with_status[0].message_id(GetStatus)
+            has_status = first_dialect.has(GetStatus)
+            question = (
+                GetStatus() if has_status else UnknownMessage(message_id=message_id, payload=b"")
+            )
             answered = unanswered = 0
-            while answered < TELLING_ROUNDS and unanswered < certain:
+            while answered < MIN_STATUS_ANSWERS and unanswered < silences_needed:
                 before = self.statuses
-                await self.ask(question)
+                await self.query(question)
                 status_came = self.statuses > before
                 answered, unanswered = answered + status_came, 0 if status_came else unanswered + 1
-            machine.adopt((others if unanswered else asking)[0])
+            machine.adopt((without_status if unanswered else with_status)[0])
         else:
             machine.adopt(machine.kin[0])
         for chunk in self.early:
             chunk.events[:] = [
-                machine.dialect.restate(event, reader) if isinstance(event, StatusReport) else event
+                machine.dialect.restate(event, first_dialect)
+                if isinstance(event, StatusReport)
+                else event
                 for event in chunk.events
             ]
 
@@ -202,12 +213,12 @@ async def attempt(
 
     Args:
         address: address of the camera.
-        dialects: one, or several that begin a session alike.
+        dialects: one dialect, or several that begin a session alike.
         transport: TCP or UDP.
-        progress: function that gets each step of the handshake.
+        progress: record of the attempt, in which each step is noted.
         name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
-        trace: function that is called with frames that came or went together.
+        trace: function that is called with frames that were received or sent together.
         disconnect_first: send Disconnect before Connect.
         liveness_timeout: see :class:`~smartcam._client.link.Link`.
 
@@ -231,22 +242,22 @@ async def attempt(
         link.send_all([Disconnect(), Connect()] if disconnect_first else [Connect()])
         progress.reach(CONNECTING)
         while collector.version is None:
-            await collector.take()
+            await collector.receive_chunk()
         if len(link.machine.kin) > 1:
             progress.reach("finding out the dialect")
-            await collector.tell_apart()
+            await collector.find_dialect()
         dialect = link.machine.dialect
         progress.dialect = dialect.label
         progress.reach("waiting for the first status")
         if not collector.statuses and not dialect.capabilities.status_by_itself:
             link.send(GetStatus(), answered=False)
         while not collector.statuses:
-            await collector.take()
+            await collector.receive_chunk()
         progress.reach("waiting for the answer to Query")
-        await collector.ask()
+        await collector.query()
         while collector.application is None:
             await asyncio.sleep(BUSY_PAUSE)
-            await collector.ask()
+            await collector.query()
     except BaseException as exc:
         link.give_up(exc)
         raise
@@ -261,45 +272,45 @@ async def attempt(
     return Session(link, address, dialect, collector.version, collector.early)
 
 
-def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
-    """Return the attempts at an address, each for a fresh link."""
-    return _tries_by(load_protocol(address.protocol), address)
+def dialect_groups(address: Address) -> list[tuple[Dialect, ...]]:
+    """Return groups of dialects, one group for each attempt at an address."""
+    return _dialect_groups(load_protocol(address.protocol), address)
 
 
-def _tries_by(protocol: Protocol, address: Address) -> list[tuple[Dialect, ...]]:
+def _dialect_groups(protocol: Protocol, address: Address) -> list[tuple[Dialect, ...]]:
     return protocol.tries(
         protocol.schemes[address.scheme], address.dialect, address.quirks, dict(address.parameters)
     )
 
 
-def _for_layout(
+def _groups_for_layout(
     tries: list[tuple[Dialect, ...]], layout: Layout | None
 ) -> list[tuple[Dialect, ...]]:
-    """Return the attempts in which the camera can get a layout.
+    """Return the dialects that can use a layout, in their groups.
 
     Raises:
-        ConfigurationError: no attempt can send the layout.
+        ConfigurationError: no group can use the layout.
     """
     groups: list[tuple[Dialect, ...]] = []
-    refused: ConfigurationError | None = None
+    first_error: ConfigurationError | None = None
     for dialects in tries:
         try:
             groups.append(tuple(dialect.for_layout(layout) for dialect in dialects))
         except ConfigurationError as exc:
-            refused = refused or exc
-    if refused is not None and not groups:
-        raise refused
+            first_error = first_error or exc
+    if first_error is not None and not groups:
+        raise first_error
     return groups
 
 
 def remarks(address: Address) -> set[str]:
-    """Return the remarks for a user who asks for results at an address.
+    """Return the remarks of an address' dialects, for a user who asks for results.
 
     An address of a fleet has none: its agent logged them.
     """
     if address.scheme in FLEET_SCHEMES:
         return set()
-    return {dialect.remark for dialects in tries_for(address) for dialect in dialects} - {""}
+    return {dialect.remark for dialects in dialect_groups(address) for dialect in dialects} - {""}
 
 
 def names_of(dialects: Sequence[Dialect]) -> str:
@@ -318,8 +329,8 @@ async def establish(
 
     Args:
         settings: the address, and the timeouts.
-        trace: function that is called with frames that came or went together.
-        layout: the fields of the results, for a camera that takes them.
+        trace: function that is called with frames that were received or sent together.
+        layout: the fields of the results, for a camera that must be told them.
 
     Raises:
         ConfigurationError: the camera cannot give results of this layout.
@@ -330,27 +341,29 @@ async def establish(
     address = settings.address
     protocol = load_protocol(address.protocol)
     transport = protocol.schemes[address.scheme]
-    groups = _for_layout(_tries_by(protocol, address), layout)
+    groups = _groups_for_layout(_dialect_groups(protocol, address), layout)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
     cause: BaseException | None = None
     disconnect_first = True
     round_tries: list[Try] = []
-    for left in range(settings.connect_attempts, 0, -1):
+    for rounds_left in range(settings.connect_attempts, 0, -1):
         if isinstance(cause, CommandRejectedError):
             break  # the camera refused, and would refuse again
         round_tries = []
-        end = loop.time() + (deadline - loop.time()) / left
-        hurried = len(groups) > 1 and left == settings.connect_attempts > 1
+        round_end = loop.time() + (deadline - loop.time()) / rounds_left
+        is_detecting = len(groups) > 1 and rounds_left == settings.connect_attempts > 1
         for position, dialects in enumerate(groups):
-            begin, untried = loop.time(), len(groups) - position
+            begun_at, untried_count = loop.time(), len(groups) - position
             progress = Try(names_of(dialects), transport.value)
             tries.append(progress)
             round_tries.append(progress)
             try:
-                async with asyncio.timeout_at(end) as limit:
-                    progress.on_step = _sharer(limit, end, untried, hurried=hurried)
+                async with asyncio.timeout_at(round_end) as limit:
+                    progress.on_step = _step_timer(
+                        limit, round_end, untried_count, is_detecting=is_detecting
+                    )
                     return await attempt(
                         address,
                         dialects,
@@ -363,10 +376,10 @@ async def establish(
                         liveness_timeout=settings.liveness_timeout,
                     )
             except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
-                progress.end(exc, loop.time() - begin)
+                progress.end(exc, loop.time() - begun_at)
                 cause = exc
             if progress.hung_up:
-                # perhaps because of the Disconnect: attempts are made with and without it by turns
+                # perhaps because of the Disconnect, so attempts alternate
                 disconnect_first = not disconnect_first
             logger.debug("%s ! attempt %d: %s", settings.name, len(tries), progress)
             if progress.step == OPENING or isinstance(cause, CommandRejectedError):
@@ -374,30 +387,30 @@ async def establish(
             if progress.step != CONNECTING:
                 groups = [dialects]  # the camera answered the Connect, so this is its dialect
                 break
-    why = explain(round_tries, address, protocol)
+    reason = explain(round_tries, address, protocol)
     raise ConnectFailedError(
-        f"{settings.name}: no session with {address.url}: {why}",
+        f"{settings.name}: no session with {address.url}: {reason}",
         host=address.host,
         port=address.port,
         attempts=tuple(f"attempt {number}: {tried}" for number, tried in enumerate(tries, 1)),
     ) from cause
 
 
-def _sharer(
-    limit: asyncio.Timeout, end: float, untried: int, *, hurried: bool
+def _step_timer(
+    limit: asyncio.Timeout, round_end: float, untried_count: int, *, is_detecting: bool
 ) -> Callable[[str], None]:
-    """Return the function that gives each step of an attempt its time, in a round until ``end``.
+    """Return a function that sets the time limit of each step of an attempt.
 
-    Only the answer to Connect has to leave time for the untried dialects, this one included:
-    without a link no dialect answered, and a camera that answered speaks this one.
+    Each step may take until the end of the round. Only the answer to Connect has a share of that
+    time, since it must leave time for the dialects that are untried after this one.
     """
     loop = asyncio.get_running_loop()
 
     def on_step(step: str) -> None:
-        when = end
-        if step == CONNECTING and (hurried or untried > 1):
-            share = (end - loop.time()) / untried
-            when = loop.time() + (min(share, DETECTION_TIMEOUT) if hurried else share)
+        when = round_end
+        if step == CONNECTING and (is_detecting or untried_count > 1):
+            share = (round_end - loop.time()) / untried_count
+            when = loop.time() + (min(share, DETECTION_TIMEOUT) if is_detecting else share)
         if when != limit.when():
             limit.reschedule(when)
 

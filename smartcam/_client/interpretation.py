@@ -1,8 +1,8 @@
 """Make a :class:`~smartcam.Result` from a result container: choose the interpreter, and run it.
 
-``interpret_as`` is one specification for all containers, or a mapping from application id to one.
-``calibration`` is applied after the interpreter, one for all applications or one for each. Then
-only values that are poses of the robot are returned.
+``interpret_as`` is one specification for all containers, or a mapping from application ids to
+specifications. ``calibration``, one for all applications or one for each, is applied after the
+interpreter. Then each returned value is poses in the robot's frame.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ Interpreted: TypeAlias = tuple[Any, int | None, int]
 
 
 class Numbering(NamedTuple):
-    """The place of the sequence number in a layout.
+    """The form of the sequence number in a layout.
 
     Attributes:
         highest: the largest number that the field holds, at most 2^31 - 1.
@@ -87,8 +87,8 @@ class Interpretation:
         lenient: whether any non-zero byte is a true bool.
         y_down: whether the camera's y axis points down.
         calibration: a value of ``calibration``.
-        own: whether the calibration was given for results read by ``spec``; else values that never
-            are localizations stay unchanged.
+        own: True if the calibration was given together with ``spec``. If False, it is not applied
+            to values that never are localizations; if True, such a specification is an error.
 
     Attributes:
         by_application: whether each application has its own interpreter.
@@ -115,18 +115,20 @@ class Interpretation:
         self._reader_of_all: _ApplicationReader | None = None
         self._by_application: dict[int, _ApplicationReader] = {}
         if hasattr(spec, "items"):
-            for application, each in spec.items():
+            for application, application_spec in spec.items():
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
                         f"{shown(application)} is no id"
                     )
                 self._by_application[application] = _make_reader(
-                    resolve(each, lenient=lenient), own
+                    resolve(application_spec, lenient=lenient), own
                 )
         else:
             self._reader_of_all = (
-                _raw(own) if spec is None else _make_reader(resolve(spec, lenient=lenient), own)
+                _raw_reader(own)
+                if spec is None
+                else _make_reader(resolve(spec, lenient=lenient), own)
             )
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
         if self._calibrations is not None and own:
@@ -138,7 +140,7 @@ class Interpretation:
 
     @property
     def layout(self) -> Layout | None:
-        """Layout of every container; None if there is none, or one for each application."""
+        """Layout of every container; None if there is none, or each application has its own."""
         return None if self._reader_of_all is None else self._reader_of_all.interpreter.layout
 
     @property
@@ -152,15 +154,15 @@ class Interpretation:
         return None if reader is None else reader.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
-        """Return the place of the number in this application's containers, None without one."""
+        """Return the form of the number in this application's containers; None if there is none."""
         reader = self._reader_of_all or self._reader_for(application)
         return reader.numbering if reader is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
         """Return the layouts with a number in them, in the form of ``interpret_as``."""
         if self._reader_of_all is not None:
-            return _numbered(self._reader_of_all)
-        texts = {key: _numbered(reader) for key, reader in self._by_application.items()}
+            return _numbered_layout_text(self._reader_of_all)
+        texts = {key: _numbered_layout_text(reader) for key, reader in self._by_application.items()}
         return {key: text for key, text in texts.items() if text is not None} or None
 
     def number(self, container: ResultContainer, endian: int) -> int | None:
@@ -200,13 +202,13 @@ class Interpretation:
             WrongApplicationError: a mapping does not know its application.
         """
         chosen = self._reader_of_all or self._known_reader(container.application)
-        interpreter, simple = chosen.interpreter, chosen.simple
+        interpreter, plain_interpreter = chosen.interpreter, chosen.plain_interpreter
         data = container.data
         if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
-        if simple is not None and not chosen.sequenced:
+        if plain_interpreter is not None and not chosen.sequenced:
             context = self._context(container.application, endian, camera, number, at)
-            value = run_plain(simple, data, context)
+            value = run_plain(plain_interpreter, data, context)
             if self._calibrations is not None and chosen.calibrated:
                 value = self._calibrations.apply(value, container.application)
             return value, None, context.empty_slots
@@ -245,22 +247,27 @@ class Interpretation:
     ) -> tuple[Sequence[Any], int] | None:
         """Return the values of several containers that arrived together, and their empty slots.
 
-        None if the containers must be interpreted singly: the interpreter uses a Reader, a sequence
-        number must be read, or one container does not fit.
+        Return None if the containers must be interpreted singly: the interpreter uses a Reader, a
+        sequence number must be read, or a container does not fit.
         """
-        known = self._reader_for(application)
-        if known is None or known.simple is None or known.sequenced or endian not in _BYTE_ORDERS:
+        chosen = self._reader_for(application)
+        if (
+            chosen is None
+            or chosen.plain_interpreter is None
+            or chosen.sequenced
+            or endian not in _BYTE_ORDERS
+        ):
             return None
         context = self._context(application, endian, camera, number, at)
         try:
-            values = known.simple.read_all(payloads, context)
+            values = chosen.plain_interpreter.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None and known.calibrated:
-                # one by one, so that the bits of a value do not depend on its companions
+            if self._calibrations is not None and chosen.calibrated:
+                # one by one, so that a value does not depend on the others in its last bits
                 values = [self._calibrations.apply(value, application) for value in values]
         except ENDS_PROGRAM:
             raise
-        except BaseException:  # noqa: BLE001 - one by one it shows, with its place
+        except BaseException:  # noqa: BLE001 - the caller interprets each one, and gets the error
             return None
         return (values, context.empty_slots) if complete else None
 
@@ -281,12 +288,14 @@ class _Calibrations:
         self._shared: Calibration | None = None
         self._by_application: dict[int, Calibration | None] | None = None
         if hasattr(given, "to_robot") or not hasattr(given, "items"):
-            self._shared = _calibration(given, y_down)
+            self._shared = _checked_calibration(given, y_down)
             return
         self._by_application = {}
-        for application, each in given.items():
+        for application, calibration in given.items():
             number = check_application(application, "calibration: application")
-            self._by_application[number] = None if each is None else _calibration(each, y_down)
+            self._by_application[number] = (
+                None if calibration is None else _checked_calibration(calibration, y_down)
+            )
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
         """Raise if the calibration can apply to no value of an interpreter.
@@ -296,7 +305,7 @@ class _Calibrations:
             interpreter: reader of these results.
 
         Raises:
-            ConfigurationError: the calibration applies to none; the text names the possible values.
+            ConfigurationError: the calibration applies to no value.
         """
         given, known = [self._shared], self._by_application
         of = "" if application is None else f" of application {application}"
@@ -323,7 +332,7 @@ class _Calibrations:
                 with the cause chained.
             WrongApplicationError: the mapping does not know the application.
         """
-        calibration = self._of(application)
+        calibration = self._calibration_for(application)
         if calibration is None:
             return value
         parts = localizations_of(value)
@@ -345,18 +354,18 @@ class _Calibrations:
         except BaseException as exc:
             text = text_of(exc)
             raise InterpretationError(f"the calibration failed with {text}", got=text) from exc
-        made = localizations_of(transformed)
-        if made is None or len(made) != len(parts):
-            actual = type(transformed).__name__ if made is None else len(made)
+        calibrated = localizations_of(transformed)
+        if calibrated is None or len(calibrated) != len(parts):
+            actual = type(transformed).__name__ if calibrated is None else len(calibrated)
             raise InterpretationError(
                 f"calibration: expected to_robot to return {len(parts)} localizations, "
                 f"got {actual}",
                 expected=len(parts),
                 got=actual,
             )
-        return made
+        return calibrated
 
-    def _of(self, application: int) -> Calibration | None:
+    def _calibration_for(self, application: int) -> Calibration | None:
         known = self._by_application
         if known is None:
             return self._shared
@@ -369,8 +378,8 @@ class _Calibrations:
         return known[application]
 
 
-def _calibration(given: Any, y_down: bool) -> Calibration:
-    """Return the calibration that was given.
+def _checked_calibration(given: Any, y_down: bool) -> Calibration:
+    """Return an object that was given as a calibration, if it is one.
 
     Raises:
         ConfigurationError: the calibration is not valid, or would mirror poses.
@@ -381,11 +390,11 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
             "calibration: expected an object with a method to_robot(localizations) that is not "
             f"async, such as PlaneCalibration.load(FILE) gives, got {shown(given)}"
         )
-    made: object = getattr(given, "y_down", None)
-    if made is not None and made != y_down:
+    own_y_down: object = getattr(given, "y_down", None)
+    if own_y_down is not None and own_y_down != y_down:
         raise ConfigurationError(
-            f"calibration: it was made with y_down={made}, so with y_down={y_down} its poses would "
-            f"be mirrored; expected y_down={made}"
+            f"calibration: it was made with y_down={own_y_down}, so with y_down={y_down} its poses "
+            f"would be mirrored; expected y_down={own_y_down}"
         )
     return cast("Calibration", given)
 
@@ -403,8 +412,8 @@ _WITHOUT_POSES = ("raw", "record", "strings50", "table")
 
 
 def without_poses(interpreter: Interpreter) -> str | None:
-    """Return an interpreter's name if it is in ``_WITHOUT_POSES``; a subclass does not count."""
-    # exactly these types, since a subclass may return any value
+    """Return the interpreter's name if its values never are localizations, else None."""
+    # exactly the built-in types, since a subclass may return any value
     names = (name for name in _WITHOUT_POSES if type(interpreter) is INTERPRETERS.load(name))
     return next(names, None)
 
@@ -415,7 +424,7 @@ def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter
 
 
 def in_pixels(interpreter: Interpreter | None) -> bool:
-    """Return True if an interpreter reads places as pixels, not as lengths."""
+    """Return True if an interpreter's positions are in pixels, not in lengths."""
     layout = None if interpreter is None else interpreter.layout
     return layout is not None and any(
         field.unit is not None and UNITS[field.unit].quantity == "pixels"
@@ -425,7 +434,7 @@ def in_pixels(interpreter: Interpreter | None) -> bool:
 
 
 def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
-    """Return a container's bytes in the form of its layout, for values that are texts."""
+    """Return a container's bytes; values that are texts are packed in the form of the layout."""
     if container.fault is not None:
         raise InterpretationError(container.fault)
     if interpreter.layout is None or container.cells is None:
@@ -439,26 +448,26 @@ class _ApplicationReader:
 
     Attributes:
         interpreter: reader of the containers.
-        simple: the interpreter if it needs only the bytes, else None.
+        plain_interpreter: the interpreter if it needs only the bytes, else None.
         sequenced: whether the interpreter may report a sequence number.
         numbering: form of the sequence number in the layout; None if it has none.
         calibrated: whether values pass through the calibration, if there is one.
     """
 
     interpreter: Interpreter
-    simple: PlainInterpreter | None
+    plain_interpreter: PlainInterpreter | None
     sequenced: bool
     numbering: Numbering | None
     calibrated: bool
 
 
 @functools.cache
-def _raw(own: bool) -> _ApplicationReader:
-    """Return the reader without a specification: plain bytes, the same reader for each client."""
+def _raw_reader(own: bool) -> _ApplicationReader:
+    """Return the reader of raw bytes, the same for all clients without a specification."""
     return _make_reader(resolve(None), own)
 
 
-def _numbered(reader: _ApplicationReader) -> str | None:
+def _numbered_layout_text(reader: _ApplicationReader) -> str | None:
     layout = reader.interpreter.layout
     return None if reader.numbering is None or layout is None else layout.text
 

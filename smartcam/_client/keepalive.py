@@ -1,10 +1,10 @@
 """Detect that a camera was lost without a message, as with a pulled cable or a lost supply.
 
 Any received byte is a sign of life. A camera need not send bytes by itself, so after half the
-timeout without a byte the client sends a Query, and the camera has the whole timeout to answer. So
-no pause shorter than the timeout ends a session, and a loss is detected at most one and a half
-timeouts after the last byte. While an application is loaded, the camera may be silent for longer:
-then the Query is sent only after ``switch_timeout``.
+timeout without a byte the client sends a Query, which the camera must answer within the whole
+timeout. So no pause shorter than the timeout ends a session, and a loss is detected at most one and
+a half timeouts after the last byte. While the camera loads an application, it may be silent for
+longer: then the Query is sent only after ``switch_timeout``.
 """
 
 from __future__ import annotations
@@ -42,36 +42,37 @@ class KeepAlive:
         if self._timeout is None:
             return _nothing
         watch = _Watch(self, link, self._timeout)
-        watch.look()
+        watch.check_link()
         return watch.stop
 
-    def ask(self, due: float) -> None:
+    def ask_sign_of_life(self, due: float) -> None:
         """Ask for a sign of life, which is awaited until ``due`` (loop time)."""
         # if the link has ended, the receive task reports it
         with contextlib.suppress(SmartCamError):
-            self._requests.ask_for_life(due)
+            self._requests.ask_sign_of_life(due)
 
-    def patience(self, usual: float) -> float:
-        """Return the allowed silence, seconds: longer during a switch, or a trigger with an answer.
+    def allowed_silence(self, usual_silence: float) -> float:
+        """Return the seconds of silence that are allowed before a Query is sent.
 
-        The trigger may also be another program's.
+        They are more while the camera loads an application, or while a switch or trigger of this
+        client is unanswered.
         """
         pending = self._waits.is_pending
         slow = self._state.loading or pending(m.SwitchAnswer) or pending(m.TriggerAnswer)
-        return self._switch_timeout if slow else usual
+        return self._switch_timeout if slow else usual_silence
 
 
 def _nothing() -> None: ...
 
 
 class _Watch:
-    """A timer that is set again each time it fires; received bytes do not move it."""
+    """A timer that is set again each time it fires, but not when bytes are received."""
 
     def __init__(self, owner: KeepAlive, link: Link, timeout: float) -> None:
         self._owner = owner
         self._link = link
         self._timeout = timeout  # seconds that the camera has to answer a Query
-        self._quiet = timeout / 2  # seconds of silence before a Query is sent
+        self._query_delay = timeout / 2  # seconds of silence before a Query is sent
         self._loop = asyncio.get_running_loop()
         self._asked_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -81,26 +82,26 @@ class _Watch:
         if self._timer is not None:
             self._timer.cancel()
 
-    def look(self) -> None:
+    def check_link(self) -> None:
         """Ask, give up, or wait; then set the timer for the next step."""
-        now, heard_at = self._loop.time(), self._link.heard_at
+        now, heard_at = self._loop.time(), self._link.last_byte_at
         if self._asked_at is not None and self._asked_at <= heard_at:  # a clock may be coarse
             self._asked_at = None
         if self._asked_at is None:
-            quiet = self._owner.patience(self._quiet)
-            if now >= heard_at + quiet:
+            silence_allowed = self._owner.allowed_silence(self._query_delay)
+            if now >= heard_at + silence_allowed:
                 self._asked_at = now
-                self._owner.ask(now + self._timeout)
-                when = now + self._quiet
+                self._owner.ask_sign_of_life(now + self._timeout)
+                check_at = now + self._query_delay
             else:
                 # a load may begin or end, so check again at each step
-                when = min(heard_at + quiet, now + self._quiet)
+                check_at = min(heard_at + silence_allowed, now + self._query_delay)
         else:
             end = self._asked_at + self._timeout
             if now >= end:
-                silence = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
-                self._link.give_up(TimeoutError(silence))
+                reason = f"no sign of life for {shown_time(now - heard_at, coarse=True)}"
+                self._link.give_up(TimeoutError(reason))
                 return
             # the camera may answer, so check again when the next Query is due
-            when = min(end, now + self._quiet)
-        self._timer = self._loop.call_at(when, self.look)
+            check_at = min(end, now + self._query_delay)
+        self._timer = self._loop.call_at(check_at, self.check_link)

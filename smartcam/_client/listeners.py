@@ -1,4 +1,4 @@
-"""Keep a camera's listeners: streams, single waiters for the next result, observers."""
+"""Keep a camera's listeners: streams, callers that wait for the next result, and observers."""
 
 from __future__ import annotations
 
@@ -25,95 +25,97 @@ class Listeners:
 
     Args:
         name: the camera's name.
-        observers: observers that see everything.
+        observers: observers that get everything.
 
     Attributes:
         results: subscriptions to results.
         statuses: subscriptions to statuses.
         events: subscriptions to events.
-        observed: True if an observer handles results.
-        may_await: True if the next result was requested since the last one.
-        hears_all_changes: True if :meth:`publish` passes events on even without a subscriber.
+        has_result_observer: True if an observer handles results.
+        may_have_waiters: True if :meth:`next_result` was called after the last result; the caller
+            may have gone since.
+        wants_all_changes: True if events about sessions and applications are needed even if there
+            is no subscriber or observer; for subclasses.
     """
 
-    hears_all_changes: ClassVar[bool] = False
+    wants_all_changes: ClassVar[bool] = False
 
     def __init__(self, name: str, observers: Observers) -> None:
         self.results: Subscribers[Result] = Subscribers()
         self.statuses: Subscribers[Status] = Subscribers()
         self.events: Subscribers[CameraEvent] = Subscribers()
-        self.observed: bool = observers.see_results
-        self._see_each = observers.see_each
+        self.has_result_observer: bool = observers.see_results
+        self._observes_singly = observers.see_single_results
         self._name = name
         self._observers = observers
-        # weak: a waiter that was made and never awaited must not count as a listener
+        # weak: a future that was made and never awaited must not count as a listener
         self._next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
-        self.may_await: bool = False
+        self.may_have_waiters: bool = False
 
     def streams(self) -> list[Queue[Any]]:
         """Return every subscription that is still referred to."""
         return [*self.results, *self.statuses, *self.events]
 
     def next_result(self) -> asyncio.Future[Result]:
-        """Return a future that gets the next result; it is dropped without a reference."""
+        """Return a future that gets the next result; the caller must keep a reference to it."""
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._next_results.add(future)
-        self.may_await = True
+        self.may_have_waiters = True
         return future
 
     @property
-    def streams_results(self) -> bool:
-        """True if results go to streams, and to no caller that waits for a single one."""
-        return self._streams_hear and not self._awaits_next
+    def only_streams_results(self) -> bool:
+        """True if results go to streams, and no caller waits for the next one."""
+        return self._has_result_streams and not self._has_waiters
 
     @property
-    def hears_results(self) -> bool:
-        """True if a result would go to a listener beside its trigger."""
-        return self._streams_hear or self._awaits_next
+    def wants_results(self) -> bool:
+        """True if a stream or a caller of :meth:`next_result` would get a result."""
+        return self._has_result_streams or self._has_waiters
 
     @property
-    def _streams_hear(self) -> bool:
-        return self.results.any_open
+    def _has_result_streams(self) -> bool:
+        return self.results.has_open_queue
 
     @property
-    def _awaits_next(self) -> bool:
-        return self.may_await and any(not future.done() for future in self._next_results)
+    def _has_waiters(self) -> bool:
+        return self.may_have_waiters and any(not future.done() for future in self._next_results)
 
     @property
     def has_subscribers(self) -> bool:
-        """True if tasks beside the callers of commands may wait for something."""
+        """True if a subscriber or a caller of :meth:`next_result` may wait for something."""
         subscribed = self.results.references or self.statuses.references or self.events.references
-        return bool(subscribed) or self.may_await
+        return bool(subscribed) or self.may_have_waiters
 
     @property
-    def hears_statuses(self) -> bool:
-        """True if a status would go to a listener."""
+    def wants_statuses(self) -> bool:
+        """True if there is a subscriber to statuses."""
         return bool(self.statuses.references)
 
     @property
-    def watches_status(self) -> bool:
-        """True if there is a subscriber to statuses or events."""
+    def needs_polling(self) -> bool:
+        """True if an open subscription to statuses or events needs the status to be polled."""
         streams: list[Queue[Any]] = [*self.statuses, *self.events]
         return any(not stream.ended for stream in streams)
 
     @property
-    def sees_events(self) -> bool:
-        """True if an event would go to a listener."""
-        return bool(self.events.references) or self.notes_events()
+    def wants_events(self) -> bool:
+        """True if a subscriber, an observer or the log needs events."""
+        return bool(self.events.references) or self.observers_want_events()
 
     @property
-    def hears_changes(self) -> bool:
-        """True if an event about a session or the active application would go to a listener."""
-        return self.hears_all_changes or self.sees_events
+    def wants_changes(self) -> bool:
+        """True if events about sessions and the active application are needed."""
+        return self.wants_all_changes or self.wants_events
 
-    def notes_events(self) -> bool:
-        """Return True if an observer or the log needs events, even without a subscriber."""
+    def observers_want_events(self) -> bool:
+        """Return True if an observer or the log needs events."""
         return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
 
     # ------------------------------------------------------------------ delivery
 
     def publish(self, event: CameraEvent) -> None:
-        """Pass an event to its subscribers."""
+        """Pass an event to the log, the observers and the subscribers."""
         logger.debug("%s = %s", self._name, event)
         self._observers.state(event)
         self.events.offer(event, 0.0)
@@ -124,32 +126,33 @@ class Listeners:
             self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
-        """Pass on results that are only streamed and observed; ``size`` bytes in all."""
-        if self._see_each:
-            self._offer_each(results, now)
+        """Pass results of ``size`` bytes to observers and streams; no caller waits for one."""
+        if self._observes_singly:
+            self._offer_singly(results, now)
             return
-        if self.observed:
+        if self.has_result_observer:
             self._observers.results(results)
         for stream in self.results:
             stream.offer_all(results, now, size)
 
-    def _offer_each(self, results: Sequence[Result], now: float) -> None:
-        """Show observers one result after the other, and pass the results on together.
+    def _offer_singly(self, results: Sequence[Result], now: float) -> None:
+        """Call observers with one result after the other, and pass the results on together.
 
-        A listener that a hook adds gets the result that the hook was called with, and later ones.
+        A listener that an observer adds gets the result of that call, and later ones.
         """
-        heard, streams, joined, done = self.results, [*self.results], self.results.joined, 0
+        subscribers, streams, offered = self.results, [*self.results], 0
+        count = subscribers.added_count
         try:
-            for place, result in enumerate(self._observers.each(results)):
-                if heard.joined != joined or self.may_await:
-                    _offer_all(streams, results[done:place], now)
-                    done = place + 1
-                    heard.offer(result, now, len(result.raw))
+            for index, result in enumerate(self._observers.each(results)):
+                if subscribers.added_count != count or self.may_have_waiters:
+                    _offer_all(streams, results[offered:index], now)
+                    offered = index + 1
+                    subscribers.offer(result, now, len(result.raw))
                     for future in self._take_next_results():
                         future.set_result(result)
-                    streams, joined = [*heard], heard.joined
-        finally:  # a hook may end the program
-            _offer_all(streams, results[done:], now)
+                    streams, count = [*subscribers], subscribers.added_count
+        finally:  # an observer may end the program
+            _offer_all(streams, results[offered:], now)
 
     def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
         """Pass a result on.
@@ -160,37 +163,44 @@ class Listeners:
             current: True unless the result is known to belong to an older trigger.
             late: True if the result is known to belong to a trigger that was given up.
         """
-        if self.observed:
+        if self.has_result_observer:
             self._observers.result(result)
         if self.results.references:
             self.results.offer(result, now, len(result.raw))
-        if current and self.may_await:
+        if current and self.may_have_waiters:
             for future in self._take_next_results():
                 future.set_result(result)
 
     def offer_error(
-        self, error: InterpretationError, now: float, size: int, *, current: bool, owned: bool
+        self,
+        error: InterpretationError,
+        now: float,
+        size: int,
+        *,
+        current: bool,
+        reported_by_caller: bool,
     ) -> None:
-        """Report that a container cannot be read.
+        """Report that a container cannot be interpreted.
 
         Args:
             error: the reason.
             now: loop time.
             size: the container's bytes.
             current: as for :meth:`offer_result`.
-            owned: the error ends a trigger, and the trigger's caller reports it to observers.
+            reported_by_caller: True if the error ends a trigger, whose caller reports it to
+                observers.
         """
         if self.results:
-            _drop_frames(error)
+            _clear_tracebacks(error)
         self.results.offer(error, now, size)
         if current:
             for future in self._take_next_results():
                 future.set_exception(error)
-        if not owned:
+        if not reported_by_caller:
             self._observers.error(self._name, error)
 
     def fail(self, error: SmartCamError) -> None:
-        """Raise an error in every caller that waits for the next result; streams go on."""
+        """Raise an error in every caller that waits for the next result; streams stay open."""
         for future in self._take_next_results():
             future.set_exception(error)
 
@@ -201,11 +211,11 @@ class Listeners:
                 stream.end(error)
 
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
-        if not self.may_await:
+        if not self.may_have_waiters:
             return []
         waiting = [future for future in self._next_results if not future.done()]
         self._next_results.clear()
-        self.may_await = False
+        self.may_have_waiters = False
         return waiting
 
 
@@ -215,21 +225,21 @@ def _offer_all(streams: Sequence[Queue[Result]], results: Sequence[Result], now:
         stream.offer_all(results, now, size)
 
 
-def _drop_frames(error: SmartCamError) -> None:
-    """Remove the frames from an error that may wait in a queue: they hold a delivery's bytes.
+def _clear_tracebacks(error: SmartCamError) -> None:
+    """Remove the tracebacks of an error that may wait in a queue: they keep received bytes alive.
 
-    Its cause gets a note with the place where it was raised.
+    Each error of its chain gets a note with the place where it was raised.
     """
     chain: list[BaseException | None] = [error]
     while chain:
-        exc = chain.pop()
-        place = exc.__traceback__ if exc is not None else None
-        if exc is None or place is None:
+        link = chain.pop()
+        traceback = link.__traceback__ if link is not None else None
+        if link is None or traceback is None:
             continue
-        while place.tb_next is not None:
-            place = place.tb_next
-        if exc is not error:
-            code = place.tb_frame.f_code
-            exc.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{place.tb_lineno}")
-        exc.__traceback__ = None  # so that each error is visited once
-        chain += (exc.__cause__, exc.__context__)
+        while traceback.tb_next is not None:
+            traceback = traceback.tb_next
+        if link is not error:
+            code = traceback.tb_frame.f_code
+            link.add_note(f"raised in {code.co_qualname}, {code.co_filename}:{traceback.tb_lineno}")
+        link.__traceback__ = None  # so that each error is visited once
+        chain += (link.__cause__, link.__context__)

@@ -1,7 +1,7 @@
-"""Poll the status, in dialects that do not send it unasked (``bid``), while it is needed.
+"""Poll the status while it is needed, in dialects that do not send it by themselves (``bid``).
 
-There is one timer, which runs while a wait for a status or a trigger is pending, or while statuses
-or events are subscribed to. It sends a request only if no request for the status is open; an
+One timer runs while a trigger or a wait for a status is pending, or while statuses or events are
+subscribed to. It sends a request only if no request for the status is open; an
 unanswered request is repeated after a while, since a datagram may be lost. On TCP nothing is lost:
 if a camera sends other messages but no answer, the link is given up.
 """
@@ -49,42 +49,42 @@ class Polling:
         self._running = False
         self._triggered = False  # whether a trigger is pending
         self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0  # time at which the timer fires; a timer of uvloop does not have it
+        self._timer_at = 0.0  # time at which the timer fires; a timer of uvloop does not have it
         self._open_since = 0.0
-        self._received = -1  # number of statuses that had come when the timer fired last
+        self._last_status_count = -1  # number of statuses received when the timer last fired
 
     def begin_session(self) -> None:
         """Begin to request the status, if the dialect does not send it by itself."""
         self._running = self._connection.features.polled
         self._open_since = 0.0
-        self._received = -1
-        self.wanted()
+        self._last_status_count = -1
+        self.poll_soon()
 
     def end_session(self) -> None:
         """Stop requesting the status."""
         self._running = False
         self._stop()
 
-    def wanted(self) -> None:
-        """Request the status from now on, or more often, since a task needs it."""
+    def poll_soon(self) -> None:
+        """Request the status now, and then repeatedly, since a task needs it."""
         if not self._running:
             return
         loop = self._connection.loop
-        if self._timer is not None and self._due - loop.time() <= PERIOD:
+        if self._timer is not None and self._timer_at - loop.time() <= PERIOD:
             return
         self._stop()
         self._set_timer(0.0)
 
-    def begin_trigger(self, questions: int) -> None:
+    def begin_trigger(self, request_count: int) -> None:
         """Note that a trigger is pending, which needs the status.
 
         Args:
-            questions: number of requests for the status that were sent together with the trigger.
+            request_count: number of requests for the status that were sent with the trigger.
         """
         self._triggered = True
-        if questions:
-            self._state.status_asked(self._connection.loop.time(), questions)
-        self.wanted()
+        if request_count:
+            self._state.note_status_request(self._connection.loop.time(), request_count)
+        self.poll_soon()
 
     def end_trigger(self) -> None:
         """Note that no trigger is pending any more."""
@@ -97,22 +97,26 @@ class Polling:
 
     def _tick(self) -> None:
         self._timer = None
-        link, received = self._connection.link, self._state.statuses_received
-        soon = self._triggered or self._waits.statuses
-        if not (soon or self._listeners.watches_status) or link is None or link.lost:
+        link, status_count = self._connection.link, self._state.statuses_received
+        soon = self._triggered or self._waits.status_waiters
+        if not (soon or self._listeners.needs_polling) or link is None or link.lost:
             return
         loop = self._connection.loop
         now = loop.time()
         state = self._state
-        if received != self._received or not state.status_is_pending or self._may_be_silent:
-            self._received, self._open_since = received, now
+        if (
+            status_count != self._last_status_count
+            or not state.status_is_pending
+            or self._is_silence_allowed
+        ):
+            self._last_status_count, self._open_since = status_count, now
         elif self._connection.features.ordered and now - self._open_since >= self._answer_timeout:
             open_for = shown_time(now - self._open_since, coarse=True)
             silence = f"no status within {open_for} of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return
         if state.status_is_pending and now - state.status_asked_at >= REPEAT_AFTER:
-            state.status_lost()
+            state.note_statuses_lost()
         if not state.status_is_pending:
             try:
                 self._requests.ask_status()
@@ -122,10 +126,10 @@ class Polling:
 
     def _set_timer(self, seconds: float) -> None:
         loop = self._connection.loop
-        self._due = loop.time() + seconds
+        self._timer_at = loop.time() + seconds
         self._timer = loop.call_later(seconds, self._tick)
 
     @property
-    def _may_be_silent(self) -> bool:
-        """Return True while the camera loads or inspects, since it may answer only afterwards."""
+    def _is_silence_allowed(self) -> bool:
+        """True while the camera loads or inspects, since it may answer only afterwards."""
         return self._waits.is_pending(SwitchAnswer) or self._waits.is_pending(TriggerAnswer)

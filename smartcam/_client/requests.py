@@ -1,10 +1,10 @@
 """Send requests to the camera, and wait for each answer with a deadline.
 
-The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
-open, and a cancelled request leaves a pending answer, which the next request of that kind awaits
-first. An answer that never comes makes the link untrustworthy, so the link is given up; but not
-before ``request_timeout`` is over (``switch_timeout`` for a switch): one caller may have little
-time, and others use the link, too.
+No message names its request. So an answer is matched by its type, and at most one request of a
+type is open. A cancelled request leaves a pending answer, which the next request of that type
+awaits first. If an answer never comes, the link is given up, since later answers would be matched
+wrongly; but not before ``request_timeout`` is over (``switch_timeout`` for a switch), since a
+caller may have little time, and others use the link, too.
 
 Every ``deadline`` is loop time. The command lock decides whose command runs, one at a time.
 """
@@ -50,24 +50,24 @@ class Requests:
     _connection: Connection
     _waits: Waits
     _state: CameraState
-    # seconds that an answer may take, however short the caller's deadline is
+    # seconds that an answer may take before the link is given up, also after a caller's deadline
     patience: float
     _switch_patience: float  # seconds that the answer to a switch may take
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
-        self._due: dict[object, float] = {}  # deadline of the last request of a kind
-        # future of the wait that the timer belongs to
-        self._late: Waiter | None = None
-        self._timer = DeadlineTimer(weak_callback(self, Requests._wake_late))
+        self._due: dict[object, float] = {}  # loop time when an answer is overdue, by its key
+        # the waiter that the shared timer wakes
+        self._timed_waiter: Waiter | None = None
+        self._timer = DeadlineTimer(weak_callback(self, Requests._wake_timed_waiter))
 
     def finish(self) -> None:
         """End for good: leave nothing in the event loop."""
         self._timer.cancel()
 
     def begin_session(self) -> None:
-        """Forget pending answers: the session is new."""
+        """Forget the pending answers of the session before."""
         self._due.clear()
 
     # ------------------------------------------------------------------ send and wait
@@ -75,7 +75,7 @@ class Requests:
     async def send_unanswered(
         self, message: m.Message, deadline: float, *, answered: bool | None = None
     ) -> None:
-        """Send a message that the camera never answers; returns once written.
+        """Send a message that the camera never answers; return once it is written.
 
         Args:
             message: the message.
@@ -139,7 +139,7 @@ class Requests:
         )
 
     async def ask(self, message: m.Message, answer: type[AnswerT], deadline: float) -> AnswerT:
-        """Send a request and return its answer, which may come among statuses and results.
+        """Send a request and return its answer; statuses and results may come before the answer.
 
         Raises:
             ResponseTimeoutError: the answer did not come, as for :meth:`exchange`.
@@ -172,7 +172,7 @@ class Requests:
     async def post(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> PendingAnswer:
-        """Send a request as soon as none of its kind is open; its answer is pending from then on.
+        """Send a request as soon as none of its kind is open, and return its pending answer.
 
         Args:
             message: the request.
@@ -187,15 +187,15 @@ class Requests:
         return self._send(message, key, deadline)  # at once, before the next request in line
 
     def is_free(self, key: type[m.Message] | int) -> bool:
-        """Return True if no answer of this kind is pending, and no request of it is in line."""
+        """Return True if no answer of this kind is pending, and no such request waits in line."""
         waits = self._waits
-        any_pending = waits.answers or waits.fences_open
+        any_pending = waits.pending_answers or waits.fences_open
         return not ((any_pending and waits.is_pending(key)) or self._locks[key].locked())
 
     async def await_turn(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
-        """Wait in line with requests of this kind until none is open; send at once then.
+        """Wait in line with requests of this kind until none is open; the caller must then send.
 
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``, as in
@@ -217,31 +217,33 @@ class Requests:
     ) -> PendingAnswer:
         link = self._connection.require_link()
         link.send(message)
-        return self._expect(link, key, deadline)
+        return self._register_answer(link, key, deadline)
 
-    def expect(self, key: type[m.Message] | int, deadline: float) -> PendingAnswer:
+    def register_answer(self, key: type[m.Message] | int, deadline: float) -> PendingAnswer:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
-        It may come later: the link is given up only when ``request_timeout`` is over, too.
+        The answer may come later: the link is given up only after ``request_timeout``.
         """
-        return self._expect(self._connection.require_link(), key, deadline)
+        return self._register_answer(self._connection.require_link(), key, deadline)
 
-    def _expect(self, link: Link, key: type[m.Message] | int, deadline: float) -> PendingAnswer:
+    def _register_answer(
+        self, link: Link, key: type[m.Message] | int, deadline: float
+    ) -> PendingAnswer:
         patience = self._switch_patience if key is m.SwitchAnswer else self.patience
         now = link.loop.time()
         due = now + patience
         self._due[key] = max(deadline, due)
-        return self._waits.next_answer(key, link.loop, now, behind=link.deliveries)
+        return self._waits.next_answer(key, link.loop, now, after_delivery=link.deliveries)
 
-    # ------------------------------------------------------------------ Query, and what it fences
+    # ------------------------------------------------------------------ Query and status
 
     async def fence(self, deadline: float) -> None:
-        """Wait until everything is received that the camera sent before now."""
+        """Wait for the answer to a Query: all that the camera sent before is received then."""
         await self.await_pending(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
     def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
-        """Note that Queries went out with a trigger: no task waits for their answers."""
+        """Note that Queries were sent with a trigger; no task waits for their answers."""
         self._waits.fences_open = count
         due = sent_at + self.patience
         # max() takes twenty times as long
@@ -255,28 +257,31 @@ class Requests:
         """
         link = self._connection.require_link()
         link.send(m.GetStatus(), answered=False)
-        self._state.status_asked(link.loop.time())
+        self._state.note_status_request(link.loop.time())
 
-    def ask_for_life(self, deadline: float) -> bool:
-        """Send a Query unless one is open; its answer is awaited until ``deadline``."""
+    def ask_sign_of_life(self, deadline: float) -> bool:
+        """Send a Query unless one is open, and return whether it was sent.
+
+        The answer, a sign of life, is due at ``deadline``.
+        """
         if self._waits.is_pending(m.QueryAnswer):
             return False
         features = self._connection.features
-        # the status must be fresh; over UDP a pending answer may have been lost
+        # the status is requested, too; over UDP a pending answer to an earlier request may be lost
         if features.polled and not (features.ordered and self._state.status_is_pending):
             self.ask_status()
         self._connection.require_link().send(m.Query())
-        self.expect(m.QueryAnswer, deadline)
+        self.register_answer(m.QueryAnswer, deadline)
         return True
 
-    def ask_what_is_active(self) -> None:
+    def ask_active_application(self) -> None:
         """Send a Query after a switch by others, as soon as no earlier Query is open."""
         with contextlib.suppress(SmartCamError):  # the link is over: the receive task reports it
-            if self.ask_for_life(asyncio.get_running_loop().time()):
+            if self.ask_sign_of_life(asyncio.get_running_loop().time()):
                 self._state.clear_active_doubt()
 
     def is_done(self, request: type[m.Message], answer: m.Acknowledgement) -> bool:
-        """Return True if an answer says that all is well: :meth:`check` would not raise."""
+        """Return True if an answer is a success, so that :meth:`check` would not raise."""
         link = self._connection.require_link()
         return link.machine.dialect.code(answer.code, request).verdict is Verdict.DONE
 
@@ -293,11 +298,10 @@ class Requests:
     async def await_pending(
         self, key: type[m.Message] | int, message: m.Message, deadline: float
     ) -> None:
-        """Wait for the answer to an earlier request, which is dropped.
+        """Wait for the answer to an earlier request, and ignore the answer.
 
         Raises:
-            ResponseTimeoutError: the answer did not come; the link is given up if its own time is
-                over too.
+            ResponseTimeoutError: the answer did not come; if it is overdue, the link is given up.
         """
         while self._waits.is_pending(key):  # a trigger may send the next Query meanwhile
             answer = self._waits.pending_answer(key)
@@ -326,9 +330,9 @@ class Requests:
             link = self._connection.require_link()
             waiter: Waiter = link.outcome()
             answer.waiters.append(waiter)
-            timer = None  # a wait beside another has its own timer
-            if self._late is None:
-                self._late = waiter
+            timer = None  # of several waits at the same time, only the first uses the shared timer
+            if self._timed_waiter is None:
+                self._timed_waiter = waiter
                 self._timer.set(deadline)
             else:
                 timer = link.loop.call_at(deadline, wake, waiter)
@@ -336,7 +340,7 @@ class Requests:
                 await waiter
             finally:
                 if timer is None:
-                    self._late = None
+                    self._timed_waiter = None
                     self._timer.clear()
                 else:
                     timer.cancel()
@@ -348,9 +352,9 @@ class Requests:
             raise reply.with_traceback(None)
         return reply
 
-    def _wake_late(self) -> None:
-        if self._late is not None:
-            wake(self._late)
+    def _wake_timed_waiter(self) -> None:
+        if self._timed_waiter is not None:
+            wake(self._timed_waiter)
 
     def _unsent_error(self, message: m.Message) -> ResponseTimeoutError:
         return self._timeout_error(message, "could not send", "in time: an earlier answer is owed")

@@ -1,4 +1,4 @@
-"""Decide where each result goes: to the running trigger, to streams, or only into the counts."""
+"""Decide where each result goes: to the running trigger, to streams, or only into the counters."""
 
 from __future__ import annotations
 
@@ -40,9 +40,11 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
-# as plain integers: operations of an IntFlag cost more than the rest of handling a status
-# a change of these bits may mean that the running trigger has failed
-_TELLING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING)
+# a change of these bits may mean that the running trigger has failed; a plain integer, since
+# operations of an IntFlag cost more than the rest of handling a status
+_FAILURE_BITS = int(
+    Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING
+)
 
 _CURRENT = {"triggered", "nobody"}
 """Fates of containers that are not known to belong to an older trigger."""
@@ -60,9 +62,8 @@ class PendingTrigger(SentTrigger):
         triggered_at: time of the wall clock, UTC.
         application: id of the application that is probably active; None: any is accepted.
         results: results received so far.
-        unproven: containers that wait for proof that the camera accepted the trigger, and the
-            containers after them. With the proof, containers with the fate ``triggered`` are the
-            trigger's.
+        unproven: containers received before the proof that the camera accepted the trigger. With
+            the proof, those with the fate ``triggered`` are the trigger's results.
     """
 
     outcome: DirectFuture[list[Result]] | asyncio.Future[list[Result]]
@@ -102,10 +103,10 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        # reads the numbers in results after the first trigger with a number
+        # interpretation for the numbers in results, after the first trigger with a number
         self._numbering: Interpretation | None = None
         self._warned_extra = self._warned_others = False
-        self._lossy = False  # whether a message may arrive twice, or not at all
+        self._lossy = False  # whether a message may arrive twice or be lost (UDP)
         self._timer = DeadlineTimer(weak_callback(self, Results._time_out))
 
     def _time_out(self) -> None:
@@ -125,7 +126,7 @@ class Results:
     def fail(self, error: SmartCamError) -> None:
         """End the session and the running trigger.
 
-        The trigger's results are pending, since they may still arrive in the next session.
+        The trigger's results are owed, since they may still arrive in the next session.
         """
         if self._pending is not None:
             self.give_up(copy_to_raise(error))
@@ -134,9 +135,9 @@ class Results:
         """End for good: leave nothing in the event loop."""
         self._timer.cancel()
 
-    # ------------------------------------------------------------------ the trigger under way
+    # ------------------------------------------------------------------ the running trigger
 
-    def _awaited(self) -> PendingTrigger | None:
+    def _waiting_trigger(self) -> PendingTrigger | None:
         """Return the running trigger while its caller waits, else None."""
         pending = self._pending
         if pending is None:
@@ -147,7 +148,7 @@ class Results:
         if not pending.ended:
             return pending
         if pending.unproven:
-            self._release(pending)
+            self._release_unproven(pending)
         return None
 
     def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
@@ -156,35 +157,35 @@ class Results:
         self._timer.set(deadline)
         if pending.number is not None:
             self._numbering = pending.interpretation
-        self.correlation.send(pending)
+        self.correlation.begin_trigger(pending)
 
     def end_trigger(self) -> None:
         """Note that the trigger's caller no longer waits."""
         pending, self._pending = self._pending, None
         if pending is not None and pending.unproven:
             pending.ended = True
-            self._release(pending)
+            self._release_unproven(pending)
         self._timer.clear()
-        self.correlation.leave()
+        self.correlation.end_trigger()
 
     def give_up(self, error: Exception) -> None:
         """End the running trigger with an error; its results are late from now on."""
-        pending = self._awaited()
+        pending = self._waiting_trigger()
         if pending is not None:
             self.correlation.give_up(pending)
             pending.fail(error)
-            self._release(pending)
+            self._release_unproven(pending)
 
-    def input_sent(self) -> None:
-        """Note that input data was sent with the trigger, and is perhaps unused."""
+    def note_input_sent(self) -> None:
+        """Note that input data was sent with the trigger; the camera may not have used it."""
         self.input_in_doubt = True
 
-    # ------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------ received messages
 
     def on_switched(self) -> None:
         """Forget older results, which cannot arrive after another application was loaded."""
         self.input_in_doubt = False
-        self.correlation.settled()
+        self.correlation.forget_owed()
 
     def on_query_answer(self, now: float) -> None:
         """Note that the Query that was sent with the last trigger is answered."""
@@ -198,7 +199,7 @@ class Results:
 
     def _decide(self, now: float) -> None:
         """End the running trigger if the messages received so far decide its outcome."""
-        pending = self._awaited()
+        pending = self._waiting_trigger()
         if pending is None:
             return
         if pending.evidence.doubtful:
@@ -211,7 +212,7 @@ class Results:
             )
         else:
             if pending.unproven and pending.evidence.proven:
-                self._release(pending)
+                self._release_unproven(pending)
             if pending.results:
                 self._complete(pending, now)
 
@@ -223,17 +224,17 @@ class Results:
             bits: the new status.
             now: loop time.
         """
-        was = previous or 0
-        if (bits ^ was) & _TELLING:
-            self._fail_trigger(bits & ~was, was & ~bits)
+        old_bits = previous or 0
+        if (bits ^ old_bits) & _FAILURE_BITS:
+            self._fail_by_status(bits & ~old_bits, old_bits & ~bits)
         if self.correlation.on_status(previous, bits):
             self._note_others()
         if self._pending is not None:
             self._decide(now)
 
-    def _fail_trigger(self, risen: int, fallen: int) -> None:
+    def _fail_by_status(self, risen: int, fallen: int) -> None:
         """End the running trigger if the status shows that its result would be unreliable."""
-        pending = self._awaited()
+        pending = self._waiting_trigger()
         if pending is None:
             return
         error: SmartCamError | None = None
@@ -261,24 +262,24 @@ class Results:
         """End the running trigger; later results of it go to the streams."""
         self.correlation.give_up(pending, "streamed")
         pending.fail(error)
-        self._release(pending)
+        self._release_unproven(pending)
 
-    def _release(self, pending: PendingTrigger) -> None:
+    def _release_unproven(self, pending: PendingTrigger) -> None:
         """Pass the unproven containers to the trigger, or to the streams if it has ended."""
         unproven, pending.unproven = pending.unproven, []
         if not pending.ended:
             pending.received -= sum(fate == "triggered" for _, fate, *_ in unproven)
         for container, fate, number, now, at in unproven:
             if fate != "triggered":
-                self.hand_on(container, None, fate, number, now, at)
-            elif not pending.ended:  # it has ended if the one before could not be read
-                self.hand_on(container, pending, fate, number, now, at)
+                self.deliver(container, None, fate, number, now, at)
+            elif not pending.ended:  # it ends if a container cannot be interpreted
+                self.deliver(container, pending, fate, number, now, at)
             else:
                 older = self.correlation.judge_older(number).fate
-                self.hand_on(container, None, older, number, now, at)
+                self.deliver(container, None, older, number, now, at)
 
     def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
-        """Count and pass on several containers together, or singly if their fates may differ."""
+        """Count several containers and pass them on, singly if their fates may differ."""
         results = self._read_burst(burst, at)
         if results is None:
             for container in burst:
@@ -292,35 +293,35 @@ class Results:
         self._listeners.offer_burst(results, now, burst.size)
 
     @property
-    def only_streams(self) -> bool:
+    def is_streaming_only(self) -> bool:
         """True if all results go to streams, and need not be passed on singly.
 
-        No result can then belong to a trigger, be a pending one, or count as an extra result.
+        No result can then belong to a trigger, be owed, or count as an extra result.
         """
         correlation = self.correlation
-        ours = self._pending or self._numbering or correlation.owed or correlation.satisfied
-        return not ours and self._listeners.streams_results
+        needed = self._pending or self._numbering or correlation.owed or correlation.satisfied
+        return not needed and self._listeners.only_streams_results
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None if they must be passed singly.
 
-        Otherwise a trigger or a single waiter may need one of them, one may be a pending result,
-        and one that cannot be interpreted is its own item.
+        They must if a trigger or a caller of ``next_result()`` may need one of them, if a result
+        may be owed, or if a container cannot be interpreted, so that the error is an item.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:
             return None
-        if not self._listeners.streams_results:
+        if not self._listeners.only_streams_results:
             return None
         if self._state.expected not in {None, application}:
             return None
         name, first = self._name, self._counters.received + 1
-        done = self.interpretation.burst(
+        interpreted = self.interpretation.burst(
             application, burst.data, self._state.endian, camera=name, number=first, at=at
         )
-        if done is None:
+        if interpreted is None:
             return None
-        values, empty_slots = done
+        values, empty_slots = interpreted
         self._counters.skip(empty_slots)
         # rows of a Result's fields; a loop in Python would take twice as long
         numbers, none = itertools.count(first), itertools.repeat(None)
@@ -337,11 +338,11 @@ class Results:
             now: loop time at which the container came.
             at: time of the wall clock at which the container came.
         """
-        state, counters, pending = self._state, self._counters, self._awaited()
+        state, counters, pending = self._state, self._counters, self._waiting_trigger()
         active, expected = state.active, state.expected
         if container.application < 0:  # some cameras do not send the application
-            known = m.UNNAMED_APPLICATION if active is None else active
-            container = replace(container, application=known)
+            application = m.UNNAMED_APPLICATION if active is None else active
+            container = replace(container, application=application)
         if expected is None and pending is not None:
             expected = pending.application
         if active != container.application:
@@ -350,29 +351,29 @@ class Results:
             # the trigger's result may still arrive
             self.give_up(self._wrong_application(container, expected))
             if state.shared:  # the result may be for another program
-                self.hand_on(container, None, "streamed", None, now, at)
+                self.deliver(container, None, "streamed", None, now, at)
             else:
                 counters.count("wrong_application")
             return
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        ours = container.asked
-        match = correlation.judge(number) if ours is None else correlation.judge_marked(ours)
-        if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
+        asked = container.asked
+        match = correlation.judge(number) if asked is None else correlation.judge_marked(asked)
+        if self._lossy and match.fate == "triggered" and self._is_repeated(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:
             self._note_extra()
-        ours = match.fate == "triggered" and pending is not None
-        if pending is not None and (pending.unproven or (ours and not pending.evidence.proven)):
+        is_ours = match.fate == "triggered" and pending is not None
+        if pending is not None and (pending.unproven or (is_ours and not pending.evidence.proven)):
             pending.unproven.append((container, match.fate, number, now, at))
-            if ours:
+            if is_ours:
                 pending.received += 1
             return
         owner = pending if match.fate == "triggered" else None
-        self.hand_on(container, owner, match.fate, number, now, at)
+        self.deliver(container, owner, match.fate, number, now, at)
 
-    def hand_on(
+    def deliver(
         self,
         container: m.ResultContainer,
         owner: PendingTrigger | None,
@@ -381,14 +382,14 @@ class Results:
         now: float,
         at: datetime,
     ) -> None:
-        """Count a container, and give its result to its trigger, ``owner``, and the listeners."""
+        """Count a container, and pass its result to its trigger ``owner`` and to the listeners."""
         counters, listeners = self._counters, self._listeners
         current = fate in _CURRENT
         if owner is None:
-            has_listeners = listeners.hears_results
+            is_wanted = listeners.wants_results
             if fate == "nobody":
-                fate = "streamed" if has_listeners else "unclaimed"
-            if not has_listeners:
+                fate = "streamed" if is_wanted else "unclaimed"
+            if not is_wanted:
                 counters.count(fate)
                 return
         name, own_number = self._name, counters.received + 1
@@ -397,16 +398,16 @@ class Results:
             interpretation, began = owner.interpretation, owner.triggered_at
             latency = now - owner.sent_at
         try:
-            # by the method's name: a call of the object itself costs four times as much
+            # interpretation(...) instead of its method costs four times as much
             value, sequence, empty_slots = interpretation.__call__(
                 container, self._state.endian, camera=name, number=own_number, at=at
             )
         except InterpretationError as error:
             counters.count("late" if fate == "late" else "uninterpretable")
-            size, owned = len(container.data), owner is not None
-            listeners.offer_error(error, now, size, current=current, owned=owned)
+            size, is_owned = len(container.data), owner is not None
+            listeners.offer_error(error, now, size, current=current, reported_by_caller=is_owned)
             if owner is not None:
-                self._fail_unread(owner, error, number)
+                self._fail_uninterpretable(owner, error, number)
             return
         if empty_slots:
             counters.skip(empty_slots)
@@ -420,11 +421,11 @@ class Results:
             owner.received += 1
             self._complete(owner, now)
 
-    def take_round(self, container: m.ResultContainer) -> PendingTrigger | None:
+    def take_usual_round(self, container: m.ResultContainer) -> PendingTrigger | None:
         """Return the running trigger if a container between the trigger's answers is its result.
 
-        The result is noted, and :meth:`hand_on` handles the container. None if the answers do not
-        suffice for the decision, or if the trigger already has a result.
+        The answers are noted then, and the caller passes the container to :meth:`deliver`. None if
+        the answers do not suffice for the decision, or if the trigger already has a result.
         """
         pending = self._pending
         if pending is None or pending.ended or pending.outcome.done() or pending.received:
@@ -436,11 +437,11 @@ class Results:
             expected = pending.application
         if expected is not None and expected != container.application:
             return None
-        if pending.unproven or pending.given_up or not self.correlation.take_round(pending):
+        if pending.unproven or pending.given_up or not self.correlation.note_usual_round(pending):
             return None
         return pending
 
-    def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
+    def _is_repeated(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
         """Return True if the same container has arrived before, as with a repeated datagram."""
         results = pending.results if pending is not None else []
         return any(result.raw == container.data for result in results)
@@ -456,33 +457,33 @@ class Results:
             )
 
     def _note_others(self) -> None:
-        self._counters.note_other()
+        self._counters.note_foreign_inspection()
         if not self._warned_others:
             self._warned_others = True
             logger.warning("%s ! something else triggers the camera, too", self._name)
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
-        """End the running trigger if it has all results, and no message speaks against them."""
+        """End the running trigger if it has all results, and messages prove that they are its."""
         if owner.received < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:
             self.input_in_doubt = False
         self._counters.processing.add(now - owner.sent_at)
-        self.correlation.done(owner)
+        self.correlation.complete(owner)
         owner.ended = True
         owner.outcome.set_result(owner.results)
 
-    def _fail_unread(
+    def _fail_uninterpretable(
         self, owner: PendingTrigger, error: InterpretationError, number: int | None
     ) -> None:
         """End a trigger whose result cannot be interpreted."""
         if owner.has_input:
             self.input_in_doubt = False
         # without a readable number the result may be another trigger's
-        certain = owner.number is None or number == owner.number
-        self.correlation.give_up(owner, unread=int(certain))
+        is_its_result = owner.number is None or number == owner.number
+        self.correlation.give_up(owner, unread=int(is_its_result))
         if not owner.given_up:
-            self.correlation.done(owner)
+            self.correlation.complete(owner)
         owner.fail(error)
 
     def _wrong_application(

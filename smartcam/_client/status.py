@@ -48,9 +48,9 @@ class StatusRequests:
         """Stop requesting statuses."""
         self._polling.end_session()
 
-    def wanted(self) -> None:
+    def start_polling(self) -> None:
         """Request statuses for a new subscriber, if the camera does not send them by itself."""
-        self._polling.wanted()
+        self._polling.poll_soon()
 
     @property
     def last(self) -> Status:
@@ -63,7 +63,7 @@ class StatusRequests:
         deadline: float,
         awaited: str,
         *,
-        insist: bool = True,
+        asks_again: bool = True,
     ) -> Status:
         """Wait for a status.
 
@@ -71,7 +71,7 @@ class StatusRequests:
             predicate: function that returns True for the status awaited.
             deadline: loop time.
             awaited: description of the status, for the error.
-            insist: request the status again if a report of it may have been lost.
+            asks_again: request the status again if it may have been lost (UDP).
 
         Raises:
             ResponseTimeoutError: the status did not arrive in time; the text names it and the last
@@ -79,9 +79,9 @@ class StatusRequests:
         """
         begin = asyncio.get_running_loop().time()
         try:
-            if not insist:
+            if not asks_again:
                 return await self.wait(predicate, deadline)
-            return await self.insist(predicate, deadline)
+            return await self.wait_asking_again(predicate, deadline)
         except TimeoutError as exc:
             waited = max(0.0, deadline - begin)
             raise ResponseTimeoutError(
@@ -103,11 +103,13 @@ class StatusRequests:
         status = self._state.status
         if status is not None and predicate(status):
             return status
-        self._polling.wanted()
-        return await self._waits.status(predicate, deadline)
+        self._polling.poll_soon()
+        return await self._waits.wait_status(predicate, deadline)
 
-    async def insist(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
-        """Wait for a status; over UDP, where one may be lost, request it again half-way.
+    async def wait_asking_again(
+        self, predicate: Callable[[Status], bool], deadline: float
+    ) -> Status:
+        """Wait for a status; over UDP, where it may be lost, request it at half of the time.
 
         Raises:
             TimeoutError: at ``deadline``.
@@ -117,14 +119,14 @@ class StatusRequests:
             now = asyncio.get_running_loop().time()
             with contextlib.suppress(TimeoutError):
                 return await self.wait(predicate, now + 0.5 * (deadline - now))
-            await self.demand(deadline)
+            await self.make_camera_send(deadline)
         return await self.wait(predicate, deadline)
 
-    async def demand(self, deadline: float) -> None:
-        """Make the camera send its status, by Get status if the dialect has it.
+    async def make_camera_send(self, deadline: float) -> None:
+        """Make the camera send its status, by Get status or else by Connect.
 
-        Otherwise the camera sends one after Connect (SC manual p. 29, published). A Query goes
-        first, so that a client that has lost its session does not take it back by the Connect.
+        The camera sends a status after Connect (SC manual p. 29, published). A Query goes first,
+        so that a client whose session was taken does not take it back by the Connect.
         """
         link = self._connection.require_link()
         if self._connection.features.polled:
@@ -134,8 +136,8 @@ class StatusRequests:
             await self._requests.fence(deadline)
             link.send(m.Connect())
         except ResponseTimeoutError:
-            pass  # the caller's time may not be over; keepalive detects a lost camera
-        except LocalProtocolError as exc:  # the last request's answer never arrived
+            pass  # the caller may have time left; keepalive detects a lost camera
+        except LocalProtocolError as exc:  # the answer to the last Connect never arrived
             link.give_up(TimeoutError(f"statuses are lost: {exc}"))
 
     async def refresh(self, deadline: float) -> None:
@@ -149,15 +151,15 @@ class StatusRequests:
         connection, state = self._connection, self._state
         if not connection.dialect.has(m.GetStatus):
             return
-        older, before = state.statuses_due, state.statuses_received
+        older_count, count = state.statuses_due, state.statuses_received
         while True:
             self._requests.ask_status()
             await self._requests.fence(deadline)
-            if state.statuses_received > older:
+            if state.statuses_received > older_count:
                 return
-            if state.statuses_received == before:  # a datagram may be lost
+            if state.statuses_received == count:  # a datagram may be lost
                 await self.pause(deadline, "the camera to tell its status")
-            older = before = state.statuses_received  # earlier answers have come or are lost
+            older_count = count = state.statuses_received  # earlier answers have come or are lost
 
     async def pause(self, deadline: float, awaited: str) -> None:
         """Wait a moment before the camera is asked again.
@@ -172,8 +174,8 @@ class StatusRequests:
                 f"status: {self.last}"
             )
         with contextlib.suppress(TimeoutError):  # a loss ends the pause at once
-            await self.wait(_never, now + BUSY_PAUSE)
+            await self.wait(_accept_none, now + BUSY_PAUSE)
 
 
-def _never(_: Status) -> bool:
+def _accept_none(_: Status) -> bool:
     return False

@@ -1,10 +1,11 @@
 """The life of a client: sessions, one after the other, and the steps between them.
 
-Each client has one task for this, the only task outside of a task group. It makes a session, reads
-its link to the end by the receive task, ends all waits, and makes the next session after the delays
-of :class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another client
-has it: then the task stops or, at an agent, tries again slowly. A callback does the steps after the
-task's end, since a task that is cancelled before its first step runs no ``finally``.
+Each client has one task for this, the only task outside of a task group. It makes a session, lets
+the receive task read the link to its end, ends all waits, and makes the next session after the
+delays of :class:`~smartcam.Backoff`. If the camera is lost again soon after a reconnect, another
+client has it: then the task ends or, at an agent, tries again at long intervals. A callback does
+the steps after the task's end, since a task that is cancelled before its first step runs no
+``finally``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from smartcam._client.doorbell import outlast
+from smartcam._client.doorbell import wait_ended
 from smartcam._client.handshake import Session, establish
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
@@ -49,9 +50,8 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 TAKEN_WITHIN = 10.0
-"""Seconds after Connect within which a lost session counts as taken by another client (a decision
-of this library: the camera does not report it)."""
-
+"""Seconds after Connect within which a lost session counts as taken by another client: the camera
+does not report it, so this is a decision of the library."""
 
 FIRST_RETRY_DELAY_OF_TAKEN = 30.0
 MAX_RETRY_DELAY_OF_TAKEN = 600.0
@@ -61,7 +61,7 @@ set: doubled each time that it is taken again. Each try interrupts the other cli
 
 @dataclass(eq=False)
 class Supervisor:
-    """Makes sessions and reads them.
+    """Makes sessions, and reads the link of each until it ends.
 
     Attributes:
         session: the last session that was made, None before the first.
@@ -84,32 +84,32 @@ class Supervisor:
         self.session: Session | None = None
         self._name = self._settings.name
         self._task: asyncio.Task[SmartCamError] | None = None
-        self._opened: asyncio.Future[SmartCamError | None] | None = None
-        self._changed: asyncio.Event | None = None  # of the tasks that wait for a change
+        self._first_session: asyncio.Future[SmartCamError | None] | None = None
+        self._change_event: asyncio.Event | None = None  # set at a change of the connection
         self._closing = False
-        self._closed: ConnectionClosedError | None = None  # error for all waits after close()
-        self._ended_by: SmartCamError | None = None  # reason of the end, if not this program
-        self._finished = False  # whether the task is over, and all waits have ended
+        self._closed_error: ConnectionClosedError | None = None  # error for all waits after close()
+        self._end_error: SmartCamError | None = None  # reason of the end, if not this program
+        self._is_finished = False  # whether the task has ended, and all waits with it
         self._reading = False  # whether the task reads a link, and so detects its end
         self.on_taken: Callable[[], None] | None = None
-        self._times_taken = 0  # losses in a row to another client
-        self._take_back = asyncio.Event()
-        self._short_lived = 0  # sessions in a row that were lost soon
-        # whether an early loss of this session has another cause than a client
-        self._excused = False
-        self._restarting: Link | None = None  # link over which a restart was requested
+        self._taken_count = 0  # number of losses in a row to another client
+        self._take_back_requested = asyncio.Event()
+        self._short_session_count = 0  # number of sessions in a row that were lost soon
+        # whether a restart of the camera explains an early loss of this session
+        self._early_loss_expected = False
+        self._restarting_link: Link | None = None  # link over which a restart was requested
 
     # ------------------------------------------------------------------ for the client
 
     @property
     def started(self) -> bool:
-        """True if the supervisor was ever started."""
+        """True once the supervisor was started."""
         return self._task is not None
 
     @property
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """True if there will be no further session."""
-        return self._closing or self._ended_by is not None
+        return self._closing or self._end_error is not None
 
     @property
     def address(self) -> Address:
@@ -120,7 +120,7 @@ class Supervisor:
     def connected(self) -> bool:
         """True while there is a session."""
         session = self.session
-        return session is not None and not session.link.lost and self._waits.end is None
+        return session is not None and not session.link.lost and self._waits.end_reason is None
 
     def use_settings(self, settings: CameraSettings) -> None:
         """Replace the settings of sessions; only before the supervisor is started."""
@@ -132,12 +132,12 @@ class Supervisor:
         Raises:
             ConnectFailedError: no session could be made.
         """
-        self._opened = opened = asyncio.get_running_loop().create_future()
+        self._first_session = first_session = asyncio.get_running_loop().create_future()
         self._task = asyncio.create_task(
             self._run(), name=f"smartcam[{self._settings.address.host}].supervisor"
         )
-        self._task.add_done_callback(self._end)
-        error = await opened
+        self._task.add_done_callback(self._on_task_end)
+        error = await first_session
         if error is not None:
             raise error
 
@@ -147,28 +147,28 @@ class Supervisor:
         Cancellation: the link is dropped at once.
         """
         task, session = self._task, self.session
-        self._closed = closed = self._closed or self.closed_error()
+        self._closed_error = closed = self._closed_error or self.closed_error()
         self._closing = True
         try:
-            if self.connected and self._lock.goes_back:
+            if self.connected and self._lock.has_jobs:
                 with contextlib.suppress(TimeoutError):  # another task's command may be under way
                     async with asyncio.timeout(self._settings.switch_timeout):
-                        await self._lock.settle()
-            linked = self.connected
+                        await self._lock.wait_for_jobs()
+            was_connected = self.connected
             self._dispatch.fail(closed)
-            if linked and session is not None:
+            if was_connected and session is not None:
                 await session.link.close(self._settings.close_timeout)
         finally:
             self._dispatch.fail(closed)
-            self._drop()
+            self._drop_link()
             if task is not None:
-                await outlast(task)
-            if not self._finished:
-                self._dispatch.finish(self._ended_by or closed)
+                await wait_ended(task)
+            if not self._is_finished:
+                self._dispatch.finish(self._end_error or closed)
                 self._commands.end_session()
 
     def abandon(self) -> bool:
-        """Drop the link and end the task soon, from any thread: no reference to the client is left.
+        """Drop the link and end the task soon, from any thread, for a client without references.
 
         Returns:
             True if there was anything to end.
@@ -178,10 +178,10 @@ class Supervisor:
             return False
         self._closing = True
         with contextlib.suppress(RuntimeError):  # a closed loop has closed its links
-            task.get_loop().call_soon_threadsafe(self._drop)
+            task.get_loop().call_soon_threadsafe(self._drop_link)
         return True
 
-    def _drop(self) -> None:
+    def _drop_link(self) -> None:
         """Drop the link at once, after a Disconnect, and end the task."""
         if self.session is not None:
             self.session.link.give_up(ConnectionAbortedError("closed by this side"))
@@ -198,11 +198,11 @@ class Supervisor:
         try:
             async with asyncio.timeout_at(deadline):
                 while True:
-                    if not self.started or self.over:
+                    if not self.started or self.has_ended:
                         self._connection.require_link()
-                    changed = self._changed = self._changed or asyncio.Event()
+                    changed = self._change_event = self._change_event or asyncio.Event()
                     if self.connected:
-                        await self._lock.settle()
+                        await self._lock.wait_for_jobs()
                     if self.connected:
                         return
                     await changed.wait()
@@ -216,16 +216,16 @@ class Supervisor:
     @property
     def taken(self) -> bool:
         """True if another client has the camera."""
-        return isinstance(self._waits.end, ConnectionTakenError)
+        return isinstance(self._waits.end_reason, ConnectionTakenError)
 
     def take_back(self) -> None:
         """Try a taken camera again now."""
         if self.taken:
-            self._take_back.set()
+            self._take_back_requested.set()
 
     def expect_restart(self, link: Link) -> None:
         """Note that a restart was requested: the link will end without a fault."""
-        self._restarting = link
+        self._restarting_link = link
 
     def closed_error(self) -> ConnectionClosedError:
         """Return the error of a client that this program has closed or not opened."""
@@ -237,25 +237,26 @@ class Supervisor:
 
     # ------------------------------------------------------------------ the task
 
-    def _end(self, task: asyncio.Task[SmartCamError]) -> None:
+    def _on_task_end(self, task: asyncio.Task[SmartCamError]) -> None:
         """End all waits, since the task has ended and there will be no further session."""
-        error = self._reason(task)
+        error = self._end_reason(task)
         self._dispatch.fail(error)
         if self._closing:
-            error = self._closed or self.closed_error()  # also after an earlier loss of the session
+            # also after an earlier loss of the session
+            error = self._closed_error or self.closed_error()
         else:
-            self._ended_by = error
+            self._end_error = error
         if self.session is not None:
             self.session.link.abort()
         self._counters.end()
         self._dispatch.finish(error)
         self._commands.end_session()
-        self._finished = True
+        self._is_finished = True
         self._wake_waiters()
-        if self._opened is not None and not self._opened.done():
-            self._opened.set_result(error)
+        if self._first_session is not None and not self._first_session.done():
+            self._first_session.set_result(error)
 
-    def _reason(self, task: asyncio.Task[SmartCamError]) -> SmartCamError:
+    def _end_reason(self, task: asyncio.Task[SmartCamError]) -> SmartCamError:
         """Return why the ended task makes no more sessions."""
         if task.cancelled():
             if self._closing:
@@ -278,38 +279,40 @@ class Supervisor:
 
     async def _run(self) -> SmartCamError:
         try:
-            return await self._live()
+            return await self._run_sessions()
         except ENDS_PROGRAM as exc:
             # the receive task has raised the error in the loop; here only clean up
             return self._lost_error(exc)
 
-    async def _live(self) -> SmartCamError:
+    async def _run_sessions(self) -> SmartCamError:
         """Make sessions; return the reason why there will be no more."""
         session = await establish(self._settings, self._observers.trace, self._dispatch.layout)
         while True:
-            again = self.session is not None
+            is_reconnect = self.session is not None
             error = await self._run_session(session)
             made_at = session.early[0].received_at
-            restarting, self._restarting = self._restarting is session.link, None
+            restarting, self._restarting_link = self._restarting_link is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
             ordered = session.link.machine.transport is Transport.TCP
-            # over UDP the loss began earlier: only silence shows that another client has the camera
+            # over UDP the loss is noticed late, by silence
             now = asyncio.get_running_loop().time()
-            short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
-            takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
-            if again and short and not self._excused and takes:
+            is_short = (now if ordered else session.link.last_byte_at) - made_at < TAKEN_WITHIN
+            may_be_taken = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
+            if is_reconnect and is_short and not self._early_loss_expected and may_be_taken:
                 taken = self._taken_error(error)
                 if self.on_taken is None:
                     return taken
-                await self._lock.vacated()
+                await self._lock.wait_until_free()
                 session = await self._retry_taken(taken, self.on_taken)
                 continue
-            if not short:
-                self._times_taken = 0
-            self._short_lived = self._short_lived + 1 if again and short else 0
-            self._excused = restarting
-            await self._lock.vacated()
+            if not is_short:
+                self._taken_count = 0
+            self._short_session_count = (
+                self._short_session_count + 1 if is_reconnect and is_short else 0
+            )
+            self._early_loss_expected = restarting
+            await self._lock.wait_until_free()
             session = await self._reconnect(error)
 
     async def _run_session(self, session: Session) -> ConnectionLostError:
@@ -322,7 +325,7 @@ class Supervisor:
             async with asyncio.TaskGroup() as tasks:
                 try:
                     self._lock.begin_session(tasks, restore=restore)
-                    self._adopt(session)
+                    self._adopt_session(session)
                     stop_watching = self._keepalive.watch(link)
                     try:
                         name = f"smartcam[{self._name}].receive"
@@ -338,22 +341,22 @@ class Supervisor:
             link.abort()
         return error
 
-    def _adopt(self, session: Session) -> None:
-        again = self.session is not None
+    def _adopt_session(self, session: Session) -> None:
+        is_reconnect = self.session is not None
         self.session = session
         ordered = session.link.machine.transport is Transport.TCP
         self._dispatch.begin_session(session.dialect, ordered=ordered)
         self._commands.begin_session(session.link)
         self._counters.begin(session.link.machine.counters)
-        kind = Reconnected if again else Connected
+        event_class = Reconnected if is_reconnect else Connected
         if logger.isEnabledFor(logging.INFO):
             logger.info("%s = connected to %s", self._name, session.address.url)
-        if self._listeners.hears_changes:
+        if self._listeners.wants_changes:
             url = session.address.url
-            self._listeners.publish(kind(camera=self._name, at=datetime.now(UTC), url=url))
+            self._listeners.publish(event_class(camera=self._name, at=datetime.now(UTC), url=url))
         self._dispatch.dispatch_early(session.early)
-        if self._opened is not None and not self._opened.done():
-            self._opened.set_result(None)
+        if self._first_session is not None and not self._first_session.done():
+            self._first_session.set_result(None)
         self._wake_waiters()
 
     async def _receive(self, link: Link) -> ConnectionLostError:
@@ -370,7 +373,7 @@ class Supervisor:
 
     def _report_loss(self, link: Link, error: ConnectionLostError) -> None:
         """End all waits, since a link has ended; all its events are dispatched."""
-        restarting = self._restarting is link
+        restarting = self._restarting_link is link
         expected = self._closing or restarting
         reason = "the camera restarts" if restarting else str(error.__cause__)
         reason = "closed by this side" if self._closing else reason
@@ -379,7 +382,7 @@ class Supervisor:
             self._counters.note_loss(error)
             self._observers.error(self._name, error)
         self._dispatch.fail(error)
-        if self._listeners.hears_changes:
+        if self._listeners.wants_changes:
             at = datetime.now(UTC)
             event = Disconnected(camera=self._name, at=at, reason=reason, expected=expected)
             self._listeners.publish(event)
@@ -388,50 +391,50 @@ class Supervisor:
     async def _retry_taken(
         self, taken: ConnectionTakenError, notify: Callable[[], None]
     ) -> Session:
-        """Make a new session after a long pause, or as soon as the camera is to be taken back.
+        """Make a new session after a long pause, or as soon as :meth:`take_back` is called.
 
         Raises:
             SmartCamError: the client gave up.
         """
         pause = self._pause_of_taken
-        self._waits.end = taken
-        self._times_taken += 1
-        self._take_back.clear()
+        self._waits.end_reason = taken
+        self._taken_count += 1
+        self._take_back_requested.clear()
         notify()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
-                await self._take_back.wait()
-        # a camera that does not answer has no client, so it counts as lost from then on
+                await self._take_back_requested.wait()
+        # a camera that does not answer serves no client, so from then on it counts as lost
         return await self._reconnect(taken, at_once=True)
 
     async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
-        """Try to make a new session until the policy ends it; ``at_once``: without a first pause.
+        """Try to make a new session until the policy gives up; ``at_once``: without a first pause.
 
         Raises:
             SmartCamError: the client gave up.
         """
         policy, name = self._settings.reconnect, self._name
         settings = replace(self._settings, address=self.address)
-        failed: SmartCamError = loss
+        last_error: SmartCamError = loss
         if policy is not None:
-            delays = policy.delays(short_lived=self._short_lived)
-            for tried, delay in enumerate(itertools.chain([0.0] * at_once, delays), 1):
+            delays = policy.delays(short_lived=self._short_session_count)
+            for try_number, delay in enumerate(itertools.chain([0.0] * at_once, delays), 1):
                 await asyncio.sleep(delay)
                 try:
                     return await establish(settings, self._observers.trace, self._dispatch.layout)
                 except SmartCamError as exc:
-                    failed = exc
-                level = logging.WARNING if tried == 1 else logging.DEBUG
-                logger.log(level, "%s ! reconnect %d: %s", name, tried, failed)
-                self._counters.note_loss(failed)
-                self._observers.error(name, failed)
-                if not policy.transient(failed):
+                    last_error = exc
+                level = logging.WARNING if try_number == 1 else logging.DEBUG
+                logger.log(level, "%s ! reconnect %d: %s", name, try_number, last_error)
+                self._counters.note_loss(last_error)
+                self._observers.error(name, last_error)
+                if not policy.transient(last_error):
                     break
         raise ConnectionLostError(
-            f"{loss}; given up after that: {failed}",
+            f"{loss}; given up after that: {last_error}",
             host=settings.address.host,
             port=settings.address.port,
-        ) from failed
+        ) from last_error
 
     def _taken_error(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
@@ -453,22 +456,22 @@ class Supervisor:
     @property
     def _pause_of_taken(self) -> float:
         """Seconds until a camera that was taken is tried again."""
-        doubled = min(self._times_taken, 16)  # a larger power is far beyond the longest pause
+        doubled = min(self._taken_count, 16)  # a larger power is far beyond the longest pause
         return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
 
     def _wake_waiters(self) -> None:
         """Wake the tasks that wait for a change of the connection."""
-        changed, self._changed = self._changed, None
+        changed, self._change_event = self._change_event, None
         if changed is not None:
             changed.set()
 
 
 def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:
-    """Return True if the loss may be another client's doing.
+    """Return True if another client may have caused the loss.
 
     On TCP the camera closes the connection of the earlier client, so only a closed connection
-    counts. Over UDP it only falls silent. A broken frame, a fault of this program, and a
-    network or a port that is gone never count.
+    counts. Over UDP the camera falls silent. A broken frame, a fault of this program, and an
+    unreachable network or port never count.
     """
     cause = error.__cause__
     if isinstance(cause, ConnectionRefusedError):

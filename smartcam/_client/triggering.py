@@ -1,7 +1,8 @@
 """Triggers: from the camera's readiness to the results, or to the reason why there are none.
 
-Owed results of earlier triggers are settled first, and a Query is sent before each trigger, so that
-no older result is taken for the trigger's result (:mod:`smartcam._client.correlation`).
+First the results that earlier triggers still owe are awaited or made impossible, and a Query is
+sent before each trigger, so that no older result counts as the trigger's
+(:mod:`smartcam._client.correlation`).
 """
 
 from __future__ import annotations
@@ -57,16 +58,16 @@ if TYPE_CHECKING:
 
 _WAITING, _OVERTRIGGERED = int(Status.WAITING_FOR_TRIGGER), int(Status.OVERTRIGGERED)
 _SYSTEM_ERROR = int(Status.SYSTEM_ERROR)
-# bits of which exactly Waiting is set if a trigger may go out at once
-_TELLS_AGAINST = int(
+# of these bits exactly Waiting is set if a trigger may be sent at once
+_READY_BITS = int(
     Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR | Status.OVERTRIGGERED
 )
-# bits of which exactly Waiting must be set before a trigger
-_SPEAKS_AGAINST = int(Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR)
+# of these bits exactly Waiting is set if the camera waits for a trigger
+_WAITS_BITS = int(Status.WAITING_FOR_TRIGGER | Status.BUSY | Status.SYSTEM_ERROR)
 
 LATE_GRACE = 0.25
-"""Seconds for which a late result is awaited before a Stop makes it impossible: most results are
-only a little late, and stopping and starting an application costs more."""
+"""Seconds for which a late result is awaited before a Stop makes it impossible. Most results are
+only a little late, and to stop and start an application takes longer."""
 
 
 OVERTRIGGERED_GRACE = 1.0
@@ -79,20 +80,22 @@ MAX_SHARE_WITHOUT_WAIT = 0.5
 MIN_TIMEOUT_SHARE = 0.01
 """Least share of its timeout that a delayed trigger must have left."""
 
-READING_SHARE = 0.8
-"""Share of the time until its deadline after which the client ends a trigger, on a camera that
-would not end it by itself. The rest is for the answer."""
+END_TRIGGER_SHARE = 0.8
+"""Share of the time until a trigger's deadline after which the client ends the trigger, on a camera
+that would not end it by itself. In the remaining time the answer arrives."""
 
-_WHY_READY = "; it does not while it inspects, and an application that runs free never does"
+_READY_HINT = "; it does not while it inspects, and an application that runs free never does"
 
 
-_HINT = "; where it never shows that, shows_triggers=no in its URL lets results do without"
+_SHOWS_TRIGGERS_HINT = (
+    "; where it never shows that, shows_triggers=no in its URL lets results do without"
+)
 
 _QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
 
 FENCED_TRIGGER = (_QUERY, _TRIGGER, _QUERY)
-"""The messages of a trigger if statuses alone show its outcome: one object, by which the machine
-recognizes them."""
+"""The messages of a trigger if statuses alone show its outcome. The machine recognizes them by this
+one object."""
 
 
 @dataclass(slots=True)
@@ -103,8 +106,9 @@ class TriggerRequest:
         interpretation: interpretation of its results.
         input_data: data to send right before the trigger, None for none.
         results: number of results expected.
-        wait: whether to wait until the camera accepts a trigger; else refuse if it does not.
-        expected: application expected to send its results; by default the named one.
+        wait: whether to wait until the camera accepts a trigger; otherwise a busy camera is an
+            error.
+        expected: id of the application that the results must come from; None: the wanted one.
     """
 
     interpretation: Interpretation
@@ -140,29 +144,30 @@ class Triggers:
     def __post_init__(self) -> None:
         self._name = self._connection.name
         self._correlation = self._results.correlation
-        self._doubtful: Link | None = None  # over UDP: link on which a status may have been lost
-        self._quickest = 0.0
-        self._quickest_of: int | None = None  # application of the quickest result
-        self._ending: asyncio.TimerHandle | None = None  # timer of the trigger under way
+        # over UDP: link on which a status may have been lost
+        self._doubtful_link: Link | None = None
+        self._quickest_time = 0.0
+        self._quickest_application: int | None = None  # application of the quickest result
+        self._end_timer: asyncio.TimerHandle | None = None  # timer of the trigger under way
 
-    def give_number(self, number: int) -> None:
+    def set_next_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
-        self._correlation.give_number(number)
+        self._correlation.set_next_number(number)
 
-    def _check_time(self, left: float, timeout: float) -> None:
+    def _check_time_left(self, time_left: float, timeout: float) -> None:
         """Check that a delayed trigger has enough time left for its result.
 
-        Otherwise it would end without its result, which would arrive late, and which the next
-        trigger would have to settle first.
+        Otherwise its result would arrive late, and the next trigger would have to wait for that
+        result first.
 
         Raises:
             ResponseTimeoutError: less time is left than the quickest result of this application
                 took, or than a hundredth of the timeout.
         """
-        quickest = self._quickest if self._quickest_of == self._state.active else 0.0
+        quickest = self._quickest_time if self._quickest_application == self._state.active else 0.0
         needed = max(quickest, MIN_TIMEOUT_SHARE * timeout)
-        if left < needed:
-            waited = timeout - left
+        if time_left < needed:
+            waited = timeout - time_left
             raise ResponseTimeoutError(
                 f"{self._name}: the camera took the trigger after {waited:.3g} s of {timeout:g} s "
                 f"only, and a result takes {needed:.3g} s at least",
@@ -189,7 +194,7 @@ class Triggers:
     async def _trigger_until_taken(
         self, request: TriggerRequest, deadline: float, timeout: float
     ) -> list[Result]:
-        """Trigger again if the camera was too busy."""
+        """Send a trigger until the camera accepts one, and return its results."""
         busy: CameraBusyError | None = None
         while True:
             try:
@@ -222,7 +227,7 @@ class Triggers:
         link = connection.require_link()
         now = link.loop.time()
         if deadline - now < MAX_SHARE_WITHOUT_WAIT * timeout:
-            self._check_time(deadline - now, timeout)
+            self._check_time_left(deadline - now, timeout)
         number = None if numbering is None else correlation.take_number(numbering.highest)
         pending = PendingTrigger(
             request.results,
@@ -237,13 +242,13 @@ class Triggers:
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        words: Sequence[m.Message] = FENCED_TRIGGER
+        messages: Sequence[m.Message] = FENCED_TRIGGER
         if not features.tells_all or number is not None or request.input_data is not None:
-            words = await self._prepare(pending, link, request.input_data, deadline)
+            messages = await self._prepare(pending, link, request.input_data, deadline)
             await self._await_turn(deadline)
         self._results.begin_trigger(pending, deadline)
         try:
-            self._send(pending, link, words, deadline)
+            self._send(pending, link, messages, deadline)
             if not link.is_writable():
                 with contextlib.suppress(TimeoutError):  # the outcome is then a timeout, too
                     async with asyncio.timeout_at(deadline):
@@ -254,20 +259,20 @@ class Triggers:
         except asyncio.CancelledError:
             if not pending.outcome.done() or pending.outcome.cancelled():
                 correlation.give_up(pending)
-                if self._ending is not None and not self._ending.cancelled():
-                    self._end_reading(link)
+                if self._end_timer is not None and not self._end_timer.cancelled():
+                    self._send_end_trigger(link)
             else:
                 pending.outcome.exception()  # no task will read it
             raise
         else:
-            took = link.heard_at - now
-            if took < self._quickest or self._quickest_of != state.active:
-                self._quickest, self._quickest_of = took, state.active
+            took = link.last_byte_at - now
+            if took < self._quickest_time or self._quickest_application != state.active:
+                self._quickest_time, self._quickest_application = took, state.active
             return results
         finally:
-            if self._ending is not None:
-                self._ending.cancel()
-                self._ending = None
+            if self._end_timer is not None:
+                self._end_timer.cancel()
+                self._end_timer = None
             if features.polled:
                 self._polling.end_trigger()
             self._results.end_trigger()
@@ -277,10 +282,10 @@ class Triggers:
         correlation = self._correlation
         return (
             self._connection.features.tells_all
-            and self._state.bits & _TELLS_AGAINST == _WAITING
+            and self._state.bits & _READY_BITS == _WAITING
             and (expected is None or expected == self._state.active)
             and request.input_data is None
-            and self._doubtful is None
+            and self._doubtful_link is None
             and not correlation.doubted
             and not correlation.owed
             and not self._commands.is_halted()
@@ -310,26 +315,26 @@ class Triggers:
             )
         if expected is not None and state.active != expected:
             await self._check_application(expected, deadline)
-        if self._doubtful is not None and self._doubtful is connection.link:
-            await self._status.demand(deadline)
+        if self._doubtful_link is not None and self._doubtful_link is connection.link:
+            await self._status.make_camera_send(deadline)
             # afterwards a status has arrived, or was lost again
             await self._requests.fence(deadline)
-            self._doubtful = None
+            self._doubtful_link = None
             correlation.note_query_answered()
         interpretation = request.interpretation
         numbering = interpretation.numbering(state.active) if features.numbered else None
         # if each container has a number, it identifies older results
-        decided = numbering is not None and numbering.always
+        numbers_suffice = numbering is not None and numbering.always
         if correlation.doubted:  # the status may not show the earlier trigger yet
             await self._requests.fence(deadline)
             correlation.note_query_answered()
         if correlation.owed or self._commands.is_halted():
-            await self._settle_debt(deadline, wait=request.wait, decided=decided)
+            await self._settle_owed(deadline, wait=request.wait, numbers_suffice=numbers_suffice)
         waited = False  # waits in line with Queries, so that neither kind delays the other
         while True:
             status = state.bits
-            if status & _SPEAKS_AGAINST != _WAITING:
-                await self._wait_for_trigger(deadline, wait=request.wait)
+            if status & _WAITS_BITS != _WAITING:
+                await self._wait_until_accepting(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
             elif features.fences and (
@@ -354,72 +359,72 @@ class Triggers:
                 break
 
     def _send(
-        self, pending: PendingTrigger, link: Link, words: Sequence[m.Message], deadline: float
+        self, pending: PendingTrigger, link: Link, messages: Sequence[m.Message], deadline: float
     ) -> None:
         """Write a trigger with its other messages; note the pending answers."""
         requests, features = self._requests, self._connection.features
-        link.send_all(words)
-        if features.tells_all and words is FENCED_TRIGGER:
+        link.send_all(messages)
+        if features.tells_all and messages is FENCED_TRIGGER:
             requests.expect_fences(2, pending.sent_at, deadline)
             return
         if features.ends_triggers:
-            end = pending.sent_at + READING_SHARE * (deadline - pending.sent_at)
-            self._ending = link.loop.call_at(end, self._end_reading, link)
+            end = pending.sent_at + END_TRIGGER_SHARE * (deadline - pending.sent_at)
+            self._end_timer = link.loop.call_at(end, self._send_end_trigger, link)
         if features.fences:
-            requests.expect_fences(words.count(_QUERY), pending.sent_at, deadline)
+            requests.expect_fences(messages.count(_QUERY), pending.sent_at, deadline)
         if features.acknowledged:
             self._expect_acknowledgement(pending, deadline)
         elif pending.has_input:
-            self._results.input_sent()
+            self._results.note_input_sent()
         if features.polled:
-            self._polling.begin_trigger(words.count(_GET_STATUS))
+            self._polling.begin_trigger(messages.count(_GET_STATUS))
 
     def _timed_out(
         self, pending: PendingTrigger, link: Link, deadline: float
     ) -> TriggerTimeoutError:
         """Give up a trigger at its deadline; return the error."""
         self._correlation.give_up(pending)
-        # after a stop, Waiting did not fall for this trigger
-        certain = self._connection.features.ordered or pending.evidence.began
-        self._doubtful = None if certain else link
+        # over UDP the status at the beginning of the inspection may have been lost
+        was_seen = self._connection.features.ordered or pending.evidence.begin_count
+        self._doubtful_link = None if was_seen else link
         waited = max(0.0, deadline - pending.sent_at)
         arrived = f"{len(pending.results)} of {pending.wanted} results"
         return TriggerTimeoutError(
             f"{self._name}: {arrived if pending.results else 'no result'} within "
             f"{shown_time(waited)} of the trigger; status: {self._status.last}"
-            f"{_what_is_missing(pending)}",
+            f"{_missing_messages_text(pending)}",
             waited=waited,
         )
 
     async def _prepare(
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[m.Message]:
-        """Return the messages of a trigger; its input is sent now if it is answered."""
+        """Return the messages of a trigger; send its input data now if the camera answers that."""
         requests, features = self._requests, self._connection.features
         asks_status = features.fences and features.polled and features.shows_triggers
-        words: list[m.Message] = [_QUERY] if features.fences else []
+        messages: list[m.Message] = [_QUERY] if features.fences else []
         if asks_status:
-            words.append(_GET_STATUS)
+            messages.append(_GET_STATUS)
         if pending.number is not None:
-            words.append(m.SetSequenceNumber(number=pending.number))
+            messages.append(m.SetSequenceNumber(number=pending.number))
         if features.acknowledged:
             await requests.await_pending(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
             await requests.command(m.SetInput(data=input_data), deadline)
         elif input_data is not None:
-            words.append(m.SetInput(data=input_data))
-        words.append(_TRIGGER)
+            messages.append(m.SetInput(data=input_data))
+        messages.append(_TRIGGER)
         if features.fences and features.shows_triggers:
-            words.append(_GET_STATUS if asks_status else _QUERY)
-        return words
+            messages.append(_GET_STATUS if asks_status else _QUERY)
+        return messages
 
-    def _end_reading(self, link: Link) -> None:
-        """Make the camera end the running trigger, which it would not do by itself."""
+    def _send_end_trigger(self, link: Link) -> None:
+        """Send the message that ends the running trigger, which the camera would not end itself."""
         with contextlib.suppress(SmartCamError):  # the link is over, and the trigger with it
             link.send(m.EndTrigger(), answered=False)
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
-        """End the trigger at once if the camera reports that it accepted none."""
+        """Register for the trigger's answer, and end the trigger at once if it is a refusal."""
 
         def on_answer(answer: asyncio.Future[Answer]) -> None:
             reply = answer.result()
@@ -435,13 +440,13 @@ class Triggers:
             except SmartCamError as exc:  # the link is over
                 pending.fail(exc)
 
-        self._requests.expect(m.TriggerAnswer, deadline).add_done_callback(on_answer)
+        self._requests.register_answer(m.TriggerAnswer, deadline).add_done_callback(on_answer)
 
     async def _check_application(self, expected: int, deadline: float) -> None:
         """Check that an application is the active one.
 
         Raises:
-            WrongApplicationError: another program has switched; only a Query was sent.
+            WrongApplicationError: somebody else has switched; only a Query was sent.
         """
         await self._requests.fence(deadline)  # the known status may be old
         active = self._state.active
@@ -453,12 +458,12 @@ class Triggers:
                 got=active,
             )
 
-    async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
+    async def _wait_until_accepting(self, deadline: float, *, wait: bool) -> None:
         """Wait until the camera accepts a trigger, or raise the reason why it never will."""
         begin = asyncio.get_running_loop().time()
-        ends_at = math.inf  # time at which another program's trigger is ended
+        end_foreign_at = math.inf  # time at which another program's trigger is ended
         if self._connection.features.ends_triggers:
-            ends_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
+            end_foreign_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
         while True:
             if self._state.bits & _SYSTEM_ERROR:
                 raise self._fault_error()
@@ -475,62 +480,62 @@ class Triggers:
                     f"{self._name}: the camera does not wait for a trigger: {status}"
                 )
             try:
-                await self._status.insist(_is_decided, min(deadline, ends_at))
+                await self._status.wait_asking_again(_is_decisive, min(deadline, end_foreign_at))
             except TimeoutError as exc:
                 if asyncio.get_running_loop().time() < deadline:
-                    ends_at = math.inf
-                    await self._end_stranger(deadline)
+                    end_foreign_at = math.inf
+                    await self._end_foreign_trigger(deadline)
                     continue
-                free = _WHY_READY if is_ready(status) else ""
+                hint = _READY_HINT if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
                     f"{self._name}: the camera did not wait for a trigger within "
-                    f"{shown_time(waited)}; status: {self._status.last}{free}",
+                    f"{shown_time(waited)}; status: {self._status.last}{hint}",
                     waited=waited,
                 ) from exc
 
-    async def _end_stranger(self, deadline: float) -> None:
-        """End a trigger of others or of a lost link, which the camera would not end by itself."""
+    async def _end_foreign_trigger(self, deadline: float) -> None:
+        """End a trigger of another program or of a lost link, which the camera would not end."""
         ours = self._waits.is_pending(m.TriggerAnswer)
         if Status.BUSY in self._status.last and not ours:
-            self._end_reading(self._connection.require_link())
+            self._send_end_trigger(self._connection.require_link())
             # afterwards no line of that trigger can be taken for the next one's
             await self._requests.fence(deadline)
 
     def _fault_error(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
 
-    async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
-        """Await the result of an earlier trigger, or make it impossible; skip it with numbers.
+    async def _settle_owed(self, deadline: float, *, wait: bool, numbers_suffice: bool) -> None:
+        """Await the owed result of an earlier trigger, or make it impossible.
 
-        Stop voids the running inspection; containers before the answer to a later Query are older.
-        Without Stop this waits for the end of the inspection, when the camera waits for a trigger
-        again. For a camera that handles requests one after the other, a Query is enough.
-        Source: that Stop voids the inspection is inferred.
+        Stop voids the running inspection (inferred); containers before the answer to a later Query
+        are older. On a camera without Stop this waits until the camera waits for a trigger again,
+        and for the answer to a Query. With ``numbers_suffice`` nothing is done, since sequence
+        numbers identify older results.
         """
         correlation, commands = self._correlation, self._commands
-        if not commands.is_halted() and (decided or correlation.debt is None):
+        if not commands.is_halted() and (numbers_suffice or correlation.owed_fate is None):
             return
         dialect = self._connection.dialect
         if dialect.in_order or not dialect.has(m.Stop):
-            await self._wait_for_trigger(deadline, wait=wait)
+            await self._wait_until_accepting(deadline, wait=wait)
             await self._requests.fence(deadline)
-            correlation.settled()
+            correlation.forget_owed()
             return
         now = asyncio.get_running_loop().time()
         if not commands.is_halted() and Status.RUNNING in self._status.last:
             grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
             with contextlib.suppress(TimeoutError):
-                await self._status.wait(_is_decided, grace)
-            if correlation.debt is None:
+                await self._status.wait(_is_decisive, grace)
+            if correlation.owed_fate is None:
                 return
-        if commands.runs:
-            # after an interruption here the next trigger repeats all of this
+        if commands.is_in_run_mode:
+            # if this is interrupted, the next trigger does it again
             await commands.void_inspection(deadline)
-        correlation.settled()
+        correlation.forget_owed()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
-        """Reset Overtriggered, or wait until it falls: only then can it rise for the next trigger.
+        """Reset Overtriggered, or wait until it falls, so that it can rise for the next trigger.
 
         Source: the bit falls by itself (SC manual p. 30, published), at an unknown time; on BVS ID
         it stays until it is reset (BVS ID guide p. 227, published).
@@ -544,7 +549,7 @@ class Triggers:
             await self._requests.command(m.ResetErrors(), deadline)
             await self._status.refresh(deadline)
         with contextlib.suppress(TimeoutError):
-            await self._status.insist(_is_not_overtriggered, now + grace)
+            await self._status.wait_asking_again(_is_not_overtriggered, now + grace)
             return
         raise OvertriggeredError(
             f"{self._connection.name}: Overtriggered has stayed set for {shown_time(grace)}. As "
@@ -568,18 +573,19 @@ def _evidence(features: Features) -> TriggerEvidence:
     return EvidenceByAnswer() if features.polled else EvidenceByStatus()
 
 
-def _what_is_missing(pending: PendingTrigger) -> str:
-    """Return the part of an error text on the camera's missing messages about the trigger."""
+def _missing_messages_text(pending: PendingTrigger) -> str:
+    """Return the part of an error text about the camera's missing messages."""
     evidence, early = pending.evidence, ""
-    if pending.early:
-        results = "1 result" if pending.early == 1 else f"{pending.early} results"
+    if pending.early_count:
+        results = "1 result" if pending.early_count == 1 else f"{pending.early_count} results"
         early = f"; {results} came before the camera had shown that it took the trigger"
     if not evidence.reached:
-        return f"; the camera has not shown that it took the trigger{early}{_HINT if early else ''}"
+        hint = _SHOWS_TRIGGERS_HINT if early else ""
+        return f"; the camera has not shown that it took the trigger{early}{hint}"
     if not evidence.proven:
         return f"; the camera has not answered the question that was sent with the trigger{early}"
     return early
 
 
-def _is_decided(status: Status) -> bool:
+def _is_decisive(status: Status) -> bool:
     return takes_trigger(status) or is_stopped(status) or Status.SYSTEM_ERROR in status

@@ -28,20 +28,20 @@ ErrorT = TypeVar("ErrorT", bound=SmartCamError)
 def copy_to_raise(error: ErrorT) -> ErrorT:
     """Return a copy of a kept error, to be raised.
 
-    A raised error refers to the frames of its caller, and by them to the client: kept by the
-    client's own task, it would keep an unreferenced client alive.
+    A raised error refers to the stack frames of the caller, and so to the client. If the client's
+    task kept that error, it would keep an unreferenced client alive.
     """
-    made = type(error)(*error.args)  # same result as copy(), in a tenth of the steps
-    vars(made).update(vars(error))
-    made.__cause__ = error.__cause__
-    return made
+    copy = type(error)(*error.args)  # same result as copy(), in a tenth of the steps
+    vars(copy).update(vars(error))
+    copy.__cause__ = error.__cause__
+    return copy
 
 
 class PendingAnswer(asyncio.Future[Answer]):
-    """A pending answer of the camera; it belongs to no single waiter.
+    """A pending answer of the camera, for which several tasks may wait.
 
     Attributes:
-        waiters: a future for each waiter.
+        waiters: a future of each waiting task.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -76,62 +76,63 @@ class Waits:
         counters: counters of the round trips.
 
     Attributes:
-        end: reason why there is no session, None while there is one.
-        answers: waiters for answers, by the type of the answer; by id for a message that the
-            dialect does not know.
-        fences_open: Queries that went out with the last trigger and are not answered.
-        statuses: waiters for statuses.
+        end_reason: reason why there is no session, None while there is one.
+        pending_answers: futures of answers, by the type of the answer; by id for a message that
+            the dialect does not know.
+        fences_open: number of Queries that were sent with the last trigger and are not answered.
+        status_waiters: callers that wait for a status, in order.
     """
 
     def __init__(self, counters: ClientCounters) -> None:
-        self.end: SmartCamError | None = None
+        self.end_reason: SmartCamError | None = None
         self._counters = counters
-        self.answers: dict[type[m.Message] | int, PendingAnswer] = {}
+        self.pending_answers: dict[type[m.Message] | int, PendingAnswer] = {}
         self._asked_at: dict[object, float] = {}
-        self._behind: dict[object, int] = {}  # deliveries received before the request was sent
+        # number of the last delivery before each request was sent, by the key of its answer
+        self._last_delivery_before: dict[object, int] = {}
         self.fences_open: int = 0
-        self.statuses: dict[StatusWaiter, None] = {}  # waiters in order; each leaves in one step
+        self.status_waiters: dict[StatusWaiter, None] = {}  # a dict: each is removed in one step
 
     def begin_session(self) -> None:
         """Begin a session, without a pending request."""
-        self.end = None
+        self.end_reason = None
         self.fences_open = 0
 
     def fail(self, error: SmartCamError) -> bool:
-        """End every wait, also one that begins before the next session, with the reason.
+        """End every wait with an error, also one that begins before the next session.
 
         Returns:
-            True if it is the first reason, which stays.
+            True if it is the first error of this session; a later one is ignored.
         """
-        if self.end is not None:
+        if self.end_reason is not None:
             return False
-        self.end = error
-        if self.answers or self.statuses:
+        self.end_reason = error
+        if self.pending_answers or self.status_waiters:
             error = copy_to_raise(error)
-        for answer in self.answers.values():
+        for answer in self.pending_answers.values():
             answer.set_result(error)
-        self.answers.clear()
+        self.pending_answers.clear()
         self._asked_at.clear()
-        self._behind.clear()
+        self._last_delivery_before.clear()
         self.fences_open = 0
-        for waiter in self.statuses:
+        for waiter in self.status_waiters:
             if not waiter.outcome.done():
                 waiter.outcome.set_result(error)
-        self.statuses.clear()
+        self.status_waiters.clear()
         return True
 
     def finish(self, error: SmartCamError) -> None:
         """Note the reason why there will be no session any more."""
-        self.end = error
+        self.end_reason = error
 
     def raise_end(self) -> None:
-        """Raise the reason why there is no session, if there is none.
+        """Raise the reason why there is no session; return if there is one.
 
         Raises:
             LinkError: the reason why there is no session.
         """
-        if self.end is not None:
-            raise copy_to_raise(self.end)
+        if self.end_reason is not None:
+            raise copy_to_raise(self.end_reason)
 
     # ------------------------------------------------------------------ answers
 
@@ -141,23 +142,23 @@ class Waits:
         loop: asyncio.AbstractEventLoop,
         now: float,
         *,
-        behind: int = 0,
+        after_delivery: int = 0,
     ) -> PendingAnswer:
-        """Register for the next answer of this kind; errors come as a result, never raised.
+        """Register for the next answer of this kind; an error is the future's result.
 
-        Messages in the delivery ``behind`` of the link, or in an earlier one, are no answer: they
-        came before the request was sent, and wait to be passed on.
+        Messages in the link's delivery number ``after_delivery`` or an earlier one are no answer:
+        they were received before the request was sent, and wait to be dispatched.
         """
         future = PendingAnswer(loop)
-        self.answers[key] = future
-        self._behind[key] = behind
+        self.pending_answers[key] = future
+        self._last_delivery_before[key] = after_delivery
         if key is not m.SwitchAnswer:  # a switch takes long, which is no round trip
             self._asked_at[key] = now
         return future
 
     def pending_answer(self, key: type[m.Message] | int) -> PendingAnswer:
         """Return the future of a pending answer (:meth:`is_pending`)."""
-        answer = self.answers.get(key)
+        answer = self.pending_answers.get(key)
         if answer is None:
             loop = asyncio.get_running_loop()
             answer = self.next_answer(key, loop, loop.time())
@@ -165,18 +166,18 @@ class Waits:
 
     def is_pending(self, key: type[m.Message] | int) -> bool:
         """Return True if an answer of this kind is pending."""
-        return key in self.answers or (key is m.QueryAnswer and self.fences_open > 0)
+        return key in self.pending_answers or (key is m.QueryAnswer and self.fences_open > 0)
 
     def expect_fences(self, count: int) -> None:
         """Note that Queries went out with a trigger; no task waits for their answers."""
         self.fences_open = count
 
     def awaits_fences(self, count: int) -> bool:
-        """Return True if ``count`` Queries of a trigger are open, and no task waits."""
-        return self.fences_open == count and not self.answers and not self.statuses
+        """Return True if ``count`` Queries of a trigger are open, and no task awaits anything."""
+        return self.fences_open == count and not self.pending_answers and not self.status_waiters
 
-    def take_fence(self) -> bool:
-        """Return True if no task waits for an answer to Query; count that answer off."""
+    def count_fence_answer(self) -> bool:
+        """Count an answer to Query for the last trigger; return False if none is expected."""
         if not self.fences_open:
             return False
         self.fences_open -= 1
@@ -185,9 +186,9 @@ class Waits:
     def on_message(self, message: m.Message, now: float, delivery: int) -> None:
         """Complete the request that a message answers, if one is open."""
         key = message.message_id if isinstance(message, m.UnknownMessage) else type(message)
-        if delivery <= self._behind.get(key, 0):
+        if delivery <= self._last_delivery_before.get(key, 0):
             return
-        future = self.answers.pop(key, None)
+        future = self.pending_answers.pop(key, None)
         if future is not None:
             asked_at = self._asked_at.pop(key, None)
             if asked_at is not None:
@@ -196,31 +197,31 @@ class Waits:
 
     # ------------------------------------------------------------------ statuses
 
-    async def status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
-        """Return the next status that ``predicate`` accepts; it gets each status in order.
+    async def wait_status(self, predicate: Callable[[Status], bool], deadline: float) -> Status:
+        """Return the next status that ``predicate`` accepts; it is called with each one in order.
 
-        Its errors are raised here.
+        An error of the predicate is raised here.
 
         Raises:
             TimeoutError: at ``deadline`` (loop time).
             LinkError: the session ended.
         """
         waiter = StatusWaiter(predicate, asyncio.get_running_loop().create_future())
-        self.statuses[waiter] = None
+        self.status_waiters[waiter] = None
         try:
             async with asyncio.timeout_at(deadline):
                 outcome = await waiter.outcome
         finally:
-            self.statuses.pop(waiter, None)
+            self.status_waiters.pop(waiter, None)
         if isinstance(outcome, SmartCamError):
             raise outcome.with_traceback(None)  # else it would grow with each waiter's raise
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
-    def show(self, status: Status) -> None:
-        """Pass a status to every waiter."""
-        for waiter in tuple(self.statuses):
+    def show_status(self, status: Status) -> None:
+        """Call the predicate of every waiter with a status."""
+        for waiter in tuple(self.status_waiters):
             if waiter.outcome.done():
                 continue
             try:

@@ -122,7 +122,7 @@ class Application(EmulatorData):
 
         Args:
             number: the run's sequence number.
-            turn: runs of this application before this one, since it was loaded.
+            turn: number of runs of this application before this one, since it was loaded.
             time: seconds since the device was made.
             scene: the scene that the camera sees.
             values: values of the input container.
@@ -189,8 +189,8 @@ class Application(EmulatorData):
             raise ValueError(f"{sources[0]} needs a layout")
         if self.layout is not None and not sources:
             raise ValueError("a layout needs values: constant, cycle or generator")
-        given = "processing_time" in self.model_fields_set  # the default gives way to the rate
-        if given and self.rate is not None and self.processing_time * self.rate > 1:
+        is_set = "processing_time" in self.model_fields_set  # the default need not fit the rate
+        if is_set and self.rate is not None and self.processing_time * self.rate > 1:
             raise ValueError(
                 f"a run of {self.processing_time} s does not fit a rate of {self.rate} per second"
             )

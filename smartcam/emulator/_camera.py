@@ -2,8 +2,8 @@
 
 Received bytes go ``socket -> ClientLink -> Machine -> EmulatedCamera.received ->
 Device.handle``; the device's messages go ``Device.take_output -> Machine -> one write``.
-Every action is a *step*: advance the device's time, act, deliver, set one timer for the device's
-next event.
+Every action is a *step*: advance the device's time, act, deliver the device's messages, and set one
+timer for the device's next event.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from smartcam.emulator._scenario.merge import make_plan
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scene import TableScene
 from smartcam.emulator._wire_camera import WireCamera
-from smartcam.emulator.faults._matching import misfit
+from smartcam.emulator.faults._matching import find_unsupported
 from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.models import Status
 from smartcam.protocols import BVS, Machine, Role, Transport
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
 """The conditions that an operator can set and clear, by name."""
 
-SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
+SHOWN_FIELDS = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
 """The fields of an application that the page shows."""
 
 _MAX_NAMED_IDS = 20  # largest number of ids that an error names
@@ -85,7 +85,7 @@ class EmulatedCamera(WireCamera):
         dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``; default
             the scenario's, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
             answers every request with a result code.
-        clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
+        clock: clock of the camera; a :class:`ManualClock` in tests. Default: real time.
         quirks: unknown behaviour of real cameras: :class:`Quirks` or a mapping of its fields.
         name: name of the camera in logs.
         active: id of the application that is loaded at first; default the first given one, else 1.
@@ -190,7 +190,7 @@ class EmulatedCamera(WireCamera):
             applications=self.device.applications,
         )
         self.device.around = self.step
-        self._active: ClientLink | SecondClientSession | None = None
+        self._session_link: ClientLink | SecondClientSession | None = None
         self._moved_at = 0.0
         self.queue.add(faults)
 
@@ -235,18 +235,18 @@ class EmulatedCamera(WireCamera):
                 return ("applications", number, "id"), text
         if plan.active is not None and plan.active not in known:
             ids_text = ", ".join(str(number) for number in known[:_MAX_NAMED_IDS])
-            more = ", ..." if len(known) > _MAX_NAMED_IDS else ""
+            ellipsis = ", ..." if len(known) > _MAX_NAMED_IDS else ""
             asked_text = f"the id {plan.active}" if plan.active.bit_length() < 64 else "such an id"
-            return ("active",), f"no application has {asked_text}; there are {ids_text}{more}"
+            return ("active",), f"no application has {asked_text}; there are {ids_text}{ellipsis}"
         try:
             spoken = dialect.with_quirks(plan.quirks.of_the_wire)
         except ConfigurationError as exc:
             return ("quirks",), str(exc)
         for number, cue in enumerate(plan.timeline):
-            for place, fault in enumerate(cue.do):
-                problem = misfit(fault, spoken, known)
+            for fault_index, fault in enumerate(cue.do):
+                problem = find_unsupported(fault, spoken, known)
                 if problem is not None:
-                    return ("timeline", number, "do", place, problem[0]), problem[1]
+                    return ("timeline", number, "do", fault_index, problem[0]), problem[1]
         return None
 
     @classmethod
@@ -324,7 +324,8 @@ class EmulatedCamera(WireCamera):
             "next_number": device.next_number,
             "queued_inputs": device.queued_inputs,
             "applications": [
-                {key: getattr(each, key) for key in SHOWN} for each in device.applications.values()
+                {key: getattr(each, key) for key in SHOWN_FIELDS}
+                for each in device.applications.values()
             ],
             "quirks": self.quirks,
             "quirks_chosen": self.quirks.model_dump(exclude_defaults=True),
@@ -338,12 +339,12 @@ class EmulatedCamera(WireCamera):
     @property
     def has_session(self) -> bool:
         """True while a client has the session."""
-        return self._active is not None
+        return self._session_link is not None
 
     @property
     def sessions(self) -> list[str]:
         """Address and port of the client that has the session; empty without one."""
-        return [] if self._active is None else [self._active.peer]
+        return [] if self._session_link is None else [self._session_link.peer]
 
     # ------------------------------------------------------------------ links and the session
 
@@ -362,87 +363,93 @@ class EmulatedCamera(WireCamera):
         """Return the policy for broken input."""
         tcp = transport is Transport.TCP
         policy = BAD_FRAME[self.quirks.bad_frame] if tcp else POLICIES[Role.CAMERA, transport]
-        return dataclasses.replace(policy, tells=self.device.behaviour.tells_bad_messages)
+        return dataclasses.replace(
+            policy, reports_malformed=self.device.behaviour.answers_bad_messages
+        )
 
     def received(self, link: ClientLink, message: m.Message) -> None:
         """Handle a message of a link; without the session only Connect has an effect."""
         connects = isinstance(message, m.Connect)
-        if not connects and link is not self._active:
+        if not connects and link is not self._session_link:
             return
-        faults = self._provoke(self.queue.device_on_client, message)
+        faults = self._fire_before(self.queue.device_on_client, message)
         if connects and not link.closed:
             self._connect(link)
-        elif link is self._active:  # a fault may have given the session to another
+        elif link is self._session_link:  # a fault may have given the session to another
             self.device.handle(message)
             if isinstance(message, m.Disconnect):
                 self._collect()
-                self._active = None
+                self._session_link = None
                 link.session_ended()
         self._collect()
         self.device.report_entered()
         if faults:
-            self._act(faults, "after")
+            self._run_device_faults(faults, "after")
 
     def serves(self, link: ClientLink) -> bool:
         """Return True if the link has the session."""
-        return link is self._active
+        return link is self._session_link
 
     def lost(self, link: ClientLink) -> None:
         """Forget a link that is gone; end its session, if it has the session."""
-        if link is self._active:
-            self._leave_session()
+        if link is self._session_link:
+            self._end_session()
 
     def _let_second_client_in(self) -> None:
         """Let another client connect; it gets the session unless a quirk refuses newcomers."""
-        if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
+        if (
+            self.device.rebooting
+            or self._refusal_timer is not None
+            or not self._may_take_over(None)
+        ):
             return
-        self._hand_session(SecondClientSession(self.spoken, self._notified_second_client))
+        self._give_session(SecondClientSession(self.spoken, self._note_second_client))
 
-    def _notified_second_client(self, frame: Frame) -> None:
-        self._note(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
+    def _note_second_client(self, frame: Frame) -> None:
+        self._log_content(SecondClientSession.peer, m.Sender.CAMERA, frame, "second_client", b"")
 
     def _connect(self, link: ClientLink) -> None:
         """Give the session to ``link``: the newcomer wins, unless a quirk says otherwise."""
         if not self._may_take_over(link):
             link.close("another client has the session")
             return
-        self._hand_session(link)
+        self._give_session(link)
 
     def _may_take_over(self, newcomer: ClientLink | None) -> bool:
-        free = self._active is None or self._active is newcomer
+        free = self._session_link is None or self._session_link is newcomer
         return free or self.transport != "tcp" or self.quirks.second_client != "refuse"
 
-    def _hand_session(self, newcomer: ClientLink | SecondClientSession) -> None:
-        old = self._active
+    def _give_session(self, newcomer: ClientLink | SecondClientSession) -> None:
+        old = self._session_link
         if old is not None and old is not newcomer:
-            self._leave_session()
+            self._end_session()
             old.dismiss(f"{newcomer.peer} takes the session over")
-        self._active = newcomer
+        self._session_link = newcomer
         self.device.handle(m.Connect())
 
-    def _leave_session(self) -> None:
-        self._active = None
+    def _end_session(self) -> None:
+        self._session_link = None
         self.device.disconnect()
 
     # ------------------------------------------------------------------ steps
 
     def _after_start(self) -> None:
         self._moved_at = self.clock.now
-        if self._timeline.watches:
-            self.device.watch(self._entered)
+        if self._timeline.watches_states:
+            self.device.watch(self._on_state_entered)
 
     def _before_stop(self) -> None:
-        if isinstance(self._active, SecondClientSession):
-            self._leave_session()
+        if isinstance(self._session_link, SecondClientSession):
+            self._end_session()
 
     def _end_device_faults(self) -> None:
         self.device.end_faults()
         self._before_stop()
 
     def _deliver_at_once(self) -> None:
-        self._send_all(self.device.take_output(), provoke=False)
+        self._send_all(self.device.take_output(), fire_faults=False)
 
-    def _move(self, now: float) -> None:
+    def _advance_device(self, now: float) -> None:
         passed, self._moved_at = now - self._moved_at, now
         self.device.tick(max(0.0, passed))
 
@@ -450,28 +457,28 @@ class EmulatedCamera(WireCamera):
         """Put the device's messages into the active link's next write."""
         output = self.device.take_output()
         if self.queue.device_on_camera:
-            self._send_all(output, provoke=True)
-        elif self._active is not None:
+            self._send_all(output, fire_faults=True)
+        elif self._session_link is not None:
             for message in output:
-                self._active.send(message)
+                self._session_link.send(message)
 
-    def _send_all(self, output: list[m.Message], *, provoke: bool) -> None:
+    def _send_all(self, output: list[m.Message], *, fire_faults: bool) -> None:
         """Send messages to the client that has the session; they may trigger faults."""
-        session = self._active
+        session = self._session_link
         for message in output:
-            faults = self._provoke(self.queue.device_on_camera, message) if provoke else ()
-            if session is not None and session is self._active and self.device.connected:
+            faults = self._fire_before(self.queue.device_on_camera, message) if fire_faults else ()
+            if session is not None and session is self._session_link and self.device.connected:
                 session.send(message)
-            self._act(faults, "after")
+            self._run_device_faults(faults, "after")
 
-    def _settle(self) -> None:
+    def _finish_step(self) -> None:
         self.device.report_entered()
         self._collect()
-        if self._active is not None:
-            self._active.flush()
-        if self.device.rebooting and not self._down:
+        if self._session_link is not None:
+            self._session_link.flush()
+        if self.device.rebooting and not self._is_down:
             self._go_down()
-        elif self._down and not self.device.rebooting:
+        elif self._is_down and not self.device.rebooting:
             self._come_up()
         delay = self.device.next_event_in()
         self._timer.set(None if delay is None else nanoseconds(self._moved_at + delay))
@@ -481,13 +488,13 @@ class EmulatedCamera(WireCamera):
     def _go_down(self) -> None:
         """Restart: close every connection and the port."""
         _log.info("= %s: rebooting", self.name)
-        self._down = True
-        self._active = None
-        self._port.shut()
+        self._is_down = True
+        self._session_link = None
+        self._port.close_with_links()
 
     def _come_up(self) -> None:
         """Come back after a restart."""
         _log.info("= %s: up again", self.name)
-        self._down = False
-        if self._refusal is None:
+        self._is_down = False
+        if self._refusal_timer is None:
             self._port.reopen()

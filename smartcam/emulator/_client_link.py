@@ -1,9 +1,9 @@
 """A client's link to the camera, and the path of its messages while faults act on them.
 
-The owner of a link makes the link's protocol machine, which has the camera's role. A link is faulty
-only while wire faults wait or hold messages back. The camera's messages then go
-``FaultyLink.send -> apply_faults -> DelayLine -> ClientLink.write``; the client's go
-``FaultyLink.take -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
+The owner of a link makes the link's protocol machine, which has the camera's role. A link has a
+:class:`FaultyLink` only while wire faults wait or hold messages back. Then the camera's messages go
+``FaultyLink.send -> apply_faults -> DelayLine -> ClientLink.write``, and the client's go
+``FaultyLink.take_bytes -> cut -> apply_faults -> DelayLine -> ClientLink.feed``.
 """
 
 from __future__ import annotations
@@ -115,7 +115,9 @@ class LinkOwner(Protocol):
         """Note that a connection has ended."""
         ...
 
-    def traced(self, link: ClientLink, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
+    def traced(
+        self, link: ClientLink, sender: m.Sender, content: Frame | RemoteProtocolError
+    ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
@@ -131,14 +133,14 @@ class ClientLink(ABC):
         self.peer = peer
         self.closed: bool = False
         self.input_faults: str | None = None
-        """Kinds of the faults that acted on the message that the camera is receiving."""
+        """Kinds of the faults that acted on the message being received; None for none."""
         self._owner = owner
         self.machine: CameraMachine = owner.make_machine(transport, self._trace)
         self._faulty: FaultyLink | None = None  # set while faults act
 
     def send(self, message: m.Message) -> None:
         """Add a message to the messages that :meth:`flush` will write."""
-        if self._owner.queue.on_camera and self._faulty is None:
+        if self._owner.queue.wire_on_camera and self._faulty is None:
             self._enter_faulty()
         try:
             self.machine.send(message)
@@ -155,16 +157,16 @@ class ClientLink(ABC):
             self._write_frames(self.machine.data_to_send())
             return
         faulty.run()
-        if faulty.idle:
+        if faulty.is_idle:
             self._faulty = None
 
     @property
     def settled(self) -> bool:
-        """True if the link has the session, so that it never makes room for another."""
+        """True if the link has the session, so that it is never closed for a new client."""
         return self._owner.serves(self)
 
     def turn_away(self, why: str) -> None:
-        """End the link to make room, or because it was without a session for too long."""
+        """End the link for a new client, or because it had no session for too long."""
         self.close(why)
 
     @abstractmethod
@@ -172,8 +174,8 @@ class ClientLink(ABC):
         """End the link; nothing more is read or written."""
 
     def dismiss(self, reason: str) -> None:
-        """End the link, since another client has the session; a dead link stays as it is."""
-        if self._faulty is None or not self._faulty.dead:
+        """End the link, since another client has the session; a half-open link stays open."""
+        if self._faulty is None or not self._faulty.is_dead:
             self.close(reason)
 
     def session_ended(self) -> None:  # noqa: B027  only TCP has an order of links
@@ -192,17 +194,17 @@ class ClientLink(ABC):
 
     @abstractmethod
     def write(self, data: bytes) -> bool:
-        """Write bytes that belong together; False if it was not possible."""
+        """Write bytes together; return False if that is not possible."""
 
     @abstractmethod
-    def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
+    def end_link(self, manner: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         """End the link after the bytes written so far, or by a reset."""
 
-    def hold(self, on: bool) -> None:  # noqa: B027  only TCP keeps unread bytes
-        """Stop reading for a time, or continue."""
+    def set_paused(self, paused: bool) -> None:  # noqa: B027  only TCP keeps unread bytes
+        """Stop reading for a time, or continue (``paused`` is False)."""
 
     @abstractmethod
-    def stop_listening(self) -> None:
+    def stop_reading(self) -> None:
         """Stop reading for good."""
 
     @abstractmethod
@@ -217,12 +219,12 @@ class ClientLink(ABC):
     def _write_frames(self, frames: list[bytes]) -> None:
         """Write frames as they are."""
 
-    def _take(self, data: bytes) -> None:
+    def _handle_bytes(self, data: bytes) -> None:
         """Handle received bytes: a part of a stream, or one datagram."""
-        if self._faulty is None and not self._owner.queue.on_client:
+        if self._faulty is None and not self._owner.queue.wire_on_client:
             self.feed(data)
         else:
-            self._enter_faulty().take(data)
+            self._enter_faulty().take_bytes(data)
 
     def _enter_faulty(self) -> FaultyLink:
         if self._faulty is None:
@@ -230,14 +232,14 @@ class ClientLink(ABC):
             self._faulty = FaultyLink(self, self._owner, self.machine)
         return self._faulty
 
-    def _leave(self) -> None:
+    def _mark_closed(self) -> None:
         self.closed = True
         if self._faulty is not None:
             self._faulty.close()
 
-    def _trace(self, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
+    def _trace(self, sender: m.Sender, content: Frame | RemoteProtocolError) -> None:
         if self._faulty is None or sender is m.Sender.CLIENT:
-            self._owner.traced(self, sender, seen)
+            self._owner.traced(self, sender, content)
 
 
 @dataclass(eq=False)
@@ -249,15 +251,20 @@ class FaultyLink:
     machine: CameraMachine
 
     def __post_init__(self) -> None:
-        self.muted: str | None = None  # kind of the fault that keeps the camera silent on this link
-        self.dead: bool = False  # nothing is read on the link either
-        self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
-        self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
+        # kind of the fault that keeps the camera silent on this link; None for none
+        self.muted_by: str | None = None
+        self.is_dead: bool = False  # whether nothing is read on the link either (half open)
+        self._outgoing = self._make_delay_line(
+            m.Sender.CAMERA, self._wake_outgoing, self._write_batch
+        )
+        self._incoming = self._make_delay_line(
+            m.Sender.CLIENT, self._wake_incoming, self._feed_batch
+        )
         # framer of the client's bytes, if there is one
         self._framer: WireFramer | None = None
-        self._revival = OneTimer(self._owner.clock, self._revive)
+        self._revival_timer = OneTimer(self._owner.clock, self._revive)
 
-    def _line(
+    def _make_delay_line(
         self,
         sender: m.Sender,
         wake: Callable[[], None],
@@ -268,16 +275,16 @@ class FaultyLink:
             ordered=self.machine.transport is Transport.TCP,
             wake=wake,
             carry=carry,
-            end=self._end,
-            lost=lambda message: self._lose(sender, message),
+            end=self._end_link,
+            lost=lambda message: self._report_lost(sender, message),
         )
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """True if no fault acts on this link any more, so that messages may bypass it."""
         return (
-            self.muted is None
-            and not self.dead
+            self.muted_by is None
+            and not self.is_dead
             and self._framer is None
             and not self._outgoing
             and not self._incoming
@@ -290,14 +297,14 @@ class FaultyLink:
 
     def close(self) -> None:
         """Drop all messages that are held back, and every timer."""
-        self._revival.set(None)
+        self._revival_timer.set(None)
         self._outgoing.close()
         self._incoming.close()
 
     def heal(self) -> None:
         """Read and write again."""
-        self._revival.set(None)
-        self.muted, self.dead = None, False
+        self._revival_timer.set(None)
+        self.muted_by, self.is_dead = None, False
 
     # ------------------------------------------------------------------ out
 
@@ -305,21 +312,23 @@ class FaultyLink:
         """Add a message of the camera, and its bytes; call :meth:`run` next."""
         dialect, queue = self._owner.codec, self._owner.queue
         frame = dialect.to_frame(message)
-        faults = queue.by_message(queue.on_camera, message)
-        self._put(self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect))
+        faults = queue.by_message(queue.wire_on_camera, message)
+        self._add_messages(
+            self._outgoing, apply_faults(WireMessage.of(frame, data), faults, dialect)
+        )
 
     def run(self) -> None:
         """Write all messages whose time has come."""
         self._outgoing.run()
 
-    def _carry_out(self, batch: list[tuple[WireMessage, bytes]]) -> None:
-        silent = self._link.closed or self.muted is not None
-        written = not silent and self._link.write(b"".join(data for _, data in batch))
+    def _write_batch(self, batch: list[tuple[WireMessage, bytes]]) -> None:
+        silent = self._link.closed or self.muted_by is not None
+        was_written = not silent and self._link.write(b"".join(data for _, data in batch))
         for message, data in batch:
-            if written:
-                message.passed += data
+            if was_written:
+                message.passed_bytes += data
             elif data:
-                message.faults.append(self._why)
+                message.faults.append(self._loss_reason)
             if not message.parts:
                 self._owner.passed(self._link, m.Sender.CAMERA, message)
 
@@ -330,13 +339,13 @@ class FaultyLink:
 
     # ------------------------------------------------------------------ in
 
-    def take(self, data: bytes) -> None:
+    def take_bytes(self, data: bytes) -> None:
         """Add bytes of the client: a part of a stream, or one datagram."""
-        if self.dead:
+        if self.is_dead:
             return
-        faults_wait = self._owner.queue.on_client
+        faults_wait = self._owner.queue.wire_on_client
         if self.machine.transport is Transport.UDP:
-            self._take_message(cut_datagram(data, self._owner.codec))
+            self._add_client_message(cut_datagram(data, self._owner.codec))
             return
         if self._framer is None:
             data = self._finish_frame(data) if faults_wait else data
@@ -345,42 +354,42 @@ class FaultyLink:
                 return
             self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
         for message in cut(data, self._framer, self._owner.codec):
-            if self.dead or self._link.closed:
+            if self.is_dead or self._link.closed:
                 return
-            self._take_message(message)
+            self._add_client_message(message)
         self._stop_cutting()
 
     def _stop_cutting(self) -> None:
-        """Give an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
-        if self._framer is not None and not self._owner.queue.on_client and not self._incoming:
+        """Pass an unfinished frame's bytes to the machine, if no fault needs the whole frame."""
+        if self._framer is not None and not self._owner.queue.wire_on_client and not self._incoming:
             pending, self._framer = self._framer.pending, None
             self._link.feed(pending)
 
     def _finish_frame(self, data: bytes) -> bytes:
-        """Let the frame pass that was unfinished when the faults were given; return the rest."""
-        done = 0
-        while self.machine.buffered and done < len(data):
-            self._link.feed(data[done : done + 1])
-            done += 1
-        return data[done:]
+        """Finish the frame that was begun before the faults; return the bytes after it."""
+        fed_count = 0
+        while self.machine.buffered and fed_count < len(data):
+            self._link.feed(data[fed_count : fed_count + 1])
+            fed_count += 1
+        return data[fed_count:]
 
-    def _take_message(self, message: WireMessage) -> None:
-        queue, frame = self._owner.queue, message.what
+    def _add_client_message(self, message: WireMessage) -> None:
+        queue, frame = self._owner.queue, message.content
         faults: list[Fault] = []
         if isinstance(frame, Frame):
-            faults = queue.by_frame(queue.on_client, frame)
-        self._put(self._incoming, apply_faults(message, faults, self._owner.codec))
+            faults = queue.by_frame(queue.wire_on_client, frame)
+        self._add_messages(self._incoming, apply_faults(message, faults, self._owner.codec))
         self._incoming.run()
 
-    def _carry_in(self, batch: list[tuple[WireMessage, bytes]]) -> None:
+    def _feed_batch(self, batch: list[tuple[WireMessage, bytes]]) -> None:
         for message, data in batch:
-            gone = self.dead or self._link.closed
-            if gone:
-                message.faults.append(self._why)
-            if gone or (message.faults and not data):
+            is_gone = self.is_dead or self._link.closed
+            if is_gone:
+                message.faults.append(self._loss_reason)
+            if is_gone or (message.faults and not data):
                 self._owner.passed(self._link, m.Sender.CLIENT, message)
                 continue
-            message.passed += data
+            message.passed_bytes += data
             self._link.input_faults = ", ".join(message.faults) or None
             self._link.feed(data)
             self._link.input_faults = None
@@ -393,40 +402,40 @@ class FaultyLink:
 
     # ------------------------------------------------------------------ both
 
-    def _put(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
+    def _add_messages(self, line: DelayLine[WireMessage], sent: list[WireMessage]) -> None:
         if line.size + sum(message.size for message in sent) > self._owner.write_limit:
             self._link.overflow()
-        outgoing = line is self._outgoing
-        if self._link.closed or (outgoing and self.muted is not None):
+        is_outgoing = line is self._outgoing
+        if self._link.closed or (is_outgoing and self.muted_by is not None):
             for message in sent:
-                self._lose(m.Sender.CAMERA if outgoing else m.Sender.CLIENT, message)
+                self._report_lost(m.Sender.CAMERA if is_outgoing else m.Sender.CLIENT, message)
         else:
             line.put(sent)
 
-    def _lose(self, sender: m.Sender, message: WireMessage) -> None:
-        message.faults.append(self._why)
+    def _report_lost(self, sender: m.Sender, message: WireMessage) -> None:
+        message.faults.append(self._loss_reason)
         self._owner.passed(self._link, sender, message)
 
     @property
-    def _why(self) -> str:
+    def _loss_reason(self) -> str:
         """Reason why a message is lost now."""
-        return self.muted or (_ENDED if self._link.closed else _UNSENT)
+        return self.muted_by or (_ENDED if self._link.closed else _UNSENT)
 
-    def _end(self, ending: Ending) -> None:
+    def _end_link(self, ending: Ending) -> None:
         self._outgoing.run()  # the camera's answers to the ending message
         if self._link.closed:
             return
         if ending.how in {"close", "reset"}:
             self._link.end_link("close" if ending.how == "close" else "reset")
             return
-        self.muted = ending.cause
+        self.muted_by = ending.cause
         self._outgoing.close()
         if ending.how == "half_open":
-            self.dead = True
+            self.is_dead = True
             self._incoming.close()
-            self._link.stop_listening()
+            self._link.stop_reading()
             if ending.seconds is not None:
-                self._revival.set(nanoseconds(self._owner.clock.now + ending.seconds))
+                self._revival_timer.set(nanoseconds(self._owner.clock.now + ending.seconds))
 
     def _revive(self) -> None:
         with self._owner.step():
@@ -435,10 +444,10 @@ class FaultyLink:
 
 @dataclass(eq=False)
 class SecondClientSession:
-    """The second client that a fault simulates: it has the session, but no connection."""
+    """The session of the second client that a fault simulates, without a connection."""
 
     _dialect: FramedDialect
-    _traced: Callable[[Frame], None]  # called with all messages to it; none is on a wire
+    _on_frame: Callable[[Frame], None]  # called with the frame of each message to it
     peer: ClassVar[str] = "second client"
 
     def send(self, message: m.Message) -> None:
@@ -448,7 +457,7 @@ class SecondClientSession:
             self._dialect.encode_frame(frame)
         except LocalProtocolError:
             return  # a link would not send it either
-        self._traced(frame)
+        self._on_frame(frame)
 
     def flush(self) -> None:
         """Do nothing, since nothing waits."""

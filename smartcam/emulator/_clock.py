@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 NANOSECONDS = 1_000_000_000
 """Number of nanoseconds in a second. Devices and the manual clock count whole nanoseconds, so that
-equal instants stay equal however they were summed up."""
+sums of times do not depend on rounding."""
 
 
 def nanoseconds(seconds: float) -> int:
@@ -29,7 +29,7 @@ class TimerHandle(Protocol):
     """The timer that :meth:`Clock.call_at` returns."""
 
     def cancel(self) -> None:
-        """Do not call; harmless after the call."""
+        """Do not call the callback; this has no effect after the call."""
         ...
 
 
@@ -68,20 +68,20 @@ class OneTimer:
 
     def __post_init__(self) -> None:
         self._handle: TimerHandle | None = None
-        self._when: int | None = None
+        self._fires_at: int | None = None
 
     def set(self, when: int | None) -> None:
         """Set the timer to an instant, nanoseconds; None: cancel it."""
-        if when == self._when:
+        if when == self._fires_at:
             return
         if self._handle is not None:
             self._handle.cancel()
-        self._handle, self._when = None, when
+        self._handle, self._fires_at = None, when
         if when is not None:
-            self._handle = self._clock.call_at(when / NANOSECONDS, self._due)
+            self._handle = self._clock.call_at(when / NANOSECONDS, self._on_timer)
 
-    def _due(self) -> None:
-        self._handle = self._when = None
+    def _on_timer(self) -> None:
+        self._handle = self._fires_at = None
         self._callback()
 
 

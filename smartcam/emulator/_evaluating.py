@@ -67,14 +67,14 @@ class Operator:
 
 
 class EvaluatingCamera(LineCamera):
-    """An emulated camera with applications, each with parts that it evaluates again and again.
+    """An emulated camera with applications, each of which evaluates its parts in turn.
 
     A subclass calls :meth:`set_up` before ``super().__init__()``, and reports a result in
     :meth:`evaluated`.
 
     Attributes:
         active: number of the active application; 0 or another unused number if none is active.
-        busy: an evaluation is running.
+        busy: True while an evaluation is running.
         parts: the parts of each application, one after the other.
     """
 
@@ -107,8 +107,9 @@ class EvaluatingCamera(LineCamera):
             number: itertools.cycle(sequence) for number, sequence in parts.items()
         }
         self._numbers_of_applications = [*parts]
-        self._asking_client: LineClient | None = None  # asked for the running evaluation
-        self._run = 0  # number of the last evaluation or switch; a switch ends a running one
+        self._asking_client: LineClient | None = None  # client of the running evaluation
+        # number of the last evaluation or switch: a switch ends a running evaluation
+        self._run_number = 0
         self.device: Any = Operator(self)
 
     @classmethod
@@ -165,16 +166,16 @@ class EvaluatingCamera(LineCamera):
     def _before_stop(self) -> None:
         """Forget the running evaluation, like a device that loses power."""
         super()._before_stop()
-        self.busy, self._asking_client, self._run = False, None, self._run + 1
+        self.busy, self._asking_client, self._run_number = False, None, self._run_number + 1
 
     def begin(self, call: LineClient | None) -> None:
-        """Begin an evaluation, for a request or without one."""
-        self.busy, self._run, self._asking_client = True, self._run + 1, call
-        run = self._run
-        self.after(self.evaluation_time, lambda: self._end(run))
+        """Begin an evaluation; ``call``: the client that asked for it, None for a trigger input."""
+        self.busy, self._run_number, self._asking_client = True, self._run_number + 1, call
+        run_number = self._run_number
+        self.after(self.evaluation_time, lambda: self._end(run_number))
 
-    def _end(self, run: int) -> None:
-        if run != self._run:
+    def _end(self, run_number: int) -> None:
+        if run_number != self._run_number:
             return
         call, self._asking_client, self.busy = self._asking_client, None, False
         self.evaluated(
@@ -185,7 +186,7 @@ class EvaluatingCamera(LineCamera):
     def activate(self, application: int) -> None:
         """Make another application the active one; the running evaluation gives no result."""
         call, self._asking_client, self.busy = self._asking_client, None, False
-        self.active, self._run = application, self._run + 1
+        self.active, self._run_number = application, self._run_number + 1
         if call is not None and not call.is_closed:
             self.voided(call)
         self.activated()

@@ -65,7 +65,7 @@ def wrap_number(field: Field, number: int) -> int:
     return (number - low) % (high - low + 1) + low
 
 
-_FOUND: dict[str, Generator] = {}  # generators in use, since each run looks up its own
+_LOADED: dict[str, Generator] = {}  # generators in use, since each run looks up its own
 
 
 def find_generator(name: str) -> Generator:
@@ -75,7 +75,7 @@ def find_generator(name: str) -> Generator:
         ConfigurationError: no generator has this name; the text lists the known names.
         PluginError: a plug-in's generator failed to load, or is no function.
     """
-    generator = _FOUND.get(name)
+    generator = _LOADED.get(name)
     if generator is not None:
         return generator
     if name not in GENERATORS:
@@ -86,7 +86,7 @@ def find_generator(name: str) -> Generator:
     loaded = GENERATORS.load(name)
     if not callable(loaded):
         raise PluginError(f"generator {name!r}: {loaded!r} is no function", name=name)
-    generator = _FOUND[name] = cast("Generator", loaded)
+    generator = _LOADED[name] = cast("Generator", loaded)
     return generator
 
 
@@ -107,9 +107,9 @@ def register_generator(name: str, function: Generator) -> None:
 def _tangram(run: Run) -> Values:
     """The table's pieces as the camera's own calibration gives them: metres and radians."""
 
-    def record(seen: Observation) -> dict[str, Any]:
-        pose = run.scene.to_table(seen)
-        return _localization(seen, x=pose.x, y=pose.y, theta=pose.theta)
+    def record(observation: Observation) -> dict[str, Any]:
+        pose = run.scene.to_table(observation)
+        return _localization(observation, x=pose.x, y=pose.y, theta=pose.theta)
 
     return _records(run, record)
 
@@ -117,16 +117,16 @@ def _tangram(run: Run) -> Values:
 def _tangram_pixels(run: Run) -> Values:
     """The table's pieces in pixels of the image; theta in radians."""
 
-    def record(seen: Observation) -> dict[str, Any]:
-        return _localization(seen, x=seen.u, y=seen.v, theta=seen.theta)
+    def record(observation: Observation) -> dict[str, Any]:
+        return _localization(observation, x=observation.u, y=observation.v, theta=observation.theta)
 
     return _records(run, record)
 
 
-def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dict[str, Any]:
+def _localization(observation: Observation, *, x: float, y: float, theta: float) -> dict[str, Any]:
     return {
-        "feature_id": seen.name,
-        "quality": seen.quality,
+        "feature_id": observation.name,
+        "quality": observation.quality,
         "photo_index": 0,
         "x": x,
         "y": y,
@@ -136,13 +136,13 @@ def _localization(seen: Observation, *, x: float, y: float, theta: float) -> dic
 
 def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Values:
     """Return the fields that the layout has; ``pieces`` in the parameters picks and orders."""
-    observed = {seen.name: seen for seen in run.scene.measure()}
-    wanted: Sequence[str] = run.parameters.get("pieces", list(observed))
+    observations = {observation.name: observation for observation in run.scene.measure()}
+    wanted: Sequence[str] = run.parameters.get("pieces", list(observations))
     names = {field.name for field in run.layout.fields}
     records = [
-        {key: value for key, value in record(observed[name]).items() if key in names}
+        {key: value for key, value in record(observations[name]).items() if key in names}
         for name in wanted
-        if name in observed
+        if name in observations
     ]
     if run.layout.repeat is None:
         return records[0] if records else zeros(run.layout.fields)
@@ -152,8 +152,10 @@ def _records(run: Run, record: Callable[[Observation], dict[str, Any]]) -> Value
 def _sequence(run: Run) -> Values:
     """The run's number in the ``@sequence`` field, else in ``field`` or the layout's first."""
     fields = run.layout.head or run.layout.fields
-    marked = run.layout.sequence_field
-    name = run.parameters.get("field", marked.name if marked is not None else fields[0].name)
+    number_field = run.layout.sequence_field
+    name = run.parameters.get(
+        "field", number_field.name if number_field is not None else fields[0].name
+    )
     values = zeros(run.layout.fields)
     for field in run.layout.fields:
         if field.name == name:

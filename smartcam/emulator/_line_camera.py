@@ -15,7 +15,7 @@ from smartcam.emulator._makes import check_options
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scenario.timeline import Cue
 from smartcam.emulator._wire_camera import WireCamera
-from smartcam.emulator.faults._matching import misfit
+from smartcam.emulator.faults._matching import find_unsupported
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import LineDialect
 from smartcam.protocols import messages as m
@@ -37,15 +37,15 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT_BYTES = 1 << 16
-"""Largest number of bytes of lines that may wait after the current one; further bytes are not read
-yet."""
+"""Largest number of bytes of lines that wait after a client's current line; more are not read yet.
+"""
 
-MAX_AGENDA = 10_000
+MAX_SCHEDULED_CALLS = 10_000
 """Largest number of calls that may be scheduled for later at one time."""
 
 
 _FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
-"""The fields of a scenario that apply to every camera of this kind."""
+"""The fields of a scenario that apply to every camera that uses lines."""
 
 _STATE = frozenset({"active", "running"})
 """Fields of a scenario that apply only to cameras with programs."""
@@ -67,15 +67,15 @@ class LineClient:
         self._link = link
         self._server = server
         self._row = 0  # state of the current line
-        self._kept = False
+        self._answers_later = False
 
     def answer_later(self) -> Self:
-        """Return a client that answers the current line later; the next line is read now."""
-        self._kept = True
-        copied = copy.copy(self)
-        self._kept = False
+        """Return a copy that will answer the current line; this client reads the next line now."""
+        self._answers_later = True
+        copied_client = copy.copy(self)
+        self._answers_later = False
         self.end_line()
-        return copied
+        return copied_client
 
     @property
     def is_closed(self) -> bool:
@@ -83,7 +83,7 @@ class LineClient:
         return self._link.closed
 
     def pack(self, text: str) -> bytes:
-        """Return an answer to the current line in the camera's form."""
+        """Return an answer to the current line as bytes."""
         return self._camera.lines.data(text)
 
     def say(self, text: str) -> None:
@@ -91,14 +91,14 @@ class LineClient:
         self.say_bytes(self._camera.lines.data(text), row=0)
 
     def answer(self, text: str | None) -> None:
-        """Answer the current line, None without sending anything; then the next one is read."""
+        """Answer the current line, with None by nothing, and read the next line."""
         if text is not None:
             self.say_bytes(self.pack(text))
-        if not self._kept:
+        if not self._answers_later:
             self.end_line()
 
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
-        """Send bytes unchanged: a part of an answer, or a prompt."""
+        """Send bytes unchanged: part of an answer, or a prompt."""
         if not self._link.closed:
             message = SaidLine(row=self._row if row is None else row, data=data)
             self._camera.say(self._link, message)
@@ -110,13 +110,13 @@ class LineClient:
     def end_line(self) -> None:
         """End the current line, and read the next."""
         self._server.busy = False
-        if not self._server.going and not self._link.closed:
+        if not self._server.is_reading and not self._link.closed:
             with self._camera.step():
                 self._link.feed(b"")
 
     def hide_next_line(self) -> None:
         """Keep the next line, a password, out of the log."""
-        self._server.secret = True
+        self._server.hides_next_line = True
 
     def close(self, reason: str) -> None:
         """End the connection at once."""
@@ -128,7 +128,7 @@ class LineClient:
         self._link.end_link("close", reason)
 
     def begin(self, message: HeardLine) -> None:
-        """Begin a line."""
+        """Note that a line has become the current one."""
         self.has_session = self.has_session or self._camera.begins_session(message)
         self._row, self._server.busy = message.row, True
 
@@ -144,8 +144,8 @@ class LineCamera(WireCamera):
             def answer(self, line: str) -> str | None:
                 return {"HELLO": "ACME", "STATE": "run"}.get(line, "what?")
 
-    A subclass with its own options takes ``**options``, too, and passes these on. A client has one
-    current line; the next ones wait. Everything is called in the event loop's thread.
+    A subclass with its own options also takes ``**options`` and passes them on. A client has one
+    current line; its next lines wait. All methods are called in the event loop's thread.
 
     Args:
         host: address to listen on, without a scheme or a port.
@@ -189,9 +189,9 @@ class LineCamera(WireCamera):
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
         self._clients: dict[ClientLink, LineClient] = {}  # the oldest stands first
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._scheduled_calls: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._spoken_to: dict[ClientLink, None] = {}  # links with lines to write
+        self._links_to_flush: dict[ClientLink, None] = {}  # links with lines to write
         cues = [validated(Cue, cue, f"cue {at}") for at, cue in enumerate(timeline, start=1)]
         self.lines: LineCodec = self.make_codec()
         super().__init__(
@@ -207,10 +207,10 @@ class LineCamera(WireCamera):
             timeline=cues,
             applications=self.application_ids,
         )
-        wrong = self.mistake_in(cues)
-        if wrong is not None:
-            place, text = wrong
-            raise ConfigurationError(f"{self.name}: {'.'.join(map(str, place))}: {text}")
+        mistake = self.mistake_in(cues)
+        if mistake is not None:
+            path, text = mistake
+            raise ConfigurationError(f"{self.name}: {'.'.join(map(str, path))}: {text}")
         self.queue.add(faults)
 
     @classmethod
@@ -269,12 +269,14 @@ class LineCamera(WireCamera):
         """Return the place of something unsupported in a timeline, and the reason; or None."""
         for number, cue in enumerate(cues):
             if cue.entering is not None and cue.entering not in self.states:
-                able = ", ".join(sorted(state.value for state in self.states))
-                return ("timeline", number, "entering"), f"it tells only of {able}"
-            for place, fault in enumerate(cue.do):
-                wrong = misfit(fault, self.codec, self.application_ids, self.fault_kinds)
-                if wrong is not None:
-                    return ("timeline", number, "do", place, wrong[0]), wrong[1]
+                supported = ", ".join(sorted(state.value for state in self.states))
+                return ("timeline", number, "entering"), f"it tells only of {supported}"
+            for fault_index, fault in enumerate(cue.do):
+                mistake = find_unsupported(
+                    fault, self.codec, self.application_ids, self.fault_kinds
+                )
+                if mistake is not None:
+                    return ("timeline", number, "do", fault_index, mistake[0]), mistake[1]
         return None
 
     @classmethod
@@ -331,11 +333,13 @@ class LineCamera(WireCamera):
         Raises:
             ConfigurationError: 10,000 calls wait already.
         """
-        if len(self._agenda) >= MAX_AGENDA:
-            raise ConfigurationError(f"{self.name}: {MAX_AGENDA} things wait for their time")
+        if len(self._scheduled_calls) >= MAX_SCHEDULED_CALLS:
+            raise ConfigurationError(
+                f"{self.name}: {MAX_SCHEDULED_CALLS} things wait for their time"
+            )
         when = nanoseconds(self.clock.now) + nanoseconds(seconds)
         with self.step():
-            heapq.heappush(self._agenda, (when, next(self._numbers), action))
+            heapq.heappush(self._scheduled_calls, (when, next(self._numbers), action))
 
     # ------------------------------------------------------------------ properties
 
@@ -370,7 +374,7 @@ class LineCamera(WireCamera):
         client = self._clients[link] = self.make_client(link, link.machine)
         with self.step():
             self.greet(client)
-            self._timeline.entered(DeviceState.CONNECTED)
+            self._timeline.note_entered(DeviceState.CONNECTED)
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
         """Return a new client."""
@@ -381,11 +385,11 @@ class LineCamera(WireCamera):
         client = self._clients.get(link)
         if client is None or not isinstance(message, HeardLine):
             return
-        faults = self._provoke(self.queue.device_on_client, message)
+        faults = self._fire_before(self.queue.device_on_client, message)
         client.begin(message)
         self.begun(client, message)
         self.hear(client, self.lines.text(message.data))
-        self._act(faults, "after")
+        self._run_device_faults(faults, "after")
 
     def begins_session(self, message: HeardLine) -> bool:
         """Return True if a line begins a session: Connect, or without Connect any known line."""
@@ -401,40 +405,40 @@ class LineCamera(WireCamera):
 
     def lost(self, link: ClientLink) -> None:
         """Forget a lost link; a second call does nothing."""
-        self._spoken_to.pop(link, None)
+        self._links_to_flush.pop(link, None)
         if self._clients.pop(link, None) is not None:
-            self._timeline.entered(DeviceState.DISCONNECTED)
+            self._timeline.note_entered(DeviceState.DISCONNECTED)
 
     def say(self, link: ClientLink, message: SaidLine) -> None:
         """Send a message to a link; it is written at the end of the step."""
         with self.step():
-            faults = self._provoke(self.queue.device_on_camera, message)
+            faults = self._fire_before(self.queue.device_on_camera, message)
             link.send(message)
-            self._spoken_to[link] = None
-            self._act(faults, "after")
+            self._links_to_flush[link] = None
+            self._run_device_faults(faults, "after")
 
     # ------------------------------------------------------------------ steps
 
-    def _move(self, now: float) -> None:
+    def _advance_device(self, now: float) -> None:
         instant = nanoseconds(now)
-        while self._agenda and self._agenda[0][0] <= instant:
-            heapq.heappop(self._agenda)[2]()
+        while self._scheduled_calls and self._scheduled_calls[0][0] <= instant:
+            heapq.heappop(self._scheduled_calls)[2]()
 
     def _collect(self) -> None:
         pass  # messages go to their links at once
 
-    def _settle(self) -> None:
-        for link in list(self._spoken_to):
+    def _finish_step(self) -> None:
+        for link in list(self._links_to_flush):
             if not link.closed:
                 link.flush()
-        self._spoken_to.clear()
+        self._links_to_flush.clear()
         for link in self._clients:
-            link.hold(link.machine.buffered > MAX_INPUT_BYTES)
-        self._timer.set(self._due())
+            link.set_paused(link.machine.buffered > MAX_INPUT_BYTES)
+        self._timer.set(self._next_call_at())
 
-    def _due(self) -> int | None:
+    def _next_call_at(self) -> int | None:
         """Return the time of the next scheduled call, nanoseconds of the clock; None for never."""
-        return self._agenda[0][0] if self._agenda else None
+        return self._scheduled_calls[0][0] if self._scheduled_calls else None
 
     def _before_stop(self) -> None:
-        self._agenda.clear()
+        self._scheduled_calls.clear()

@@ -1,7 +1,7 @@
 """Lines of text as frames, for the links, faults and the log of an emulated camera.
 
-A frame's payload is a line with its end. Its id is the row of the table that it belongs to, from
-1, as a request or as an answer; 0 for a line without a row.
+A frame's payload is a line with its end. Its id is the number of the row that the line belongs to,
+from 1, as a request or as an answer; 0 for a line without a row.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ class _LineForm(NamedTuple):
         )
 
     def read(self, text: str) -> dict[str, str] | None:
-        """Return the fields of a line, each as long as possible; None if it has another form.
+        """Return the fields of a line, each as long as possible; None for a line of another form.
 
         Fixed texts are searched from the end, so that no character is read twice.
         """
@@ -234,21 +234,21 @@ class _LineForm(NamedTuple):
             return None
         values: dict[str, str] = {}
         for name, before in zip(reversed(self.fields), reversed((first, *texts[:-1])), strict=True):
-            place = text.rfind(before, len(first), end) if len(values) < len(texts) - 1 else 0
-            if place < 0:
+            start = text.rfind(before, len(first), end) if len(values) < len(texts) - 1 else 0
+            if start < 0:
                 return None
-            values[name] = text[place + len(before) : end]
-            end = place
+            values[name] = text[start + len(before) : end]
+            end = start
         return values
 
 
 class LineFramer:
-    """Cuts a client's lines; a longer line than the codec's breaks the protocol."""
+    """Cuts a client's bytes into lines; a line longer than the codec's limit is an error."""
 
     def __init__(self, codec: LineCodec) -> None:
         self._codec = codec
         self._buffer = bytearray()
-        self._searched = 0  # no line end begins before this place
+        self._search_start = 0  # offset where the search for a line end goes on
 
     @property
     def pending(self) -> bytes:
@@ -266,43 +266,43 @@ class LineFramer:
     def next_frame(self) -> Frame | None:
         """Return the next line, None if it is incomplete; FrameError: it is too long."""
         codec = self._codec
-        match = codec.ends.search(self._buffer, self._searched)
+        match = codec.ends.search(self._buffer, self._search_start)
         size = len(self._buffer) if match is None else match.start()
         if size > codec.max_line + (match is None):  # the last byte may be half of an end
             raise FrameError(
                 f"a line of more than {codec.max_line} bytes came", data=bytes(self._buffer[:64])
             )
         if match is None:
-            self._searched = max(0, size - 1)
+            self._search_start = max(0, size - 1)
             return None
         data = bytes(self._buffer[: match.end()])
         del self._buffer[: match.end()]
-        self._searched = 0
+        self._search_start = 0
         return Frame(codec.row_of(data[:size].decode(codec.encoding, "replace")), data)
 
     def resync(self) -> int:
         """Drop everything; return the number of dropped bytes."""
         size = len(self._buffer)
         self._buffer.clear()
-        self._searched = 0
+        self._search_start = 0
         return size
 
 
 class LineServer:
-    """One connection's lines, in the camera's role: the next line waits for the current one.
+    """One connection's lines, in the camera's role: a line waits until the one before is done.
 
     Attributes:
-        busy: a line is being carried out.
-        going: :meth:`events` is running.
-        secret: the next line is not shown in the log.
+        busy: True while a line is carried out.
+        is_reading: True while :meth:`events` is running.
+        hides_next_line: True if the log must not show the next line.
     """
 
     def __init__(self, codec: LineCodec, transport: Transport, trace: Trace) -> None:
         self.transport: Transport = transport
         self.state: State = State.CONNECTED
         self.busy: bool = False
-        self.going: bool = False
-        self.secret: bool = False
+        self.is_reading: bool = False
+        self.hides_next_line: bool = False
         self._trace = trace
         self._framer = codec.framer(0)
         self._outbox: list[bytes] = []
@@ -317,25 +317,25 @@ class LineServer:
         self._framer.feed(data)
 
     def events(self) -> Iterator[HeardLine]:
-        """Yield lines until one is being carried out, each before the next is read."""
-        if self.going:
+        """Yield lines one by one, until a line is not carried out at once."""
+        if self.is_reading:
             return
-        self.going = True
+        self.is_reading = True
         try:
             while not self.busy and self.state is State.CONNECTED:
                 frame = self._framer.next_frame()
                 if frame is None:
                     return
-                secret, self.secret = self.secret, False
-                shown = Frame(0, HIDDEN) if secret else frame
-                self._trace(m.Sender.CLIENT, shown)
+                hides_line, self.hides_next_line = self.hides_next_line, False
+                traced_frame = Frame(0, HIDDEN) if hides_line else frame
+                self._trace(m.Sender.CLIENT, traced_frame)
                 yield HeardLine(row=frame.message_id, data=frame.payload)
         except FrameError as exc:
             self.state = State.FAILED
             self._framer.resync()
             self._trace(m.Sender.CLIENT, exc)
         finally:
-            self.going = False
+            self.is_reading = False
 
     def send(self, message: SaidLine) -> None:
         """Send bytes."""

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 CLOSE_TIMEOUT = 1.0
-"""Seconds of real time that a client has to close its side after a fault closed the camera's."""
+"""Seconds of real time in which a client must close its side after a fault closed the camera's."""
 
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
 FIRST_READ_BYTES = 1 << 10
-"""Bytes of a connection's first read buffer: messages of clients are short, and hundreds of cameras
+"""Size of a connection's first read buffer: messages of clients are short, and hundreds of cameras
 may have a buffer each. The buffer doubles after each full read, as input data needs, and shrinks to
 this size after a read that was not full."""
 
@@ -49,7 +49,7 @@ def _peer_text(address: Any) -> str:
 
 
 class _TcpLink(ClientLink, asyncio.BufferedProtocol):
-    """A connection. All messages of one step go out in one write (SC manual p. 40)."""
+    """A connection. All messages of one step are sent by one write (SC manual p. 40)."""
 
     _transport: asyncio.Transport
 
@@ -57,15 +57,15 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         super().__init__(owner, Transport.TCP, "?")
         self.address: Any = None
         self._listener = listener
-        self._farewell: asyncio.TimerHandle | None = None
-        self._end_waits = False
-        self._room = memoryview(bytearray(FIRST_READ_BYTES))
+        self._abort_timer: asyncio.TimerHandle | None = None
+        self._close_is_pending = False
+        self._read_buffer = memoryview(bytearray(FIRST_READ_BYTES))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self.address = transport.get_extra_info("peername")
         self.peer: str = _peer_text(self.address)
-        if self._listener.down:
+        if self._listener.is_down:
             self.close("the camera is down")
             return
         refusal = self._listener.enter(self)
@@ -78,38 +78,38 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._owner.arrived(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self._room
+        return self._read_buffer
 
     def buffer_updated(self, nbytes: int) -> None:
-        room, size = self._room, len(self._room)
-        data = bytes(room[:nbytes])
+        buffer, size = self._read_buffer, len(self._read_buffer)
+        data = bytes(buffer[:nbytes])
         if nbytes == size < MAX_READ_BYTES:
-            self._room = memoryview(bytearray(2 * size))
+            self._read_buffer = memoryview(bytearray(2 * size))
         elif nbytes < size > FIRST_READ_BYTES:
-            self._room = memoryview(bytearray(FIRST_READ_BYTES))
+            self._read_buffer = memoryview(bytearray(FIRST_READ_BYTES))
         if self.closed:  # the last bytes before the end
             return
         with self._owner.step():
-            self._take(data)
+            self._handle_bytes(data)
             self.answer_messages()
 
     def eof_received(self) -> bool:
-        """Note that the client has closed its side; bytes that faults hold back are read first."""
-        self._end_waits = self._faulty is not None and self._faulty.holds_input
-        return self._end_waits
+        """Note that the client has closed its side; first handle bytes that faults hold back."""
+        self._close_is_pending = self._faulty is not None and self._faulty.holds_input
+        return self._close_is_pending
 
     def answer_messages(self) -> None:
         self.flush()  # also answers before a Disconnect in the same bytes
         if self.machine.state is State.FAILED:
             self.close("a broken frame came")
-        elif self._end_waits and (self._faulty is None or not self._faulty.holds_input):
+        elif self._close_is_pending and (self._faulty is None or not self._faulty.holds_input):
             self._transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._farewell is not None:
-            self._farewell.cancel()
+        if self._abort_timer is not None:
+            self._abort_timer.cancel()
         by_client = not self.closed
-        self._leave()
+        self._mark_closed()
         self._listener.leave(self)
         with self._owner.step():
             self._owner.lost(self)
@@ -130,7 +130,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
     def close(self, reason: str) -> None:
         self._listener.leave(self)
         if not self.closed:
-            self._leave()
+            self._mark_closed()
             _log.info("= %s: connection closed: %s", self.peer, reason)
             self._owner.lost(self)
         self._transport.abort()
@@ -142,7 +142,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
             self.close("a fault resets it")
             return
-        self._leave()
+        self._mark_closed()
         _log.info("= %s: connection closed: %s", self.peer, why)
         self._owner.lost(self)
         # closing a socket with unread bytes sends a reset, so it stays open until the client
@@ -150,20 +150,20 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         with contextlib.suppress(OSError):
             self._transport.write_eof()
         loop = asyncio.get_running_loop()
-        self._farewell = loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
+        self._abort_timer = loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
 
-    def stop_listening(self) -> None:
+    def stop_reading(self) -> None:
         self._transport.pause_reading()
-        self._listener.keep(self)
+        self._listener.lift_time_limit(self)
 
-    def hold(self, on: bool) -> None:
-        if on:
+    def set_paused(self, paused: bool) -> None:
+        if paused:
             self._transport.pause_reading()
-        elif self._faulty is None or not self._faulty.dead:
+        elif self._faulty is None or not self._faulty.is_dead:
             self._transport.resume_reading()
 
     def heal(self) -> None:
-        if self._faulty is not None and self._faulty.muted is not None:
+        if self._faulty is not None and self._faulty.muted_by is not None:
             self.end_link("reset")
 
     def _write_frames(self, frames: list[bytes]) -> None:
@@ -194,7 +194,7 @@ class Listener(ABC):
         """Close the port, at once; links stay."""
 
     @abstractmethod
-    def shut(self) -> None:
+    def close_with_links(self) -> None:
         """Close the port and every link, at once."""
 
     async def wait_closed(self) -> None:
@@ -211,7 +211,7 @@ class TcpListener(Listener):
 
     def __init__(self, owner: LinkOwner) -> None:
         super().__init__(owner)
-        self.down: bool = True
+        self.is_down: bool = True
         """True while the camera is down: accepted connections are closed at once."""
         self._acceptor: Acceptor[ClientLink] = Acceptor(
             lambda: _TcpLink(self, self._owner),
@@ -223,12 +223,12 @@ class TcpListener(Listener):
 
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket that listens."""
-        self.down = False
+        self.is_down = False
         self._acceptor.open(sock)
 
-    def shut(self) -> None:
+    def close_with_links(self) -> None:
         """Close the port and every link, at once; the owner closes the socket."""
-        self.down = True
+        self.is_down = True
         self.close_port()
         for link in self.all_links:
             link.close("the camera is down")
@@ -243,7 +243,7 @@ class TcpListener(Listener):
         await super().wait_closed()
 
     def enter(self, link: _TcpLink) -> str:
-        """Accept a new connection; return "", or why there is no room for it."""
+        """Accept a new connection; return "", or the reason why it is refused."""
         self.places.most = self._owner.max_links
         return self._acceptor.enter(link, link.address)
 
@@ -252,11 +252,11 @@ class TcpListener(Listener):
         self._acceptor.leave(link)
 
     def session_ended(self, link: _TcpLink) -> None:
-        """Note that a client has ended its session; now it may be closed to make room."""
+        """Note that a client has ended its session; it may now be closed for a new client."""
         self._acceptor.move_back(link)
         self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
 
-    def keep(self, link: _TcpLink) -> None:
+    def lift_time_limit(self, link: _TcpLink) -> None:
         """Lift the time limit of a connection that a fault keeps silent."""
         self._acceptor.expect(link, None, "")
 
@@ -274,7 +274,7 @@ class _UdpLink(ClientLink):
 
     def datagram_received(self, data: bytes) -> None:
         with self._owner.step():
-            self._take(data)
+            self._handle_bytes(data)
             self.flush()
 
     def write(self, data: bytes) -> bool:
@@ -283,22 +283,22 @@ class _UdpLink(ClientLink):
     def end_link(self, how: Literal["close", "reset"], why: str = "a fault ends it") -> None:
         self.close(f"{why} ({how})")
 
-    def stop_listening(self) -> None:
+    def stop_reading(self) -> None:
         pass  # the faulty link takes nothing any more
 
     def heal(self) -> None:
-        if self._faulty is not None and self._faulty.muted != REFUSED:
+        if self._faulty is not None and self._faulty.muted_by != REFUSED:
             self._faulty.heal()
 
-    def shut_off(self) -> None:
-        """Close the port for a time: messages are lost."""
+    def block_messages(self) -> None:
+        """Lose all messages while the port is closed."""
         faulty = self._enter_faulty()
-        faulty.muted = faulty.muted or REFUSED
+        faulty.muted_by = faulty.muted_by or REFUSED
 
-    def let_in(self) -> None:
-        """Open the port again."""
-        if self._faulty is not None and self._faulty.muted == REFUSED:
-            self._faulty.muted = None
+    def unblock_messages(self) -> None:
+        """Stop losing messages, since the port is open again."""
+        if self._faulty is not None and self._faulty.muted_by == REFUSED:
+            self._faulty.muted_by = None
 
     def _write_frames(self, frames: list[bytes]) -> None:
         for frame in frames:
@@ -306,7 +306,7 @@ class _UdpLink(ClientLink):
 
     def close(self, reason: str) -> None:
         if not self.closed:
-            self._leave()
+            self._mark_closed()
             _log.debug("= %s: forgotten: %s", self.peer, reason)
             self._listener.forget(self._address)
             self._owner.lost(self)
@@ -327,15 +327,15 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=sock)
         for link in self.links.values():
-            link.let_in()
+            link.unblock_messages()
 
     def close_port(self) -> None:
         """Close the port, at once; messages are lost meanwhile."""
         for link in self.links.values():
-            link.shut_off()
+            link.block_messages()
         self._close_socket()
 
-    def shut(self) -> None:
+    def close_with_links(self) -> None:
         """Close the port and every link, at once."""
         self._close_socket()
         for link in self.all_links:
@@ -351,7 +351,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             transport.abort()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Pass a datagram to its address' link; of too many links, drop the longest silent one."""
+        """Pass a datagram to its address' link; a new link may replace the longest silent one."""
         if self._transport is None:
             return  # the port is shut; this datagram was read before
         now = asyncio.get_running_loop().time()

@@ -1,4 +1,4 @@
-"""The camera's port: opened, closed, and opened again on the same number."""
+"""The camera's port, which can be closed and opened again with the same number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
-_RETRY = 0.2  # seconds between tries to get the port back
+RETRY_PAUSE = 0.2  # seconds between two tries to open the port again
 
 
 @dataclass(eq=False)
@@ -48,11 +48,11 @@ class Port:
             self.number = self._socket.getsockname()[1]
             await self._hand_over(self._socket)
         except BaseException:
-            self.shut()
+            self.close_with_links()
             raise
 
     def reopen(self) -> None:
-        """Open the port again: now if possible, else as soon as it is free."""
+        """Open the port again, at once or as soon as it is free."""
         try:
             self._socket = self._bind()
         except OSError:
@@ -67,14 +67,14 @@ class Port:
         self._listener.close_port()
         self._close_socket()
 
-    def shut(self) -> None:
+    def close_with_links(self) -> None:
         """Close the port and every link."""
         self._stop_opening()
-        self._listener.shut()
+        self._listener.close_with_links()
         self._close_socket()
 
     async def wait_closed(self) -> None:
-        """Wait until the port and its connections are closed; call :meth:`shut` first."""
+        """Wait until all is closed; :meth:`close_with_links` must be called before."""
         opening, self._opening = self._opening, None
         if opening is not None:
             await asyncio.wait({opening})
@@ -101,16 +101,16 @@ class Port:
             raise
         return sock
 
-    async def _reopen(self, before: asyncio.Task[None] | None) -> None:
-        if before is not None:  # the start was cancelled, and has to release its socket
-            await asyncio.wait({before})
+    async def _reopen(self, earlier_try: asyncio.Task[None] | None) -> None:
+        if earlier_try is not None:  # an earlier, cancelled try must release its socket first
+            await asyncio.wait({earlier_try})
         while True:
             try:
                 self._socket = self._socket or self._bind()
                 await self._hand_over(self._socket)
             except OSError as exc:
                 _log.warning("! %s: port %d is not to be had: %s", self._name, self.number, exc)
-                await asyncio.sleep(_RETRY)
+                await asyncio.sleep(RETRY_PAUSE)
             else:
                 return
 

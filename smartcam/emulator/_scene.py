@@ -21,7 +21,10 @@ TABLE_SIZE = (0.30, 0.25)
 
 
 class TablePose(NamedTuple):
-    """The place of a piece: x right, y away, metres; theta counter-clockwise, radians."""
+    """The pose of a piece: x to the right and y to the back, metres; theta, radians.
+
+    The angle theta is counter-clockwise.
+    """
 
     x: float
     y: float
@@ -50,7 +53,7 @@ PIECES: Mapping[str, TablePose] = {
 """The pieces at their first poses; no two touch, none reaches over the table's edge."""
 
 _HALF_LENGTH_M = 0.02
-"""Half the length of a piece, metres; pixel noise at this distance turns the piece."""
+"""Half the length of a piece, metres: at this distance, pixel noise acts on its angle."""
 
 
 MAX_PIXELS = 1e9
@@ -84,35 +87,35 @@ class TableScene:
     ) -> None:
         if not isinstance(offset, tuple) or len(offset) != 2:
             raise wrong_argument("offset", "a pixel's u and v", offset, "scene")
-        most = MAX_PIXELS
-        self.scale: float = check_number(scale, "scale", 0, most, "scene", above=True)
+        limit = MAX_PIXELS
+        self.scale: float = check_number(scale, "scale", 0, limit, "scene", above=True)
         self.offset: tuple[float, float] = (
-            check_number(offset[0], "offset", -most, most, "scene"),
-            check_number(offset[1], "offset", -most, most, "scene"),
+            check_number(offset[0], "offset", -limit, limit, "scene"),
+            check_number(offset[1], "offset", -limit, limit, "scene"),
         )
-        self.rotation: float = check_number(rotation, "rotation", -most, most, "scene")
-        self.pixel_noise: float = check_number(pixel_noise, "pixel_noise", 0, most, "scene")
+        self.rotation: float = check_number(rotation, "rotation", -limit, limit, "scene")
+        self.pixel_noise: float = check_number(pixel_noise, "pixel_noise", 0, limit, "scene")
         self.seed: int = check_seed(seed, "scene")
         self.y_down: bool = check_flag(y_down, "y_down", "scene")
         self.pieces: dict[str, TablePose] = dict(PIECES)
         """Ground truth by name; a change shows in the next measurement."""
         self._random = random.Random(seed)  # noqa: S311  noise, not a secret
-        self._flip = -1.0 if y_down else 1.0
+        self._v_sign = -1.0 if y_down else 1.0
 
     def to_pixels(self, pose: TablePose) -> tuple[float, float, float]:
         """Return u, v (pixels) and theta (radians) of a pose on the table, without noise."""
         cos, sin = self.scale * math.cos(self.rotation), self.scale * math.sin(self.rotation)
         u = self.offset[0] + cos * pose.x - sin * pose.y
-        v = self.offset[1] + self._flip * (sin * pose.x + cos * pose.y)
-        return u, v, self._flip * (pose.theta + self.rotation)
+        v = self.offset[1] + self._v_sign * (sin * pose.x + cos * pose.y)
+        return u, v, self._v_sign * (pose.theta + self.rotation)
 
     def to_table(self, observation: Observation) -> TablePose:
-        """Return the place on the table of an observation, by the camera's calibration."""
+        """Return the pose on the table of an observation, by the camera's calibration."""
         u = observation.u - self.offset[0]
-        v = self._flip * (observation.v - self.offset[1])
+        v = self._v_sign * (observation.v - self.offset[1])
         cos, sin = math.cos(self.rotation) / self.scale, math.sin(self.rotation) / self.scale
-        theta = self._flip * observation.theta - self.rotation
-        return TablePose(cos * u + sin * v, cos * v - sin * u, _normal(theta))
+        theta = self._v_sign * observation.theta - self.rotation
+        return TablePose(cos * u + sin * v, cos * v - sin * u, _wrap_angle(theta))
 
     def measure(self) -> list[Observation]:
         """Return one observation of each piece, in the order of :attr:`pieces`, with new noise."""
@@ -120,19 +123,19 @@ class TableScene:
         observations: list[Observation] = []
         for name, pose in list(self.pieces.items()):  # a test may change them in its own thread
             u, v, theta = self.to_pixels(pose)
-            turn = gauss(0.0, self.pixel_noise / (_HALF_LENGTH_M * self.scale))
+            angle_noise = gauss(0.0, self.pixel_noise / (_HALF_LENGTH_M * self.scale))
             observations.append(
                 Observation(
                     name=name,
                     u=u + gauss(0.0, self.pixel_noise),
                     v=v + gauss(0.0, self.pixel_noise),
-                    theta=_normal(theta + turn),
+                    theta=_wrap_angle(theta + angle_noise),
                     quality=self._random.uniform(0.95, 1.0),
                 )
             )
         return observations
 
 
-def _normal(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     """Return an angle in (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2 * math.pi)

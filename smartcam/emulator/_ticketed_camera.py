@@ -123,15 +123,15 @@ class TicketedFramer(LineFramer):
 
     def __init__(self, codec: TicketedCodec) -> None:
         super().__init__(codec)
-        self._frames = codec
+        self._ticketed_codec = codec
 
     def next_frame(self) -> Frame | None:
         """Return the next frame, None if it is incomplete; FrameError: it is too long."""
-        codec = self._frames
+        codec = self._ticketed_codec
         match = codec.header.match(self._buffer)
         if match is None:
-            mark = self._buffer[codec.width : codec.width + 1]
-            if mark == b"L" and len(self._buffer) < codec.header_size:
+            length_mark = self._buffer[codec.width : codec.width + 1]
+            if length_mark == b"L" and len(self._buffer) < codec.header_size:
                 return None
             return super().next_frame()
         length = int(match[2])
@@ -142,7 +142,7 @@ class TicketedFramer(LineFramer):
             return None
         data = bytes(self._buffer[:end])
         del self._buffer[:end]
-        self._searched = 0
+        self._search_start = 0
         return Frame(codec.row_of(codec.text(data)), data)
 
 
@@ -153,7 +153,7 @@ class TicketedCamera(LineCamera):
     are read meanwhile.
 
     Attributes:
-        also_hears: requests of other clients, beside the dialect's own.
+        also_hears: requests that other clients send, in addition to the dialect's.
         client_class: class of its clients.
     """
 
@@ -172,8 +172,10 @@ class TicketedCamera(LineCamera):
             raise ConfigurationError(
                 f"{type(self).__name__}: dialect {dialect.name} has no tickets"
             )
-        *rows, last = dialect.rows  # the last row may match any line
-        return TicketedCodec(replace(dialect, rows=(*rows, *self.also_hears, last), split=None))
+        *rows, catch_all_row = dialect.rows  # the last row may match any line
+        return TicketedCodec(
+            replace(dialect, rows=(*rows, *self.also_hears, catch_all_row), split=None)
+        )
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
         """Return a new client."""

@@ -32,7 +32,7 @@ MAX_IDS = 1000
 Only a client that sends arbitrary ids uses more."""
 
 _ENTRY_BYTES = 400  # bytes of an entry with its message, without the payload
-_PER_BYTE = 4  # bytes per byte of payload: one in the message, three in hex
+_BYTES_PER_BYTE = 4  # bytes per byte of payload: one in the message, three in hex
 
 MAX_VISITS = 1000
 """Largest number of ended connections whose record is kept; the oldest are dropped first."""
@@ -95,7 +95,7 @@ class Visit(NamedTuple):
     reset: bool
 
 
-_Traced: TypeAlias = tuple[float, str, Sender, Frame | bytes, str | None, bytes | None]
+_EntryParts: TypeAlias = tuple[float, str, Sender, Frame | bytes, str | None, bytes | None]
 """Time, peer, sender, frame or bytes, faults, and passed bytes: the parts of an entry."""
 
 _DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out"}
@@ -104,8 +104,8 @@ _DIRECTIONS: dict[Sender, Direction] = {Sender.CLIENT: "in", Sender.CAMERA: "out
 class Log(Sequence[LogEntry]):
     """The last frames in both directions, oldest first; the oldest are dropped when it is full.
 
-    Entries are made when they are read; until then the log keeps the bytes of a frame. The bounds
-    do not depend on this.
+    A frame is decoded when its entry is read; until then the log keeps its bytes. The limits do not
+    depend on this.
 
     Args:
         dialect: dialect in which frames are decoded.
@@ -127,19 +127,20 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # later frames, not yet read
-        self._weights: deque[int] = deque()  # sizes of all entries in order, bytes
+        # entries after those, whose messages are not decoded yet
+        self._raw_entries: deque[LogEntry | _EntryParts] = deque()
+        self._sizes: deque[int] = deque()  # sizes of all entries in order, bytes
         self._size = 0  # sum of the sizes, bytes
-        self._gone = 0  # number of entries removed so far
+        self._removed_count = 0  # number of entries removed so far
 
     def __repr__(self) -> str:
         return f"Log({list(self)!r})"
 
     def __len__(self) -> int:
-        return len(self._weights)
+        return len(self._sizes)
 
     def __iter__(self) -> Iterator[LogEntry]:
-        return iter(self._read())
+        return iter(self._make_entries())
 
     @overload
     def __getitem__(self, index: int, /) -> LogEntry: ...
@@ -151,7 +152,7 @@ class Log(Sequence[LogEntry]):
         Raises:
             IndexError: there is no such entry.
         """
-        entries = self._read()
+        entries = self._make_entries()
         return entries[index] if isinstance(index, int) else list(entries)[index]
 
     @property
@@ -159,39 +160,43 @@ class Log(Sequence[LogEntry]):
         """Bytes that the entries hold, counted as if all had been read."""
         return self._size
 
-    def keep(self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None) -> None:
+    def add_frame(
+        self, time: float, peer: str, sender: Sender, frame: Frame, fault: str | None
+    ) -> None:
         """Add a frame that was transferred unchanged, like :meth:`append`."""
-        self._unread.append((time, peer, sender, frame, fault, None))
-        weight = _ENTRY_BYTES + _PER_BYTE * len(frame[1])
+        self._raw_entries.append((time, peer, sender, frame, fault, None))
+        entry_size = _ENTRY_BYTES + _BYTES_PER_BYTE * len(frame[1])
         if fault is not None:
-            weight += len(fault)
-        self._weights.append(weight)
-        self._size += weight
-        if len(self._weights) > self.maxlen or self._size > self.max_bytes:
-            self._push_out()
+            entry_size += len(fault)
+        self._sizes.append(entry_size)
+        self._size += entry_size
+        if len(self._sizes) > self.maxlen or self._size > self.max_bytes:
+            self._drop_oldest()
 
-    def append(self, entry: LogEntry | _Traced) -> None:
+    def append(self, entry: LogEntry | _EntryParts) -> None:
         """Add an entry, or the parts of one."""
         if isinstance(entry, LogEntry):
             size, texts = (len(entry.hex) + 1) // 3, (entry.error, entry.fault, entry.wire)
-            weight = _ENTRY_BYTES + _PER_BYTE * size + sum(len(text) for text in texts if text)
+            entry_size = (
+                _ENTRY_BYTES + _BYTES_PER_BYTE * size + sum(len(text) for text in texts if text)
+            )
         else:  # size of the entry once it is read
             _, _, _, content, fault, wire = entry
             size = len(content.payload if isinstance(content, Frame) else content)
-            weight = _ENTRY_BYTES + _PER_BYTE * size
+            entry_size = _ENTRY_BYTES + _BYTES_PER_BYTE * size
             if fault is not None or wire is not None:
-                weight += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
-        self._unread.append(entry)
-        self._weights.append(weight)
-        self._size += weight
-        self._push_out()
+                entry_size += len(fault or "") + max(0, 3 * len(wire or b"") - 1)
+        self._raw_entries.append(entry)
+        self._sizes.append(entry_size)
+        self._size += entry_size
+        self._drop_oldest()
 
-    def _push_out(self) -> None:
+    def _drop_oldest(self) -> None:
         """Drop the oldest entries while the log is full."""
-        weights = self._weights
-        while len(weights) > self.maxlen or (self._size > self.max_bytes and len(weights) > 1):
-            (self._entries or self._unread).popleft()
-            self._forget_oldest()
+        sizes = self._sizes
+        while len(sizes) > self.maxlen or (self._size > self.max_bytes and len(sizes) > 1):
+            (self._entries or self._raw_entries).popleft()
+            self._subtract_oldest()
             self.pushed_out += 1
 
     def since(self, serial: int, limit: int | None = None) -> tuple[list[LogEntry], int]:
@@ -208,10 +213,10 @@ class Log(Sequence[LogEntry]):
             serial: number of entries that the caller knows already.
             limit: largest number of entries returned, the oldest first; default all.
         """
-        entries = self._read()
-        first = min(max(0, serial - self._gone), len(entries))
+        entries = self._make_entries()
+        first = min(max(0, serial - self._removed_count), len(entries))
         last = len(entries) if limit is None else first + limit
-        return list(islice(entries, first, last)), self._gone + len(entries)
+        return list(islice(entries, first, last)), self._removed_count + len(entries)
 
     def popleft(self) -> LogEntry:
         """Remove and return the oldest entry.
@@ -219,27 +224,27 @@ class Log(Sequence[LogEntry]):
         Raises:
             IndexError: there is no entry.
         """
-        entry = self._read().popleft()
-        self._forget_oldest()
+        entry = self._make_entries().popleft()
+        self._subtract_oldest()
         return entry
 
     def clear(self) -> None:
         """Remove all entries."""
-        self._gone += len(self)
+        self._removed_count += len(self)
         self._entries.clear()
-        self._unread.clear()
-        self._weights.clear()
+        self._raw_entries.clear()
+        self._sizes.clear()
         self._size = self.pushed_out = 0
 
-    def _forget_oldest(self) -> None:
+    def _subtract_oldest(self) -> None:
         """Subtract the size of the oldest entry."""
-        self._gone += 1
-        self._size -= self._weights.popleft()
+        self._removed_count += 1
+        self._size -= self._sizes.popleft()
 
-    def _read(self) -> deque[LogEntry]:
-        unread, entries = self._unread, self._entries
-        while unread:
-            entry = unread.popleft()
+    def _make_entries(self) -> deque[LogEntry]:
+        raw_entries, entries = self._raw_entries, self._entries
+        while raw_entries:
+            entry = raw_entries.popleft()
             entries.append(entry if isinstance(entry, LogEntry) else self._entry(*entry))
         return entries
 
@@ -312,11 +317,11 @@ class TrafficLog:
         received = self._received
         if message_id in received or len(received) < MAX_IDS:
             received[message_id] += 1
-        received.add(_kind(self._dialect, message_id, len(payload)))
+        received.add(_message_type(self._dialect, message_id, len(payload)))
 
 
 @functools.lru_cache(maxsize=256)
-def _kind(dialect: WireCodec, message_id: int, size: int) -> type[Message] | None:
+def _message_type(dialect: WireCodec, message_id: int, size: int) -> type[Message] | None:
     """Return the type of a client's frame; id and size of its payload decide that."""
     message = _decode(dialect, Sender.CLIENT, Frame(message_id, bytes(size)))
     return None if message is None else type(message)

@@ -1,7 +1,7 @@
 """The base of emulated cameras of every make: port, links, faults, timeline, log.
 
-Every action is a *step*: advance the device's time, act, deliver, set one timer for the device's
-next event.
+Every action is a *step*: advance the device's time, act, deliver the device's messages, and set one
+timer for the device's next event.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from smartcam.emulator._port import Port
 from smartcam.emulator._scenario.timeline import Timeline
 from smartcam.emulator._traffic import TrafficLog, Visit
 from smartcam.emulator.faults._base import DeviceFault
-from smartcam.emulator.faults._device_effects import FaultTargets, act, supported_faults
+from smartcam.emulator.faults._device_effects import FaultTargets, apply_fault, supported_faults
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
@@ -62,11 +62,12 @@ _log = logging.getLogger("smartcam.emulator")
 _CLIENT = m.Sender.CLIENT
 
 MAX_LINKS = 32
-"""Largest number of clients that are connected. The camera serves one; a few more may wait to take
-over. A newcomer always gets in: the client without a session for longest makes room."""
+"""Largest number of clients that are connected. The camera serves one; others may wait to take
+over. A new client is always accepted: the one that was without a session for longest is closed."""
 
 WRITE_LIMIT = 1 << 20
-"""Bytes kept for a client that does not read, or held back by faults; more end its connection."""
+"""Bytes kept for a client that does not read, or held back by faults; if there are more, its
+connection ends."""
 
 _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
     Transport.TCP: TcpListener,
@@ -75,8 +76,8 @@ _LISTENERS: dict[Transport, type[TcpListener | UdpListener]] = {
 
 
 @dataclass(slots=True, eq=False)
-class _Bracket:
-    """A context that begins and ends something; nested uses do nothing."""
+class _NestedContext:
+    """A context that calls a function at its begin and its end; nested uses do nothing."""
 
     _begin: Callable[[], None]  # called on entering; if it raises there is no step
     _end: Callable[[], None]  # called on leaving, also after an error
@@ -104,7 +105,7 @@ class _Bracket:
 
 
 class WireCamera(Server):
-    """An emulated camera of any make on a real port; a subclass implements its messages.
+    """An emulated camera of any make on a real port; a subclass implements the messages.
 
     Args:
         spoken: codec of the messages on the wire.
@@ -114,7 +115,7 @@ class WireCamera(Server):
         transport: ``"tcp"`` or ``"udp"``.
         dialect: name of the wire dialect.
         name: name of the camera in logs.
-        clock: clock that the camera runs by.
+        clock: clock of the camera.
         seed: seed of all random numbers.
         timeline: events that happen by themselves, with their times.
 
@@ -165,12 +166,12 @@ class WireCamera(Server):
         self.fault_kinds: frozenset[str] = supported_faults(device)
         self.codec: WireCodec = spoken
         self._cues = timeline
-        self._step = _Bracket(self._begin_step, self._end_step)
+        self._step = _NestedContext(self._begin_step, self._end_step)
         self._listener: Listener = _LISTENERS[Transport(transport)](self)
         self._port = Port(self._listener, host, port, name)
         self._traffic = TrafficLog(spoken)
         self._step_at: float | None = None  # time of the present step
-        self._shows = False  # whether each frame is logged, checked once a step
+        self._logs_frames = False  # whether each frame is logged, checked once a step
         self.queue: FaultQueue = FaultQueue(spoken, self.clock, applications, self.fault_kinds)
         self._fault_targets = FaultTargets(
             device=device,
@@ -179,10 +180,10 @@ class WireCamera(Server):
             clear=self.clear_faults,
         )
         self._timeline = self._make_timeline()
-        self._refusal: TimerHandle | None = None
+        self._refusal_timer: TimerHandle | None = None
         self._refused_until = 0.0
         self._started = False
-        self._down = False
+        self._is_down = False
         self._timer = OneTimer(self.clock, self._wake)
 
     @classmethod
@@ -321,7 +322,7 @@ class WireCamera(Server):
     @property
     def cues_done(self) -> list[int]:
         """Number of times that each cue of the timeline has happened since the start."""
-        return self._timeline.done
+        return self._timeline.injected_counts
 
     @property
     def visits(self) -> deque[Visit]:
@@ -378,11 +379,11 @@ class WireCamera(Server):
                 f"emulator: cannot listen on {self.transport} {self.host}:{self.port}: {exc}"
             ) from exc
         self._started = True
-        self._down = False
+        self._is_down = False
         self._timeline = self._make_timeline()
         self._after_start()
         with self.step():
-            self._act_at_once()
+            self._run_immediate_faults()
             self._timeline.start()
         _log.info("= %s: listening on %s", self.name, self.url)
         if self.is_random:
@@ -399,7 +400,7 @@ class WireCamera(Server):
             self._timeline.stop()
             self._end_refusal()
             self._before_stop()
-            self._port.shut()
+            self._port.close_with_links()
             await self._port.wait_closed()
 
     def __del__(self) -> None:
@@ -425,7 +426,7 @@ class WireCamera(Server):
             self._collect()  # messages from before are not changed
             self.queue.add(faults)
             if self._started:
-                self._act_at_once()
+                self._run_immediate_faults()
 
     def command(self, name: str) -> None:
         """Give a command: the timeline's cues that wait for it happen.
@@ -438,7 +439,7 @@ class WireCamera(Server):
         self._timeline.command(check_text(name, "name", "command", most=200))
 
     def clear_faults(self) -> None:
-        """Forget waiting faults, and end lasting ones.
+        """Forget faults that wait, and end faults that last.
 
         BUSY is cleared, the port opens, the second client leaves, connections that are half open or
         stalled are reset. Delayed messages come at their time, and a reboot takes its time.
@@ -453,11 +454,11 @@ class WireCamera(Server):
     def _refuse(self, seconds: float) -> None:
         """Close the port for a time; open connections stay."""
         self._refused_until = max(self._refused_until, self.clock.now + seconds)
-        if self._refusal is not None:
-            self._refusal.cancel()
-        elif not self._down:
+        if self._refusal_timer is not None:
+            self._refusal_timer.cancel()
+        elif not self._is_down:
             self._port.close()
-        self._refusal = self.clock.call_at(self._refused_until, self._wake_port)
+        self._refusal_timer = self.clock.call_at(self._refused_until, self._wake_port)
 
     def _let_second_client_in(self) -> None:
         """Let another client connect; it has no effect on a camera that serves several."""
@@ -467,27 +468,29 @@ class WireCamera(Server):
             self._cues, clock=self.clock, seed=self.seed, inject=lambda do: self.inject(*do)
         )
 
-    def _entered(self, state: DeviceState) -> None:
+    def _on_state_entered(self, state: DeviceState) -> None:
         """Note that the device has entered a state, after all its earlier messages."""
         self._collect()
-        self._timeline.entered(state)
+        self._timeline.note_entered(state)
 
-    def _act_at_once(self) -> None:
-        self._act(self.queue.at_once(), None)
+    def _run_immediate_faults(self) -> None:
+        self._run_device_faults(self.queue.at_once(), None)
 
-    def _provoke(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
+    def _fire_before(self, waiting: list[Row], message: m.Message) -> Sequence[Fault]:
         """Run the device faults that come before a message; return all triggered faults."""
         if not waiting:
             return ()
         faults = self.queue.by_message(waiting, message)
-        self._act(faults, "before")
+        self._run_device_faults(faults, "before")
         return faults
 
-    def _act(self, faults: Iterable[Fault], when: Literal["before", "after"] | None) -> None:
+    def _run_device_faults(
+        self, faults: Iterable[Fault], when: Literal["before", "after"] | None
+    ) -> None:
         """Run device faults; the camera's answers trigger no other device fault."""
         for fault in faults:
             if isinstance(fault, DeviceFault) and when in {None, fault.when}:
-                act(self._fault_targets, fault)
+                apply_fault(self._fault_targets, fault)
                 self._deliver_at_once()
 
     # ------------------------------------------------------------------ for links
@@ -513,29 +516,31 @@ class WireCamera(Server):
 
     def connection_ended(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
         """Note that a connection has ended."""
-        by: Literal["client", "camera"] = "client" if by_client else "camera"
-        self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
+        ended_by: Literal["client", "camera"] = "client" if by_client else "camera"
+        self._traffic.visits.append(Visit(self.clock.now, link.peer, ended_by, reset))
 
-    def traced(self, link: ClientLink, sender: m.Sender, seen: Frame | RemoteProtocolError) -> None:
+    def traced(
+        self, link: ClientLink, sender: m.Sender, content: Frame | RemoteProtocolError
+    ) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
         traffic, now = self._traffic, self._step_at
         if now is None:
             now = self.clock.now
-        if isinstance(seen, Frame):
-            traffic.entries.keep(now, link.peer, sender, seen, link.input_faults)
+        if isinstance(content, Frame):
+            traffic.entries.add_frame(now, link.peer, sender, content, link.input_faults)
             if sender is _CLIENT:
-                traffic.count(seen)
+                traffic.count(content)
         else:
-            traffic.add(now, link.peer, sender, seen, link.input_faults)
-        if self._shows:
-            self._show_last()
+            traffic.add(now, link.peer, sender, content, link.input_faults)
+        if self._logs_frames:
+            self._log_last_entry()
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         """Log a message that passed or is lost, as faults have changed it."""
         faults = ", ".join(message.faults) or None
-        self._note(link.peer, sender, message.what, faults, message.wire)
+        self._log_content(link.peer, sender, message.content, faults, message.wire)
 
-    def _note(
+    def _log_content(
         self,
         peer: str,
         sender: m.Sender,
@@ -545,9 +550,9 @@ class WireCamera(Server):
     ) -> None:
         self._traffic.add(self.clock.now, peer, sender, content, fault, wire)
         if _log.isEnabledFor(logging.DEBUG):
-            self._show_last()
+            self._log_last_entry()
 
-    def _show_last(self) -> None:
+    def _log_last_entry(self) -> None:
         entry = self.log[-1]
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
         faulty = f" ({entry.fault}; on the wire: {entry.wire})" if entry.fault else ""
@@ -564,15 +569,15 @@ class WireCamera(Server):
         return self._step
 
     def _begin_step(self) -> None:
-        self._shows = _log.isEnabledFor(logging.DEBUG)
+        self._logs_frames = _log.isEnabledFor(logging.DEBUG)
         if self._started:
             self._step_at = now = self.clock.now
-            self._move(now)
+            self._advance_device(now)
 
     def _end_step(self) -> None:
         try:
             if self._started:
-                self._settle()
+                self._finish_step()
         finally:
             self._step_at = None
 
@@ -581,7 +586,7 @@ class WireCamera(Server):
             pass
 
     @abstractmethod
-    def _move(self, now: float) -> None:
+    def _advance_device(self, now: float) -> None:
         """Advance the device's time; ``now``: the clock's."""
 
     @abstractmethod
@@ -589,7 +594,7 @@ class WireCamera(Server):
         """Put the device's messages into the next write."""
 
     @abstractmethod
-    def _settle(self) -> None:
+    def _finish_step(self) -> None:
         """Deliver the messages of a step, and set the timer."""
 
     def _deliver_at_once(self) -> None:
@@ -608,11 +613,11 @@ class WireCamera(Server):
 
     def _end_refusal(self) -> None:
         """Open the port that a fault closed."""
-        refusal, self._refusal = self._refusal, None
+        timer, self._refusal_timer = self._refusal_timer, None
         self._refused_until = 0.0
-        if refusal is not None:
-            refusal.cancel()
-            if self._started and not self._down:
+        if timer is not None:
+            timer.cancel()
+            if self._started and not self._is_down:
                 self._port.reopen()
 
     def _wake_port(self) -> None:

@@ -1,6 +1,6 @@
 """Sans-I/O wire protocols: bytes to events and back, for both roles.
 
-For authors of dialects and protocols; :mod:`smartcam.protocols.messages` has the words.
+For authors of dialects and protocols; :mod:`smartcam.protocols.messages` has the messages.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Role(enum.Enum):
-    """The side of the wire for which a machine speaks."""
+    """The side of the link whose messages a machine sends."""
 
     CLIENT = "client"
     CAMERA = "camera"
@@ -44,7 +44,7 @@ class Role(enum.Enum):
 
 
 class Transport(enum.Enum):
-    """The transport of frames: a stream of bytes, or a datagram for each."""
+    """The transport of frames: a stream of bytes, or a datagram for each frame."""
 
     TCP = "tcp"
     UDP = "udp"
@@ -55,19 +55,20 @@ class Policy:
     """The way in which one role handles broken input.
 
     Attributes:
-        fatal: errors that end the link: :exc:`~smartcam.FrameError` for bytes that make no frame,
-            :exc:`~smartcam.MessageError` for a short body or a message at the wrong time. The
-            input that causes any other error is dropped and counted.
+        fatal: errors that end the link: :exc:`~smartcam.FrameError` for bytes that are no frame,
+            :exc:`~smartcam.MessageError` for a short body or a message at the wrong time. Input
+            that causes another error is dropped and counted.
         exact_length: True if a known message must have exactly its documented length; otherwise a
             longer body is accepted and counted.
-        tells: True if a known message of the wrong length is reported as an event, not dropped.
-        bounded: True if a frame is broken when it announces more bytes than its message may have,
-            or is not complete in time.
+        reports_malformed: True if a known message of the wrong length is reported as an event, not
+            dropped.
+        bounded: True if a frame counts as broken when it announces more bytes than its message may
+            have, or is not complete in time.
     """
 
     fatal: tuple[type[RemoteProtocolError], ...]
     exact_length: bool
-    tells: bool = False
+    reports_malformed: bool = False
     bounded: bool = False
 
 
@@ -126,7 +127,7 @@ class RawRequest(NamedTuple):
     Attributes:
         message: the message to send.
         answer: the answer's message type, or its id.
-        answered: whether it is answered by the documents; True for an unknown id.
+        answered: whether the camera answers it, by the documents; True for an unknown id.
         known: whether the dialect knows the id.
     """
 
@@ -155,11 +156,11 @@ class Dialect(ABC):
     shows_triggers: bool = True
 
     in_order: ClassVar[bool] = False
-    """True if the camera handles one request after the other: an answer shows that all earlier
-    requests are finished, with their results. Or if its results name their trigger, so that no
-    order is needed."""
+    """True if the camera handles one request after the other, so that an answer shows that all
+    earlier requests are finished, with their results. Also True if its results name their
+    trigger, so that no order is needed."""
     exclusive: ClassVar[bool] = True
-    """True if the camera serves one client, and a newcomer takes it."""
+    """True if the camera serves one client, and a new client takes the camera from it."""
     has_login: ClassVar[bool] = False
     """True if a refused session is final: a wrong password stays wrong."""
 
@@ -212,14 +213,14 @@ class Dialect(ABC):
         return tuple(name for name, _ in wire_fields(message_type))
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status, which another dialect has read, as this dialect reads it."""
+        """Return a status as this dialect reads it; ``reader`` is the dialect that has read it."""
         return report
 
     def data_begins(self, sender: Sender, message_id: int) -> int | None:
-        """Return the length of a body before its ``data``, which is the rest of the body.
+        """Return the number of bytes of a body before its ``data``; None if there is no such field.
 
-        :meth:`spell` needs only these bytes and the body's length. None if a message has no such
-        data.
+        ``data`` is the last field. :meth:`spell` needs only the bytes before it and the body's
+        length.
         """
         return None
 
@@ -229,7 +230,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for users who know more than the table.
+        """Return a request by its id, for users who know messages that the dialect has not.
 
         Raises:
             LocalProtocolError: only the client itself may send it, such as Connect and Disconnect.
@@ -241,7 +242,7 @@ class Dialect(ABC):
         """Return the bytes of the answer to a raw request.
 
         Raises:
-            CommandRejectedError: the bytes only say that the camera refused.
+            CommandRejectedError: the answer is a refusal.
         """
 
     def unsupported(self, message_type: type[Message]) -> UnsupportedError:
@@ -297,8 +298,9 @@ class Protocol:
             session alike, and finds out which of them the camera speaks.
         parameters: other parameters of a URL, and their meanings; ``user`` and ``password`` stand
             before the host there.
-        detection: groups of dialects that a client without a given dialect tries, the most probable
-            first, each on a fresh link. A group begins a session alike. Default: one dialect each.
+        detection: groups of dialects that a client tries if none is given, the most probable group
+            first, each on a new link. The dialects of a group begin a session alike. Default: a
+            group for each dialect.
         emulator: ``module:attribute`` of the class of its emulated cameras, such as a
             :class:`~smartcam.emulator.LineCamera`; "" if it brings none.
         greeting: bytes that a camera sends to a new client before it received anything; ``b""`` if

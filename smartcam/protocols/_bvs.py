@@ -114,7 +114,7 @@ MESSAGES = (
         "SC manual p. 29 (the name), mvBlueGEMINI manual p. 31 (it restarts), published",
     ),
 )
-"""Every message of the dialects with a magic number; the one place where ids and bodies stand."""
+"""Every message of the dialects with a magic number: the only place with their ids and bodies."""
 
 HANDBOOK = FramedDialect(
     name="handbook",
@@ -358,7 +358,7 @@ class _Bvs(Protocol):
     dialects: Mapping[str, FramedDialect]
 
 
-# while either of the last two may be spoken, frames are shown as bid's, which is published
+# while the camera may speak either of the last two, frames are shown as those of bid (published)
 _16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
 BVS: _Bvs = _Bvs(

@@ -14,17 +14,17 @@ class LineReader:
     """Cuts lines, prompts and counted text from a stream of bytes.
 
     Args:
-        ends: pattern of a line's end, one or two bytes.
+        line_end: pattern of the end of a line, one or two bytes.
         max_line: largest number of bytes of a line, without its end.
-        encoding: encoding of its characters; bytes that are not valid are replaced.
+        encoding: encoding of the characters; bytes that are not valid are replaced.
     """
 
-    def __init__(self, ends: re.Pattern[bytes], *, max_line: int, encoding: str) -> None:
-        self._ends = ends
+    def __init__(self, line_end: re.Pattern[bytes], *, max_line: int, encoding: str) -> None:
+        self._line_end = line_end
         self._max_line = max_line
         self._encoding = encoding
         self._buffer = bytearray()
-        self._searched = 0  # no line end begins before this place
+        self._search_start = 0  # place where the search for a line end goes on
 
     def __len__(self) -> int:
         """Return the number of bytes that are kept."""
@@ -40,11 +40,11 @@ class LineReader:
         self._buffer += data
 
     def next_line(self) -> str | None:
-        """Return the next line without its end, None if no whole one is there.
+        """Return the next line without its end, None if there is no whole line yet.
 
         Raises FrameError: the line is too long; the stream cannot be read on.
         """
-        match = self._ends.search(self._buffer, self._searched)
+        match = self._line_end.search(self._buffer, self._search_start)
         size = match.start() if match is not None else len(self._buffer)
         # the last byte may be half of a line end
         if size > self._max_line + (match is None):
@@ -52,24 +52,24 @@ class LineReader:
                 f"a line of more than {self._max_line} bytes came", data=self._buffer[:64]
             )
         if match is None:
-            self._searched = max(0, size - 1)
+            self._search_start = max(0, size - 1)
             return None
         line = self._buffer[:size].decode(self._encoding, "replace")
         del self._buffer[: match.end()]
-        self._searched = 0
+        self._search_start = 0
         return line
 
     def take(self, size: int) -> bytes | None:
-        """Return the next ``size`` bytes, None if they are not all there yet."""
+        """Remove and return the next ``size`` bytes, None if they are not all there yet."""
         if len(self._buffer) < size:
             return None
         data = bytes(self._buffer[:size])
         del self._buffer[:size]
-        self._searched = 0
+        self._search_start = 0
         return data
 
     def take_prompt(self, prompt: bytes) -> bool:
-        """Remove a prompt, which has no line end, if it comes next and is complete."""
+        """Remove a prompt, which has no line end, if it comes next; return whether it did."""
         if not self._buffer.startswith(prompt):
             return False
         self.take(len(prompt))

@@ -1,8 +1,8 @@
 """Cameras that speak in lines of text: each request is a line, and so is its answer.
 
-A table of :class:`LineRow` holds the camera's requests and answers; dialect and machine are made of
-it. Answers have several shapes: one line, in order; several lines; an echo and then a result; or
-lines in any order, matched to their request by a word or a ticket that it carried.
+A table of :class:`LineRow` holds the camera's requests and answers, from which dialect and machine
+are made. Answers have several forms: one line, in the order of the requests; several lines; an echo
+and then a result; or lines in any order, each with a word or a ticket of its request.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     """One message, or several, that an answer becomes."""
 
     Script = Generator[str, str, Reported]
-    """Yields lines, receives the answer to each, and returns the facts in them."""
+    """Yields lines, receives the answer to each, and returns the messages made of them."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
@@ -79,13 +79,14 @@ class LineRow(NamedTuple):
         answer: message type of the answer; None for a request without an answer.
         read: function that makes one or several messages of the answer's line; a ValueError
             or LookupError means that the line is no answer.
-        word: word that matches the answer, if the dialect splits answers; "" for an answer without
-            a word; None: the first word of the request's line. Later lines of a script are always
-            matched by their first words. A dialect with tickets needs it only for unasked lines.
+        word: word by which the answer is recognized, if the dialect splits answers; "" for an
+            answer without a word; None: the first word of the request's line. Answers to later
+            lines of a script are always recognized by the first word of the line. A dialect with
+            tickets needs ``word`` only for unasked lines.
         echo: line that comes before the answer.
         until: first words that end an answer of several lines, which ``read`` gets joined by line
             feeds.
-        also: other message types that the answer may become, beside ``answer``.
+        also: message types other than ``answer`` that the answer may become.
         script: function for a request of several lines; it gets the dialect and the message, yields
             lines and receives the answer to each. ``line`` is then the line for error texts.
     """
@@ -110,7 +111,7 @@ class LineReply(m.Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineCommand(m.Request):
-    """The user's own line; a dialect has it if a row gives the form of its answer."""
+    """A line of the user; a dialect allows it if a row gives the form of its answer."""
 
     answer: ClassVar[type[m.Message] | None] = LineReply
 
@@ -142,8 +143,9 @@ class LineDialect(Dialect):
         tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
             added by :meth:`pack`. Empty without tickets.
         at_once: requests are sent without waiting for earlier answers; needs ``split``.
-        codes: the meaning of each result code of the answers; without codes every answer is done.
-        names_application: results name their application, or all are of one. Otherwise the
+        codes: the meaning of each result code of the answers; without codes, every answer is a
+            success.
+        names_application: results name their application, or there is only one. Otherwise the
             camera is asked before each trigger and after each result, by the row of Query.
         make: name of the maker or make, for errors.
     """
@@ -171,7 +173,7 @@ class LineDialect(Dialect):
     @property
     def capabilities(self) -> Capabilities:
         """Abilities of a camera in this dialect, from its rows."""
-        able = {name: True for kind, name in _ABILITIES.items() if self.row(kind) is not None}
+        abilities = {name: True for kind, name in _ABILITIES.items() if self.row(kind) is not None}
         unasked = {row.answer for row in self.rows if row.request is None}
         return Capabilities(
             dialect=self.name,
@@ -179,7 +181,7 @@ class LineDialect(Dialect):
             result_codes=bool(self.codes),
             status_by_itself=self.row(m.GetStatus) is None,
             unasked_results=m.ResultContainer in unasked,
-            **able,
+            **abilities,
         )
 
     def row(self, request: type[m.Message]) -> LineRow | None:
@@ -187,7 +189,7 @@ class LineDialect(Dialect):
         return next((row for row in self.rows if row.request is request), None)
 
     def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
-        """Return the meaning of a code; done in a dialect without codes."""
+        """Return the meaning of a code; in a dialect without codes it is a success."""
         return self.codes.get(code, UNDOCUMENTED) if self.codes else DONE
 
     def has(self, message_type: type[m.Message]) -> bool:
@@ -263,7 +265,7 @@ class LineDialect(Dialect):
         return Spelled(None, "line", {"text": text}, frame.payload + self.line_end)
 
     def command(self, line: str) -> str:
-        """Return a line of the user's own, checked; a dialect with such lines may refuse some.
+        """Return a line of the user after a check; a subclass may refuse some lines.
 
         Raises:
             ConfigurationError: the text is no line that can be sent.
@@ -271,10 +273,10 @@ class LineDialect(Dialect):
         return line
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return a line of the user's own; the payload follows it.
+        """Return the request for a line of the user; the payload is added to the line.
 
         Raises:
-            UnsupportedError: how another line is answered is not known.
+            UnsupportedError: the dialect allows no lines of the user.
             ConfigurationError: the text is no line that can be sent.
             LocalProtocolError: the line triggers, and its answer would not name the trigger.
         """
@@ -283,30 +285,34 @@ class LineDialect(Dialect):
         line = self.command(message_id + payload.decode(self.encoding, "replace"))
         self.pack(line, "")
         message = LineCommand(line=line)
-        twin = self._twin(message)
-        if twin is not None and twin.request in {m.Trigger, m.EndTrigger} and not self.tickets:
+        equivalent = self._equivalent_row(message)
+        if (
+            equivalent is not None
+            and equivalent.request in {m.Trigger, m.EndTrigger}
+            and not self.tickets
+        ):
             raise LocalProtocolError(
                 f"{self.make or self.name}: {line[:32]!r} is the client's own: its result could "
                 "not be told from a trigger's; call trigger()"
             )
-        answered = twin is None or twin.answer is not None
+        answered = equivalent is None or equivalent.answer is not None
         return RawRequest(message, LineReply, answered=answered, known=True)
 
-    def _twin(self, message: LineCommand) -> LineRow | None:
-        """Return the row of a request of the client that sends the same command."""
+    def _equivalent_row(self, message: LineCommand) -> LineRow | None:
+        """Return the row of a client's request that sends the same command as a user's line."""
         word = _command_word(message.line)
         own_rows = (row for row in self.rows if row.request not in {None, LineCommand})
         return next((row for row in own_rows if _command_word(row.line) == word), None)
 
     def row_of(self, message: m.Message) -> LineRow | None:
-        """Return the row of a message; a user's line is answered like the client's same command."""
+        """Return the row of a message; a user's line is answered like the same client's command."""
         row = self.row(type(message))
-        twin = self._twin(message) if isinstance(message, LineCommand) else None
-        if row is None or twin is None:
+        equivalent = self._equivalent_row(message) if isinstance(message, LineCommand) else None
+        if row is None or equivalent is None:
             return row
-        answer = None if twin.answer is None else row.answer
-        word = None if twin.script is not None else twin.word
-        return row._replace(answer=answer, word=word, echo=twin.echo, until=twin.until)
+        answer = None if equivalent.answer is None else row.answer
+        word = None if equivalent.script is not None else equivalent.word
+        return row._replace(answer=answer, word=word, echo=equivalent.echo, until=equivalent.until)
 
     def body(self, answer: m.Message) -> bytes:
         """Return the bytes of the answer to a line of the user's own.
@@ -347,25 +353,26 @@ class _OpenRequest:
 
     Attributes:
         row: row of the request.
-        script: rest of its lines and answers.
-        line: line to send now.
-        known_by: word that the next answer is matched by once ``line`` is sent; None: the first
-            word of ``line``.
-        word: word or ticket that the next answer is matched by.
-        sent: whether ``line`` was sent.
-        echoed: whether the echo before the answer has come.
+        script: the request's remaining lines and answers.
+        line: line to send next, or the line sent last.
+        answer_word: word by which the answer to ``line`` will be recognized; None: the first word
+            of ``line``.
+        word: word or ticket by which the answer to the sent line is recognized.
+        is_sent: whether ``line`` was sent.
+        has_echo: whether the echo before the answer has come.
         lines: received lines of an answer of several lines.
         size: number of characters in ``lines``.
-        question: number of a question for the application, which the machine asks by itself.
+        question: number of the machine's own question for the application; 0 for a request of the
+            client.
     """
 
     row: LineRow
     script: Script
     line: str
-    known_by: str | None
+    answer_word: str | None
     word: str = ""
-    sent: bool = False
-    echoed: bool = False
+    is_sent: bool = False
+    has_echo: bool = False
     lines: list[str] = field(default_factory=list[str])
     size: int = 0
     question: int = 0
@@ -374,13 +381,13 @@ class _OpenRequest:
 class LineMachine:
     """One connection's lines, in the client's role, as a link needs it.
 
-    See :class:`~smartcam.protocols.LinkMachine`. If lines do not name their request, a
-    request is sent when the one before it is answered, so that a lost answer does not shift the
-    answers of later requests; a line is the answer to the open request, unless a row says that the
+    See :class:`~smartcam.protocols.LinkMachine`. If answers do not name their request, a
+    request is sent when the request before it is answered, so that a lost answer is not taken from
+    a later request. A line is the answer to the open request, unless a row says that the
     camera sends such a line unasked. If answers name their request, they may come in any order.
 
-    A container that answers a Trigger is marked as asked for, and one that comes unasked as not;
-    so no client confuses them.
+    Containers that answer a Trigger have ``asked=True``, containers that come unasked
+    ``asked=False``, so that the client does not confuse them.
 
     Args:
         dialect: the dialect of the camera.
@@ -417,11 +424,13 @@ class LineMachine:
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
         self._store = memoryview(bytearray(MAX_READ_BYTES))
-        self._open: list[_OpenRequest] = []  # open requests in order; at most one of a kind
+        self._open_requests: list[
+            _OpenRequest
+        ] = []  # open requests in order; at most one of a kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)
-        self._marks = trigger is not None and trigger.answer is m.ResultContainer
+        self._marks_results = trigger is not None and trigger.answer is m.ResultContainer
         self._query = None if dialect.names_application else dialect.row(m.Query)
         self._held = HeldResults()
         self._outbox: list[bytes] = []
@@ -455,28 +464,28 @@ class LineMachine:
             while (line := self._reader.next_line()) is not None:
                 self.counters.frames_received += 1
                 self._trace_line(m.Sender.CAMERA, line)
-                self._read(line)
+                self._handle_line(line)
         except RemoteProtocolError as error:
             if self._trace is not None:
                 self._trace(m.Sender.CAMERA, error)
-            self._end(State.FAILED, LinkFailed(error=error))
+            self._end_link(State.FAILED, LinkFailed(error=error))
 
     def receive_eof(self) -> None:
         """Note that the camera will send no more; call :meth:`events` next."""
         if self.state not in {State.FAILED, State.CLOSED}:
-            self._end(State.CLOSED, LinkEnded(pending=len(self._reader)))
+            self._end_link(State.CLOSED, LinkEnded(pending=len(self._reader)))
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; the caller owns the list."""
-        return self._held.take()
+        return self._held.take_ready()
 
-    def _read(self, line: str) -> None:
-        """Handle a line; FrameError if it is neither an answer nor an unasked line."""
+    def _handle_line(self, line: str) -> None:
+        """Handle a line; raise FrameError if it is neither an answer nor an unasked line."""
         split = self.dialect.split
         if split is None:
-            request = self._open[0] if self._open else None
-            begun = request is not None and (request.echoed or request.lines)
-            if not begun and self._report_unasked("", line):
+            request = self._open_requests[0] if self._open_requests else None
+            has_begun = request is not None and (request.has_echo or request.lines)
+            if not has_begun and self._report_unasked("", line):
                 return
             word, text = "", line
         else:
@@ -484,20 +493,25 @@ class LineMachine:
                 word, text = split(line)
             except (ValueError, LookupError) as exc:
                 raise FrameError(f"{line[:64]!r} came, no answer of this dialect") from exc
-            request = self._known_by(word) if word else None
+            request = self._request_for_word(word) if word else None
             if request is None and self._report_unasked(word, text, by_word=True):
                 return
-            request = request or self._known_by("")
+            request = request or self._request_for_word("")
             if request is None and self._report_unasked(word, text):
                 return
         if request is None:
             raise FrameError(f"{line[:64]!r} came, nothing was asked")
-        self._take(request, text)
+        self._handle_answer_line(request, text)
 
-    def _known_by(self, word: str) -> _OpenRequest | None:
-        """Return the request whose answer is matched by a word."""
+    def _request_for_word(self, word: str) -> _OpenRequest | None:
+        """Return the request whose answer is recognized by a word."""
         return next(
-            (request for request in self._open if request.sent and request.word == word), None
+            (
+                request
+                for request in self._open_requests
+                if request.is_sent and request.word == word
+            ),
+            None,
         )
 
     def _report_unasked(self, word: str, text: str, *, by_word: bool = False) -> bool:
@@ -505,8 +519,8 @@ class LineMachine:
 
         Args:
             word: word of the line.
-            text: the rest.
-            by_word: try the rows that name this word, not those without a word.
+            text: text of the line after the word.
+            by_word: try only the rows with this word; otherwise only the rows without a word.
         """
         for row in self._unasked:
             if by_word != bool(row.word) or (by_word and row.word != word):
@@ -515,15 +529,15 @@ class LineMachine:
                 reported = row.read(text)
             except (ValueError, LookupError):
                 continue
-            self._add(reported, is_answer=False)
+            self._report_messages(reported, is_answer=False)
             return True
         return False
 
-    def _take(self, request: _OpenRequest, text: str) -> None:
+    def _handle_answer_line(self, request: _OpenRequest, text: str) -> None:
         """Handle a line of an answer; if the answer is complete, report its messages."""
         row = request.row
-        if row.echo and not request.echoed and text == row.echo:
-            request.echoed, request.word = True, ""
+        if row.echo and not request.has_echo and text == row.echo:
+            request.has_echo, request.word = True, ""
             return
         if row.until:
             request.lines.append(text)
@@ -533,7 +547,7 @@ class LineMachine:
             if _first_word(text) not in row.until:
                 return
             text = "\n".join(request.lines)
-        elif row.echo and not request.echoed and self.dialect.split is None:
+        elif row.echo and not request.has_echo and self.dialect.split is None:
             raise FrameError(f"{text[:64]!r} came, the echo {row.echo!r} was expected")
         try:
             request.line = request.script.send(text)
@@ -545,28 +559,32 @@ class LineMachine:
                 f"{text[:64]!r} came, {name} to {row.line[:32]!r} was expected"
             ) from exc
         else:
-            request.sent = request.echoed = False
-            request.known_by = None
+            request.is_sent = request.has_echo = False
+            request.answer_word = None
             request.lines, request.size = [], 0
             if self.state in {State.CONNECTING, State.CONNECTED}:
                 self._send_line(request)
             else:
-                self._open.remove(request)  # Disconnect was the last request
+                self._open_requests.remove(request)  # Disconnect was the last request
             return
-        self._open.remove(request)
+        self._open_requests.remove(request)
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
         if request.question:
-            self._name(reported, request.question)
+            self._note_application(reported, request.question)
         else:
-            self._add(reported, is_answer=row.request is m.Trigger)
-        if self._open and not self._open[0].sent and self.state is State.CONNECTED:
-            self._send_line(self._open[0])
+            self._report_messages(reported, is_answer=row.request is m.Trigger)
+        if (
+            self._open_requests
+            and not self._open_requests[0].is_sent
+            and self.state is State.CONNECTED
+        ):
+            self._send_line(self._open_requests[0])
 
-    def _add(self, reported: Reported, *, is_answer: bool) -> None:
-        """Report messages; mark containers as answers to a Trigger or not, if that is known."""
+    def _report_messages(self, reported: Reported, *, is_answer: bool) -> None:
+        """Report messages; note in containers whether they answer a Trigger, if that is known."""
         messages = reported if isinstance(reported, tuple) else (reported,)
-        if self._marks:
+        if self._marks_results:
             messages = tuple(
                 replace(message, asked=is_answer)
                 if isinstance(message, m.ResultContainer)
@@ -574,35 +592,35 @@ class LineMachine:
                 for message in messages
             )
         if self._query is None:
-            self._held.pass_on(messages)
+            self._held.add_ready(messages)
             return
         if self._held.add(messages, answers_trigger=is_answer):
             self._ask_application()
-        self._name(messages)
+        self._note_application(messages)
 
-    def _name(self, reported: Reported, question: int = 0) -> None:
+    def _note_application(self, reported: Reported, question: int = 0) -> None:
         """Note which application is active; ask again if results came after the question."""
         for message in reported if isinstance(reported, tuple) else (reported,):
             if not isinstance(message, m.QueryAnswer | m.SwitchAnswer):
                 continue
-            if self._held.application_named(message.application, question):
+            if self._held.note_application(message.application, question):
                 self._ask_application()
 
     def _ask_application(self, *, trigger: bool = False) -> None:
         """Ask which application is active, before a trigger or after a result."""
         if self._query is None or self.state not in {State.CONNECTING, State.CONNECTED}:
-            self._held.end()
+            self._held.end_link()
             return
-        number = self._held.ask(trigger=trigger)
-        self._begin(self._query, m.Query(), question=number)
+        number = self._held.add_question(trigger=trigger)
+        self._start_request(self._query, m.Query(), question=number)
 
-    def _end(self, state: State, event: Event) -> None:
-        """Send and read nothing more; report the reason last."""
+    def _end_link(self, state: State, event: Event) -> None:
+        """Stop sending and reading; report the reason as the last event."""
         self.state = state
-        self._open.clear()
+        self._open_requests.clear()
         self._reader = self.dialect.reader(0)
-        self._held.end()
-        self._held.pass_on((event,))
+        self._held.end_link()
+        self._held.add_ready((event,))
 
     # ------------------------------------------------------------------ messages out
 
@@ -611,9 +629,9 @@ class LineMachine:
     ) -> None:
         """Send a request, or queue it; write :meth:`data_to_send` next.
 
-        A Get status that is queued already is not repeated: its answer will be new enough; that of
-        one already sent may not be. Disconnect sends nothing, it ends the connection. A request
-        without an answer is sent at once.
+        A Get status is not queued twice, since the answer to the queued one will be new enough. If
+        one was already sent, its answer may be older, so another is queued. Disconnect sends
+        nothing, it ends the connection. A request without an answer is sent at once.
 
         Raises:
             LocalProtocolError: not in this state, or an answer of the same kind is pending.
@@ -631,40 +649,40 @@ class LineMachine:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        same = [
+        same_kind = [
             request
-            for request in self._open
+            for request in self._open_requests
             if request.row.request is row.request and not request.question
         ]
         if kind is m.GetStatus:
-            if not all(request.sent for request in same):
+            if not all(request.is_sent for request in same_kind):
                 return
-        elif same:
+        elif same_kind:
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
         if kind is m.Trigger and self._query is not None:
             self._ask_application(trigger=True)
-        self._begin(row, message)
+        self._start_request(row, message)
         if kind is m.Connect:
             self.state = State.CONNECTING
 
-    def _begin(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
+    def _start_request(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
         """Send the first line of a request, or queue the request."""
         script = self.dialect.script(row, message)
         request = _OpenRequest(row, script, next(script), row.word, question=question)
-        if row.answer is None or self.dialect.at_once or not self._open:
+        if row.answer is None or self.dialect.at_once or not self._open_requests:
             self._send_line(request)
         else:
             self.dialect.pack(request.line, "")  # if this raises, nothing has changed
         if row.answer is not None:
-            self._open.append(request)
+            self._open_requests.append(request)
 
     def _send_line(self, request: _OpenRequest) -> None:
-        """Send the line of a request; its answer is matched by its ticket, or by its word."""
+        """Send the line of a request, and note the ticket or word of its answer."""
         ticket = self._next_ticket() if self.dialect.tickets else ""
         data = self.dialect.pack(request.line, ticket)
-        word = request.known_by
+        word = request.answer_word
         request.word = ticket or (_first_word(request.line) if word is None else word)
-        request.sent = True
+        request.is_sent = True
         self._outbox.append(data)
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)
@@ -673,7 +691,7 @@ class LineMachine:
 
     def _next_ticket(self) -> str:
         """Return a ticket that no waiting request has."""
-        used = {request.word for request in self._open}
+        used = {request.word for request in self._open_requests}
         return next(ticket for ticket in self._tickets if ticket not in used)
 
     def data_to_send(self) -> list[bytes]:

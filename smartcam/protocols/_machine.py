@@ -1,6 +1,6 @@
-"""The contract between a link and the protocol spoken over it, which every machine keeps.
+"""The interface between a link and the machine of its protocol.
 
-A machine takes bytes and gives events, and takes messages and gives bytes, in either role; it
+A machine turns received bytes into events, and messages into bytes to send, in either role; it
 imports no socket, loop or clock. ``_framed`` has the machine for frames, ``_lines`` and
 ``_insight`` those for lines of text.
 """
@@ -34,7 +34,7 @@ class State(enum.Enum):
     CONNECTED = "connected"
     """A session is open."""
     DISCONNECTED = "disconnected"
-    """Disconnect was sent; messages that were under way may still come."""
+    """Disconnect was sent; messages that the camera sent before may still come."""
     CLOSED = "closed"
     """The peer closed the link."""
     FAILED = "failed"
@@ -50,10 +50,10 @@ class Frame(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class ResultBurst:
-    """Two or more result containers of one application that came one right after the other.
+    """Two or more result containers of one application that came directly after each other.
 
-    The client's machine returns it for containers that came in one delivery, so that a free-running
-    camera costs no object for each. Iterating yields them one by one.
+    The client's machine returns it for containers that were received together, so that the results
+    of a free-running camera need no object each. Iterating yields the containers one by one.
 
     Attributes:
         application: id of the application that sent the containers.
@@ -68,7 +68,7 @@ class ResultBurst:
     def __iter__(self) -> Iterator[m.ResultContainer]:
         return (m.ResultContainer(application=self.application, data=data) for data in self.data)
 
-    def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
+    def split(self, count: int) -> tuple[ResultBurst, ResultBurst]:
         """Return the first ``count`` containers and the others."""
         data, remaining = self.data[:count], self.data[count:]
         size = sum(map(len, data))
@@ -98,16 +98,15 @@ Event = m.Message | ResultBurst | LinkFailed | LinkEnded
 class LinkMachine(Protocol):
     """The methods of a machine in the client's role that a link calls.
 
-    Each kind of protocol has its own: for frames, for lines of text. Received bytes go in by
-    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram). :meth:`events`
-    returns them as messages of :mod:`smartcam.protocols.messages`, whatever their form on the
-    wire.
+    Received bytes are passed in by :meth:`room` and :meth:`filled` (a stream) or by
+    :meth:`receive_data` (a datagram). :meth:`events` returns them as messages of
+    :mod:`smartcam.protocols.messages`, whatever their form on the wire.
     """
 
     transport: Transport
     """The transport of the link."""
     replies: bool
-    """True if the machine may have bytes to send after receiving some."""
+    """True if the machine may have bytes to send after it received some."""
     counters: Counters
     """The counters of bytes and messages."""
 
@@ -139,7 +138,7 @@ class LinkMachine(Protocol):
         ...
 
     def filled(self, count: int, now: float) -> bool:
-        """Accept ``count`` bytes that were written into :meth:`room`; False for no events yet.
+        """Accept ``count`` bytes that were written into :meth:`room`; return False without events.
 
         ``now``: seconds of any clock, which bound the time that a frame may take.
         """
@@ -169,22 +168,22 @@ class LinkMachine(Protocol):
 
 
 def send_each(machine: LinkMachine, messages: Iterable[m.Message]) -> None:
-    """Send messages one after the other, which go out together.
+    """Send messages that the link will write together.
 
-    A second Query among them is allowed, since a trigger stands between the two. A status also
-    comes by itself, so a request for it leaves no answer pending.
+    A second Query is allowed, since there is a trigger between the two. A status also comes by
+    itself, so a request for it leaves no answer pending.
 
     Raises:
         LocalProtocolError: the protocol's state forbids a message; those before it are sent.
     """
-    queried = False
+    has_query = False
     for message in messages:
         kind = type(message)
-        if kind is m.Query and queried:
+        if kind is m.Query and has_query:
             machine.send(message, again=True)
         else:
             machine.send(message, answered=False if kind is m.GetStatus else None)
-        queried = queried or kind is m.Query
+        has_query = has_query or kind is m.Query
 
 
 @dataclass(slots=True)

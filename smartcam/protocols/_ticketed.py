@@ -1,8 +1,8 @@
 """Cameras that speak in frames with a header of text: a ticket, the length, and the content.
 
-Each request carries a ticket that its answer repeats, so answers may come in any order, and
-with other frames between. Such a dialect is a dialect of lines whose lines are cut by length.
-Contents are bytes; as texts they are Latin-1, in which each character is one byte.
+Each request carries a ticket that its answer repeats, so answers may come in any order, with other
+frames between them. Such a dialect is a dialect of lines that end by their length. Contents are
+bytes; as texts they are Latin-1, in which each character is one byte.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class TicketedDialect(LineDialect):
     """A dialect of frames: ``TTTT`` ``L`` and a length, ``CR LF``, the ticket again and content.
 
     Args:
-        digits: digits of the length, 0 for frames without a header, which end with their first
-            ``CR LF``. The length counts the ticket, the content and the ``CR LF`` after it.
-        asks_with_length: requests have the header, too.
+        digits: number of digits of the length, 0 for frames without a header, which end with their
+            first ``CR LF``. The length counts the ticket, the content and the ``CR LF`` after it.
+        asks_with_length: True if requests have the header, too.
     """
 
     digits: int = 9
@@ -72,7 +72,7 @@ class TicketedDialect(LineDialect):
         """Return the bytes of a request.
 
         Raises:
-            ConfigurationError: the content cannot stand in a frame.
+            ConfigurationError: a frame cannot hold the content.
         """
         data = line.encode(ENCODING, "replace")
         if len(data) > self.max_line or (not self.asks_with_length and b"\r\n" in data):
@@ -85,14 +85,14 @@ class TicketedDialect(LineDialect):
         """Return a new reader that cuts a stream into contents, each with its ticket."""
         if self.digits:
             return HeaderReader(self.width, self.digits, max_length)
-        ends = re.compile(re.escape(self.line_end))
-        return LineReader(ends, max_line=max_length, encoding=ENCODING)
+        line_end = re.compile(re.escape(self.line_end))
+        return LineReader(line_end, max_line=max_length, encoding=ENCODING)
 
     def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
         """Return a frame in readable form."""
         from_client = sender.value == "client"  # the client's frames are traced with their header
-        headed = from_client and self.asks_with_length
-        body = frame.payload.partition(b"\r\n")[2] if headed else frame.payload
+        has_header = from_client and self.asks_with_length
+        body = frame.payload.partition(b"\r\n")[2] if has_header else frame.payload
         ticket, content = body[: self.width].decode(ENCODING), body[self.width :]
         data = frame.payload + self.line_end
         if not from_client:
@@ -111,18 +111,18 @@ class HeaderReader(LineReader):
 
     def __init__(self, width: int, digits: int, max_length: int) -> None:
         super().__init__(re.compile(b"\r\n"), max_line=0, encoding=ENCODING)
-        self._width = width
-        self._size = width + 1 + digits + 2
+        self._ticket_digits = width
+        self._header_bytes = width + 1 + digits + 2
         self._form = re.compile(rb"([0-9]{%d})L([0-9]{%d})\r\n" % (width, digits))
         self._max_length = max_length
 
     def next_line(self) -> str | None:
-        """Return the next frame's ticket and content, None if no whole one is there.
+        """Return the next frame's ticket and content, None if there is no whole frame yet.
 
         Raises FrameError: the bytes are no frame; the stream cannot be read on.
         """
-        header = bytes(self._buffer[: self._size])
-        if len(header) < self._size:
+        header = bytes(self._buffer[: self._header_bytes])
+        if len(header) < self._header_bytes:
             if not self._may_begin(header):
                 raise FrameError(f"{header!r} came, no frame begins so", data=header)
             return None
@@ -130,20 +130,25 @@ class HeaderReader(LineReader):
         if form is None:
             raise FrameError(f"{header!r} came, no frame begins so", data=header)
         length = int(form[2])
-        if not self._width + 2 <= length <= self._width + 2 + self._max_length:
+        if not self._ticket_digits + 2 <= length <= self._ticket_digits + 2 + self._max_length:
             raise FrameError(
                 f"a frame of {length} bytes came, at most {self._max_length} are accepted",
                 data=header,
             )
-        if len(self._buffer) < self._size + length:
+        if len(self._buffer) < self._header_bytes + length:
             return None
-        self.take(self._size)
+        self.take(self._header_bytes)
         body = self.take(length) or b""
         if not body.endswith(b"\r\n") or not body.startswith(form[1]):
             raise FrameError(f"frame {form[1].decode()} does not hold what it says", data=body[:64])
         return body[:-2].decode(ENCODING)
 
     def _may_begin(self, header: bytes) -> bool:
-        """Return True if these bytes, too few for a header, may begin a frame."""
-        model = b"0" * self._width + b"L" + b"0" * (self._size - self._width - 3) + b"\r\n"
-        return _DIGIT.sub(b"0", header) == model[: len(header)]
+        """Return True if bytes that are too few for a header may be the beginning of one."""
+        pattern = (
+            b"0" * self._ticket_digits
+            + b"L"
+            + b"0" * (self._header_bytes - self._ticket_digits - 3)
+            + b"\r\n"
+        )
+        return _DIGIT.sub(b"0", header) == pattern[: len(header)]

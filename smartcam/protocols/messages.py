@@ -74,7 +74,7 @@ class Wire(enum.Enum):
     UINT32 = "uint32"
     """Four bytes in every dialect."""
     DATA = "data"
-    """Every byte to the end of the frame; the last field only."""
+    """All bytes to the end of the frame; only the last field may have this form."""
 
 
 Word = Annotated[int, Wire.WORD]
@@ -111,7 +111,7 @@ class Request(Message):
 
 
 class Report(Message):
-    """A message from camera to client: an answer, or sent unasked."""
+    """A message from camera to client: an answer, or a message that it sends by itself."""
 
     __slots__ = ()
     sender: ClassVar[Sender] = Sender.CAMERA
@@ -177,8 +177,9 @@ class ResultContainer(Report):
         cells: the values of which ``data`` was made, if the protocol sends them as texts. The
             fields of a layout are these values, in order.
         fault: reason why the values cannot come from one inspection, None if there is none.
-        asked: True if the wire shows that it answers a trigger of this client, the running or the
-            last given-up one; False if it answers none; None if the wire does not show it.
+        asked: True if the wire shows that the container answers a trigger of this client, the
+            running one or the last one that was given up; False if it answers no trigger of this
+            client; None if the wire does not show it.
     """
 
     application: Word = UNNAMED_APPLICATION
@@ -212,7 +213,7 @@ class QueryAnswer(Acknowledgement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwitchAnswer(Acknowledgement):
-    """Comes after the switch. ``code`` is its outcome; ``application`` is active now."""
+    """The switch is finished: ``code`` is its outcome, and ``application`` is active now."""
 
     application: Word
 
@@ -280,7 +281,7 @@ class Connect(Request):
 
 
 class Disconnect(Request):
-    """End the session: neither results nor status after it."""
+    """End the session; neither results nor statuses follow."""
 
     __slots__ = ()
 
@@ -366,7 +367,7 @@ class SetInput(Request):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetSequenceNumber(Request):
-    """Number of the next run."""
+    """Set the number of the next inspection."""
 
     number: UInt32
 
@@ -426,7 +427,7 @@ class MalformedMessage(Message):
 def wire_fields(message_type: type[Message]) -> tuple[tuple[str, Wire], ...]:
     """Return name and wire type of each field of a message's body, in order.
 
-    It has all fields of all dialects; a dialect's row lists those on its wire.
+    These are the fields of all dialects; a dialect's row lists the fields that it leaves out.
     """
     fields = _WIRE_FIELDS.get(message_type)
     if fields is None:

@@ -225,7 +225,7 @@ async def test_the_last_descriptors_are_for_who_has_a_session(
         async with strangers("nothing", row, stage, count=8) as there:
             before = len(stage.places)
             with monkeypatch.context() as patch:
-                patch.setattr(_accepting, "_is_last", lambda _connection, _reserve: True)
+                patch.setattr(_accepting, "_is_reserved", lambda _connection, _reserve: True)
                 async with strangers("nothing", row, stage, count=8):
                     assert len(stage.places) <= before
                     await alive()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from smartcam import Status
 from tests.client.inside import (
     Correlation,
-    Debt,
     EvidenceByAnswer,
     EvidenceByFence,
     EvidenceByStatus,
     Match,
+    OwedFate,
     SentTrigger,
     TriggerEvidence,
 )
@@ -66,7 +66,7 @@ class Line:
         pending = SentTrigger(wanted, number, evidence)
         self.numbered = self.numbered or number is not None
         self.results = []
-        self.at.send(pending)
+        self.at.begin_trigger(pending)
         return pending
 
     def trigger(self, number: int | None = None, wanted: int = 1) -> SentTrigger:
@@ -85,7 +85,7 @@ class Line:
     def leave(self) -> None:
         """The caller of the trigger has been woken."""
         self.look()
-        self.at.leave()
+        self.at.end_trigger()
         self.cancelled = False
 
     def cancel(self) -> None:
@@ -97,13 +97,13 @@ class Line:
         if self.cancelled and self.pending is not None and not self.pending.ended:
             self.fail("late")
 
-    def fail(self, debt: Debt) -> None:
+    def fail(self, debt: OwedFate) -> None:
         """The trigger ends without its results; its caller was not woken yet."""
         assert self.pending is not None
         self.at.give_up(self.pending, debt)
         self.pending.ended = True
 
-    def give_up(self, debt: Debt = "late") -> None:
+    def give_up(self, debt: OwedFate = "late") -> None:
         assert self.pending is not None
         self.at.give_up(self.pending, debt)
         self.leave()
@@ -168,7 +168,7 @@ class Line:
         pending = self.pending
         assert pending is not None
         if pending.evidence.proven and pending.received == pending.wanted:
-            self.at.done(pending)
+            self.at.complete(pending)
             pending.ended = True
             self.returned = self.results
 

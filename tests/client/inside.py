@@ -6,19 +6,19 @@ from smartcam._client import handshake, link, polling
 from smartcam._client.connection import Connection
 from smartcam._client.correlation import (
     Correlation,
-    Debt,
     EvidenceByAnswer,
     EvidenceByFence,
     EvidenceByStatus,
     Match,
+    OwedFate,
     SentTrigger,
     TriggerEvidence,
     _Owed,
 )
 from smartcam._client.dispatch import Dispatch
-from smartcam._client.doorbell import DirectFuture, Doorbell, outlast
+from smartcam._client.doorbell import DirectFuture, Doorbell, wait_ended
 from smartcam._client.handshake import establish
-from smartcam._client.link import LARGEST_CHUNK, Chunk, Link, LinksOfLoop, open_link, split
+from smartcam._client.link import MAX_CHUNK_FRAMES, Chunk, Link, LinksOfLoop, open_link, split_chunk
 from smartcam._client.requests import Requests
 from smartcam._client.results import PendingTrigger, Results
 from smartcam._client.triggering import FENCED_TRIGGER, TriggerRequest

@@ -29,7 +29,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ResultBurst
 from tests.client.camera_by_hand import NUMBER, READY, RUNNING, TRIGGER, WAITING, HandmadeCamera
 from tests.client.clientkit import SHORT, balance, by_hand, cancelled, gone, hear, steps
-from tests.client.inside import LARGEST_CHUNK, Chunk, split
+from tests.client.inside import MAX_CHUNK_FRAMES, Chunk, split_chunk
 from tests.handmade import until
 from tests.insides import inside
 
@@ -59,7 +59,7 @@ async def behind_its_answers(camera: Camera) -> None:
 
 def bursts(camera: Camera) -> list[int]:
     """Return where the sizes of the bursts that come will stand."""
-    takers, sizes = inside(camera)._dispatch._takers, list[int]()
+    takers, sizes = inside(camera)._dispatch._handlers, list[int]()
     take = takers[ResultBurst]
 
     def note(burst: ResultBurst, *arguments: Any) -> None:
@@ -697,7 +697,7 @@ async def test_bursts_of_many_reads_all_come_in_order() -> None:
         assert [one.value.n for one in await queued(batch)] == [*range(10_000)]
         assert [one.number for one in await queued(results)] == [*range(1, 10_001)]
         assert fates(camera) == {"streamed": 10_000}
-        assert max(sizes) <= LARGEST_CHUNK
+        assert max(sizes) <= MAX_CHUNK_FRAMES
 
 
 # ---------------------------------------------------------------------- a trigger's deadline
@@ -810,6 +810,6 @@ def test_answer_of_a_trigger_and_its_result_are_never_cut_apart(one_each: bool) 
     answer, result = m.TriggerAnswer(), m.ResultContainer(application=1, data=b"x", asked=True)
     events = [m.StatusReport(status=Status(0))] * 3 + [answer, result] + [m.GetStatus()] * 3
     frames = len(events) if one_each else len(events) - 1
-    first, rest = split(Chunk(0.0, [*events], frames, 1), 4)
+    first, rest = split_chunk(Chunk(0.0, [*events], frames, 1), 4)
     assert first.events == events[:5]
     assert rest.events == events[5:]

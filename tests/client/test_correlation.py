@@ -14,7 +14,7 @@ from smartcam import Status
 from smartcam._client._inside import Interpretation
 from smartcam.protocols.messages import ResultContainer
 from tests.client.correlation_line import READY, WORKING, Line, after_one, ready
-from tests.client.inside import Correlation, Debt, Match
+from tests.client.inside import Correlation, Match, OwedFate
 from tests.insides import inside
 
 FEWEST_NUMBERS = 64
@@ -78,7 +78,7 @@ def test_result_without_a_shown_inspection_is_not_the_triggers(
     assert line.result(number) == NOBODY
     line.hear(READY | Status.OVERHEAT)  # that is no beginning
     assert line.result(number) == NOBODY
-    assert (pending.early, pending.received, pending.ended) == (2, 0, False)
+    assert (pending.early_count, pending.received, pending.ended) == (2, 0, False)
 
 
 @numbers_of_any_width
@@ -89,7 +89,7 @@ def test_inspection_before_the_first_answer_is_somebody_elses(number: int | None
     assert line.result(number) == NOBODY
     line.hear(READY)
     line.answer()
-    assert (line.others, pending.early, pending.evidence.began) == (1, 1, 0)
+    assert (line.others, pending.early_count, pending.evidence.begin_count) == (1, 1, 0)
     assert line.result(number) == NOBODY  # the camera waits again before it has said all of it
     line.hear(WORKING)
     line.answer()
@@ -172,10 +172,10 @@ def test_answers_of_a_trigger_that_is_settled_say_nothing() -> None:
     line = ready()
     pending = line.send()
     line.give_up()
-    line.at.settled()
+    line.at.forget_owed()
     line.answer()
     line.hear(WORKING)
-    assert pending.evidence.began == 0
+    assert pending.evidence.begin_count == 0
     assert line.others == 1
 
 
@@ -219,7 +219,7 @@ def test_result_before_the_trigger_is_answered_is_older(*, queried: bool) -> Non
         line.answer()
         line.hear(READY)
     assert line.result() == NOBODY
-    assert (pending.early, pending.received) == (1, 0)
+    assert (pending.early_count, pending.received) == (1, 0)
 
 
 BEFORE = {
@@ -304,13 +304,13 @@ def test_container_behind_the_answer_in_front_is_the_triggers_where_nothing_show
 
 
 @pytest.mark.parametrize("debt", ["late", "streamed"])
-def test_container_after_a_trigger_was_given_up_pays_its_debt_once(debt: Debt) -> None:
+def test_container_after_a_trigger_was_given_up_pays_its_debt_once(debt: OwedFate) -> None:
     line = ready()
     line.begin()
     line.give_up(debt)
-    assert line.at.debt == debt
+    assert line.at.owed_fate == debt
     assert line.result() == Match(debt)
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
     assert line.result() == NOBODY
 
 
@@ -322,10 +322,10 @@ def test_container_before_a_trigger_given_up_began_does_not_pay_its_debt() -> No
     assert line.result().fate == "nobody"
     line.answer()
     assert line.result().fate == "nobody"
-    assert line.at.debt == "late"
+    assert line.at.owed_fate == "late"
     line.hear(WORKING)
     assert line.result() == LATE
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_sensors_result_of_before_does_not_pay_a_debt() -> None:
@@ -337,7 +337,7 @@ def test_sensors_result_of_before_does_not_pay_a_debt() -> None:
     assert line.result().fate == "nobody"
     line.hear(READY)
     line.answer()
-    assert line.at.debt == "late"
+    assert line.at.owed_fate == "late"
 
 
 def test_debts_are_paid_in_the_order_of_their_triggers() -> None:
@@ -365,7 +365,7 @@ def test_container_that_came_and_was_not_read_is_not_owed() -> None:
     assert [line.result(), line.result()] == [LATE, NOBODY]
     line.at.give_up(line.send(), unread=1)
     line.leave()
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_container_of_a_trigger_whose_caller_was_not_woken_yet_is_late() -> None:
@@ -380,7 +380,7 @@ def test_trigger_given_up_twice_keeps_its_first_fate() -> None:
     pending = line.trigger()
     line.at.give_up(pending, "streamed")
     line.give_up("late")
-    assert line.at.debt == "streamed"
+    assert line.at.owed_fate == "streamed"
 
 
 def test_trigger_that_has_its_results_owes_nothing() -> None:
@@ -388,7 +388,7 @@ def test_trigger_that_has_its_results_owes_nothing() -> None:
     line.begin()
     line.result()
     line.give_up()
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
     assert not line.at.doubted
 
 
@@ -399,15 +399,15 @@ def test_trigger_whose_results_were_not_proven_owes_them_still() -> None:
     line.hear(WORKING)
     line.result()
     line.give_up()
-    assert line.at.debt == "late"
+    assert line.at.owed_fate == "late"
 
 
 def test_settled_means_that_nothing_of_before_can_come() -> None:
     line = Line()
     line.trigger()
     line.give_up()
-    line.at.settled()
-    assert (line.at.debt, line.at.doubted, line.at.judge(None).extra) == (None, False, False)
+    line.at.forget_owed()
+    assert (line.at.owed_fate, line.at.doubted, line.at.judge(None).extra) == (None, False, False)
     assert line.result() == NOBODY
 
 
@@ -545,7 +545,7 @@ def test_status_that_begins_no_inspection_is_nobodys(status: Status) -> None:
     assert line.at.judge(None).extra
     pending = line.trigger()
     line.hear(status)
-    assert not pending.evidence.began
+    assert not pending.evidence.begin_count
 
 
 def test_status_that_goes_on_working_begins_no_inspection() -> None:
@@ -581,7 +581,7 @@ def test_inspection_that_owes_us_a_result_is_ours() -> None:
 
 def test_somebody_elses_inspection_has_the_number_that_the_user_has_set() -> None:
     line = ready()
-    line.at.give_number(41)
+    line.at.set_next_number(41)
     line.hear(WORKING)
     assert line.at.take_number(MAX_NUMBER) != 41
 
@@ -612,19 +612,19 @@ def test_container_of_a_sensors_run_that_took_our_number_is_not_the_triggers(
 
 
 @pytest.mark.parametrize("debt", ["late", "streamed"])
-def test_container_with_the_number_of_a_trigger_given_up_is_known(debt: Debt) -> None:
+def test_container_with_the_number_of_a_trigger_given_up_is_known(debt: OwedFate) -> None:
     line = ready()
     line.trigger(1000)
     line.give_up(debt)
     line.begin(2000)
     assert line.result(1000) == Match(debt)
     assert line.result(2000) == OURS
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_containers_of_several_triggers_given_up_may_come_in_any_order() -> None:
     line = Line(complete=False)
-    fates: list[Debt] = ["late", "streamed", "late"]
+    fates: list[OwedFate] = ["late", "streamed", "late"]
     for number, debt in enumerate(fates, 1):
         line.send(number * 1000)
         line.give_up(debt)
@@ -635,7 +635,7 @@ def test_containers_of_several_triggers_given_up_may_come_in_any_order() -> None
         LATE,
         LATE,
     ]
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_debt_stays_until_every_number_that_is_owed_has_come() -> None:
@@ -644,9 +644,9 @@ def test_debt_stays_until_every_number_that_is_owed_has_come() -> None:
         line.trigger(number)
         line.give_up()
     line.result(2000)
-    assert line.at.debt == "late"
+    assert line.at.owed_fate == "late"
     line.result(1000)
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_somebody_elses_number_does_not_pay_a_debt() -> None:
@@ -654,7 +654,7 @@ def test_somebody_elses_number_does_not_pay_a_debt() -> None:
     line.begin(1000)
     line.give_up()
     assert line.result(77) == NOBODY
-    assert line.at.debt == "late"
+    assert line.at.owed_fate == "late"
 
 
 def test_second_container_with_the_number_of_the_last_trigger_is_extra() -> None:
@@ -698,9 +698,9 @@ def test_number_of_a_trigger_given_up_is_known_when_nothing_is_owed_any_more() -
     line = Line()
     line.trigger(1000)
     line.give_up()
-    line.at.settled()
+    line.at.forget_owed()
     assert [line.result(1000), line.result(1000)] == [LATE, LATE]
-    assert line.at.debt is None
+    assert line.at.owed_fate is None
 
 
 def test_numbers_owed_are_bounded_and_the_oldest_are_forgotten() -> None:
@@ -708,7 +708,7 @@ def test_numbers_owed_are_bounded_and_the_oldest_are_forgotten() -> None:
     for number in range(MAX_OWED + 10):
         line.trigger(number)
         line.give_up()
-    assert len(line.at.owed) == len(line.at._given_up) == MAX_OWED
+    assert len(line.at.owed) == len(line.at._given_up_fates) == MAX_OWED
     assert line.result(9) == NOBODY
     assert line.result(10) == LATE
 
@@ -729,7 +729,7 @@ def test_drop_in_the_next_session_is_not_the_lost_triggers() -> None:
     pending = line.send()
     line.reconnect()
     line.hear(READY, WORKING)
-    assert not pending.evidence.began
+    assert not pending.evidence.begin_count
     assert line.others == 1
 
 
@@ -743,7 +743,7 @@ def test_session_begins_without_doubt_and_without_answers_of_before() -> None:
     line.at.on_query_answer()
     line.at.on_trigger_answer()
     line.hear(READY, WORKING)
-    assert (pending.evidence.began, pending.evidence.proven) == (0, False)
+    assert (pending.evidence.begin_count, pending.evidence.proven) == (0, False)
 
 
 def test_numbers_owed_in_a_lost_session_are_known_in_the_next() -> None:
@@ -825,14 +825,14 @@ def test_number_wraps_around_below_zero() -> None:
 
 def test_number_the_user_has_set_is_taken_once() -> None:
     attribution = Correlation(chance=0.5)
-    attribution.give_number(41)
+    attribution.set_next_number(41)
     assert attribution.take_number(MAX_NUMBER) == 41
     assert attribution.take_number(MAX_NUMBER) != 41
 
 
 def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> None:
     attribution = Correlation(chance=0.5)
-    attribution.give_number(200)
+    attribution.set_next_number(200)
     assert 0 <= attribution.take_number(127) <= 127
     assert attribution.take_number(MAX_NUMBER) != 200
 
@@ -840,16 +840,16 @@ def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> N
 @pytest.mark.parametrize("highest", [127, MAX_NUMBER])
 def test_number_the_user_has_set_may_be_the_highest(highest: int) -> None:
     attribution = Correlation(chance=0.5)
-    attribution.give_number(highest)
+    attribution.set_next_number(highest)
     assert attribution.take_number(highest) == highest
 
 
 def test_number_the_user_has_set_again_while_its_result_is_owed_is_not_taken() -> None:
     line = ready()
-    line.at.give_number(41)
+    line.at.set_next_number(41)
     line.trigger(line.at.take_number(MAX_NUMBER))
     line.give_up()
-    line.at.give_number(41)
+    line.at.set_next_number(41)
     number = line.at.take_number(MAX_NUMBER)
     assert number != 41
     line.begin(number)
@@ -860,18 +860,18 @@ def test_number_the_user_has_set_again_while_its_result_is_owed_is_not_taken() -
 def test_number_of_the_last_trigger_that_the_user_has_set_again_is_not_taken() -> None:
     """A second result of that trigger may still come."""
     line = ready()
-    line.at.give_number(41)
+    line.at.set_next_number(41)
     line.begin(line.at.take_number(MAX_NUMBER))
     assert line.result(41) == OURS
     line.leave()
-    line.at.give_number(41)
+    line.at.set_next_number(41)
     assert line.at.take_number(MAX_NUMBER) != 41
 
 
 def test_number_the_user_has_set_that_a_trigger_without_a_number_took_is_not_taken_again() -> None:
     """D6: its result carries that number, and may be late."""
     line = Line()
-    line.at.give_number(500)
+    line.at.set_next_number(500)
     line.trigger()
     line.give_up()
     assert line.at.take_number(MAX_NUMBER) != 500

@@ -241,7 +241,7 @@ class CameraAndClient(RuleBasedStateMachine):
         if at.doubted:
             self.round_trip(data)
             at.note_query_answered()
-        if at.debt is not None and kind != "number":
+        if at.owed_fate is not None and kind != "number":
             self.settle(data)
         self.go_on(data, lambda: not self.owes)
         if self.line.status != READY:
@@ -291,7 +291,7 @@ class CameraAndClient(RuleBasedStateMachine):
         at = self.line.at
         if data.draw(st.booleans(), "grace"):
             self.go_on(data, lambda: self.line.status == READY, give_up=True)
-        if at.debt is None:
+        if at.owed_fate is None:
             return
         self.say_to_camera(Word("stop"))
         self.go_on(data, lambda: Status.RUNNING not in (self.line.status or STOPPED))
@@ -299,7 +299,7 @@ class CameraAndClient(RuleBasedStateMachine):
         self.say_to_camera(Word("start"))
         self.go_on(data, lambda: self.line.status == READY, give_up=True)
         if self.line.status == READY:  # nobody has stopped it meanwhile
-            at.settled()
+            at.forget_owed()
 
     def go_on(
         self, data: st.DataObject, until: Callable[[], bool], *, give_up: bool = False
@@ -542,7 +542,7 @@ class CameraAndClientByOnesOwnNumber(CameraAndClient):
     def set_number(self, number: int | None) -> None:
         """None: the one that the camera would give to its next run."""
         number = self.camera.next_number if number is None else number
-        self.line.at.give_number(number)
+        self.line.at.set_next_number(number)
         self.say_to_camera(Word("number", 0, number))
 
 
@@ -559,7 +559,9 @@ class CameraAndClientByNarrowNumber(CameraAndClient):
     def sensor_triggers_often(self, short: int) -> None:
         """So often that the next run, or one of those behind it, has the number of our next."""
         step = (self.highest + 1) // 64
-        self.camera.next_number = (self.line.at._turn - step) % (self.highest + 1) - short
+        self.camera.next_number = (self.line.at._last_own_number - step) % (
+            self.highest + 1
+        ) - short
 
 
 class CameraAndClientOfAllKinds(CameraAndClientByOnesOwnNumber):
@@ -637,10 +639,10 @@ class CameraAndClientThatAnswers(CameraAndClient):
         self.wake()
         self.refresh(data)
         at.note_query_answered()
-        if at.debt is not None:
+        if at.owed_fate is not None:
             self.go_on(data, lambda: self.asks_until_ready())
             self.round_trip(data)
-            at.settled()
+            at.forget_owed()
         if self.line.status == READY | Status.OVERTRIGGERED:
             self.say_to_camera(Word("reset"))
             self.refresh(data)

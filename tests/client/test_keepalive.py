@@ -60,7 +60,7 @@ class LeapingTime:
     def __init__(self, camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
         loop = asyncio.get_running_loop()
         self._real = loop.time
-        self._begin = inside(camera)._connection.require_link().heard_at
+        self._begin = inside(camera)._connection.require_link().last_byte_at
         self._ahead = 0.0
         monkeypatch.setattr(loop, "time", lambda: self._real() + self._ahead)
 
@@ -102,7 +102,7 @@ async def test_silent_camera_is_found_without_any_call(transport: str) -> None:
     async with by_hand(box={"transport": transport}, liveness_timeout=2 * SHORT) as (box, camera):
         events = camera.events()
         box.script[QUERY] = quiet
-        begin = inside(camera)._connection.require_link().heard_at
+        begin = inside(camera)._connection.require_link().last_byte_at
         async with asyncio.timeout(5):
             event = await anext(events)
         waited = asyncio.get_running_loop().time() - begin
@@ -168,7 +168,7 @@ async def test_answer_keeps_the_link(transport: str, monkeypatch: pytest.MonkeyP
         for count in range(1, 6):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not inside(camera)._waits.answers)
+            await until(lambda: not inside(camera)._waits.pending_answers)
         await time.at(5 * (HALF + JUST) + HALF - JUST)
         assert camera.connected
         assert queries(box) == 5
@@ -265,13 +265,13 @@ async def test_answer_within_the_same_tick_of_a_coarse_clock_keeps_the_link(
     async with leaping(monkeypatch) as (box, camera, time):
         loop, heard_at = (
             asyncio.get_running_loop(),
-            inside(camera)._connection.require_link().heard_at,
+            inside(camera)._connection.require_link().last_byte_at,
         )
         with monkeypatch.context() as standing:
             standing.setattr(loop, "time", lambda: heard_at + HALF)
             await steps(100)
             assert queries(box) == 1
-            assert inside(camera)._connection.require_link().heard_at == heard_at + HALF
+            assert inside(camera)._connection.require_link().last_byte_at == heard_at + HALF
         await time.at(LIVENESS)
         assert camera.connected
         await time.at(LIVENESS + JUST)
@@ -349,7 +349,7 @@ async def test_trigger_without_a_result_is_no_silence(monkeypatch: pytest.Monkey
         for count in range(1, 8):
             await time.at(count * (HALF + JUST))
             await box.wait_for(QUERY, count + 1)
-            await until(lambda: not inside(camera)._waits.answers)
+            await until(lambda: not inside(camera)._waits.pending_answers)
         box.send(box.result_frame() + box.status_frame(READY))
         assert (await triggering).raw == b"found"
 
@@ -414,7 +414,7 @@ async def test_load_that_is_over_is_asked_after_again(monkeypatch: pytest.Monkey
         await time.at(1200.0)
         await heard(camera, box, box.status_frame(READY))
         await box.wait_for(QUERY, 2)  # which application is active now?
-        await until(lambda: not inside(camera)._waits.answers)
+        await until(lambda: not inside(camera)._waits.pending_answers)
         await time.at(1200.0 + HALF - JUST)
         assert queries(box) == 1
         await time.at(1200.0 + HALF)
@@ -448,7 +448,7 @@ def looks() -> list[asyncio.TimerHandle]:
     """Return the timers of watches that are set."""
     loop: Any = asyncio.get_running_loop()
     timers: list[asyncio.TimerHandle] = loop._scheduled
-    return [one for one in timers if not one.cancelled() and "_Watch.look" in repr(one)]
+    return [one for one in timers if not one.cancelled() and "_Watch.check_link" in repr(one)]
 
 
 async def test_no_timeout_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
-from tests.client.inside import Chunk, Link, open_link, outlast
+from tests.client.inside import Chunk, Link, open_link, wait_ended
 from tests.client.inside import link as connection
 from tests.handmade import (
     BUSY,
@@ -191,7 +191,7 @@ async def test_receive_takes_one_chunk_in_a_turn_of_the_loop(
 async def test_delivery_with_many_frames_is_taken_in_several_turns(
     server: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "LARGEST_CHUNK", 64)
+    monkeypatch.setattr(connection, "MAX_CHUNK_FRAMES", 64)
     monkeypatch.setattr(connection, "MIN_FRAMES_PER_CHUNK", 64)
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 120 + BUSY * 10)
@@ -219,7 +219,7 @@ async def test_chunk_is_as_large_as_a_turn_takes(
     monkeypatch.setattr(connection, "thread_time", lambda: now[0])
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 150)
-    assert (await link.receive()).frames == connection.FIRST_CHUNK
+    assert (await link.receive()).frames == connection.FIRST_CHUNK_FRAMES
     now[0] += took
     assert (await link.receive()).frames == frames
     link.abort()
@@ -640,7 +640,7 @@ async def test_udp_datagrams_that_have_come_are_taken_together_in_order() -> Non
         assert await take(link, 12) == 12 * [RUNNING]
         link.abort()
         await until(lambda: link._closed)
-        assert link._aside is None
+        assert link._direct_socket is None
 
 
 async def test_udp_refusal_among_datagrams_is_told_behind_those_before_it(
@@ -699,15 +699,15 @@ async def test_outlast_returns_when_the_task_has_failed_and_raises_nothing() -> 
         raise ValueError("not for whoever waits")
 
     task = asyncio.create_task(fail())
-    await outlast(task)
+    await wait_ended(task)
     assert str(task.exception()) == "not for whoever waits"
-    await outlast(task)
+    await wait_ended(task)
 
 
 async def test_outlast_cancelled_leaves_the_task_and_the_others_that_wait_alone() -> None:
     end = asyncio.Event()
     task = asyncio.create_task(end.wait())
-    one, other = (asyncio.create_task(outlast(task)) for _ in range(2))
+    one, other = (asyncio.create_task(wait_ended(task)) for _ in range(2))
     await asyncio.sleep(0)
     one.cancel()
     await asyncio.wait({one})

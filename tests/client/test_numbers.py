@@ -325,7 +325,7 @@ async def test_debt_is_of_all_results_that_are_missing() -> None:
         await gone(camera.trigger(timeout=SHORT, results_per_trigger=3))
         box.send(box.result_frame(b"2"))
         await camera.query_application()
-        assert inside(camera)._results.correlation.debt == "late"
+        assert inside(camera)._results.correlation.owed_fate == "late"
         box.script[TRIGGER] = lambda _: box.inspects(b"own")
         assert (await camera.trigger()).raw == b"own"
         assert box.ids.count(STOP) == 1
@@ -375,4 +375,4 @@ async def test_own_number_that_does_not_fit_leaves_no_debt() -> None:
         )
         with pytest.raises(InterpretationError):
             await camera.trigger()
-        assert inside(camera)._results.correlation.debt is None
+        assert inside(camera)._results.correlation.owed_fate is None

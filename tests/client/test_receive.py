@@ -15,7 +15,7 @@ from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
 from tests.client.clientkit import balance, by_hand
 from tests.client.inside import (
-    LARGEST_CHUNK,
+    MAX_CHUNK_FRAMES,
     DirectFuture,
     Doorbell,
     LinksOfLoop,
@@ -212,7 +212,7 @@ async def test_flood_of_statuses_leaves_others_their_turns() -> None:
             while camera.statistics().frames_received < heard + 10_000:  # noqa: ASYNC110
                 await asyncio.sleep(0)
         counting.cancel()
-        assert turns > 10_000 / LARGEST_CHUNK
+        assert turns > 10_000 / MAX_CHUNK_FRAMES
         await until(lambda: camera.status == Status(READY))
 
 
@@ -266,7 +266,7 @@ async def test_flood_gives_way_again_while_others_are_at_work(
                 await asyncio.sleep(0)
                 turns.append(camera.statistics().received > before)
     behind = turns[len(turns) // 2 :]
-    assert behind.count(True) * link.MAX_PASSES < 1.1 * len(behind)
+    assert behind.count(True) * link.MAX_TURNS_PER_CHUNK < 1.1 * len(behind)
 
 
 async def test_link_that_has_ended_shares_no_loop() -> None:

@@ -426,11 +426,11 @@ async def test_answer_that_nobody_asked_for_is_counted_only() -> None:
 async def test_answer_of_another_kind_than_asked_for_is_an_error() -> None:
     async with by_hand() as (_, camera):
         asking = asyncio.create_task(camera.query_application())
-        await until(lambda: m.QueryAnswer in inside(camera)._waits.answers)
-        inside(camera)._waits.answers[m.QueryAnswer].set_result(
+        await until(lambda: m.QueryAnswer in inside(camera)._waits.pending_answers)
+        inside(camera)._waits.pending_answers[m.QueryAnswer].set_result(
             m.SwitchAnswer(code=0, application=1)
         )
-        del inside(camera)._waits.answers[m.QueryAnswer]
+        del inside(camera)._waits.pending_answers[m.QueryAnswer]
         with pytest.raises(RemoteProtocolError, match="QueryAnswer was expected"):
             await asking
 

@@ -178,7 +178,7 @@ async def test_only_what_another_client_can_have_caused_is_taken_for_it(
         supervisor = inside(camera)._supervisor
         for sessions in range(2, 4):
             inside(camera)._connection.require_link().abort(cause)
-            await until(lambda: supervisor.over or camera.statistics().sessions == sessions)  # noqa: B023
+            await until(lambda: supervisor.has_ended or camera.statistics().sessions == sessions)  # noqa: B023
         if tcp if transport == "tcp" else udp:
             with pytest.raises(ConnectionTakenError):
                 await camera.wait_connected(SOON)

@@ -589,7 +589,7 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
             for data, expected in itertools.product((None, b"1"), (None, state.active, 99)):
                 state.status, state.bits = Status(said), said
                 correlation.doubted, correlation.owed = doubted, owed  # type: ignore[assignment]
-                commands._halted_at, waits.fences_open = halted, open_
+                commands._loads_when_halted, waits.fences_open = halted, open_
                 request = TriggerRequest(client._default, data, 1, wait=True)
                 if triggers._is_ready(request, expected):
                     straight += 1
@@ -598,7 +598,7 @@ async def test_trigger_that_goes_out_at_once_has_nothing_to_wait_for() -> None:
                         triggers._get_ready(request, expected, link.loop.time() + 1.0).send(None)
                     assert link.machine.counters.frames_sent == written
         state.status, state.bits, correlation.owed = usual
-        correlation.doubted, commands._halted_at, waits.fences_open = False, None, 0
+        correlation.doubted, commands._loads_when_halted, waits.fences_open = False, None, 0
     assert straight == 4  # with Running or without, whichever application is expected
 
 

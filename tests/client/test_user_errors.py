@@ -224,7 +224,7 @@ async def test_predicate_raises_where_it_was_given(error: Callable[[], BaseExcep
     async with box() as emulator, smartcam.connect(emulator.url) as camera:
         waiting = asyncio.ensure_future(camera.wait_status(never))
         other = asyncio.ensure_future(camera.wait_status(lambda _: False, timeout=1.0))
-        await until(lambda: len(inside(camera)._waits.statuses) == 2)
+        await until(lambda: len(inside(camera)._waits.status_waiters) == 2)
         bad.raising = True
         await camera.trigger(1)
         raised = await gone(waiting)
@@ -260,7 +260,7 @@ async def test_client_whose_own_task_is_cancelled_says_so() -> None:
         (supervisor,) = (t for t in asyncio.all_tasks() if t.get_name().endswith(".supervisor"))
         waiting = asyncio.ensure_future(camera.wait_status(lambda _: False))
         results = camera.results()
-        await until(lambda: inside(camera)._waits.statuses)
+        await until(lambda: inside(camera)._waits.status_waiters)
         await cancelled(supervisor)
         for one in (waiting, anext(results), camera.trigger()):
             error = await gone(one)

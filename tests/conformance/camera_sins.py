@@ -127,7 +127,7 @@ def takes(change: Callable[[Emulator, Any, bytes], bytes]) -> Callable[[Emulator
     return do
 
 
-_take = ClientLink._take
+_take = ClientLink._handle_bytes
 
 
 def open_to_bytes(self: Any, data: bytes) -> None:
@@ -239,7 +239,7 @@ def _result_when_stopped(emulator: Emulator, link: Any, message: m.Message) -> b
 
 def _complain(emulator: Emulator) -> None:
     emulator.device.behaviour = dataclasses.replace(
-        emulator.device.behaviour, tells_bad_messages=True
+        emulator.device.behaviour, answers_bad_messages=True
     )
 
 

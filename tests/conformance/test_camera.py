@@ -101,7 +101,7 @@ def judged() -> Iterator[Judged]:
         ),
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ClientLink, "_take", camera_sins.open_to_bytes)
+        patch.setattr(ClientLink, "_handle_bytes", camera_sins.open_to_bytes)
         yield Judged(cases)
 
 
@@ -270,7 +270,7 @@ UNDESCRIBED = [
 def test_judge_answer_that_no_setting_describes_is_reported(
     name: str, sin: Any, dialect: str, came: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ClientLink, "_take", camera_sins.open_to_bytes)
+    monkeypatch.setattr(ClientLink, "_handle_bytes", camera_sins.open_to_bytes)
     monkeypatch.setattr(ClientLink, "dismiss", lambda *_: None)
     (report,) = judge_all([Case({"dialect": dialect}, (name,), sin, IMPATIENT)])
     finding = report[name]

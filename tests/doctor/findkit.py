@@ -93,7 +93,7 @@ class TakenAtOnce(EmulatedCamera):
 
     def arrived(self, link: ClientLink) -> None:
         super().arrived(link)
-        old = self._active
+        old = self._session_link
         if isinstance(old, type(link)) and old is not link:
             old.close("a newcomer")
 

@@ -207,7 +207,7 @@ def test_cutting_gives_back_every_byte(dialect: Any) -> None:
         framer = Framer(dialect.header, 100)
         messages = cut(data[:at], framer, dialect) + cut(data[at:], framer, dialect)
         assert b"".join(one.original for one in messages) + framer.pending == data
-        assert [one.what for one in messages if isinstance(one.what, Frame)] == [
+        assert [one.content for one in messages if isinstance(one.content, Frame)] == [
             Frame(0x31, b"\x15\0\0\0")
         ] * 3
 
@@ -215,10 +215,10 @@ def test_cutting_gives_back_every_byte(dialect: Any) -> None:
 def test_cutting_refuses_a_length_as_the_machine_does() -> None:
     data = bytes.fromhex("50535642 0b000000 30000000")
     messages = cut(data, Framer(HANDBOOK.header, 10), HANDBOOK)
-    assert [type(one.what) for one in messages] == [bytes]
+    assert [type(one.content) for one in messages] == [bytes]
 
 
 @pytest.mark.parametrize("data", [b"", b"?", bytes.fromhex("50535642 00000000 30000000") * 2])
 def test_datagram_that_is_not_one_frame_stays_whole(data: bytes) -> None:
     message = cut_datagram(data, HANDBOOK)
-    assert (message.what, message.original, message.parts) == (data, data, [data])
+    assert (message.content, message.original, message.parts) == (data, data, [data])

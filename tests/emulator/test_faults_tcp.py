@@ -132,7 +132,7 @@ async def test_delay_of_the_clients_message_delays_the_end_after_it(
     listener: Any = emulator._listener
     (link,) = listener.all_links
     session.socket.shutdown(socket.SHUT_WR)
-    await until(lambda: link._end_waits)
+    await until(lambda: link._close_is_pending)
     clock.advance(2)
     await session.expect(wire.WAITING)
     assert emulator.has_session

@@ -290,7 +290,7 @@ async def test_reboot_stop_while_it_comes_up() -> None:
 async def test_reboot_port_taken_meanwhile_is_tried_again(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.emulator._port._RETRY", 0.001)
+    monkeypatch.setattr("smartcam.emulator._port.RETRY_PAUSE", 0.001)
     clock = ManualClock()
     async with EmulatedCamera(clock=clock) as emulator:
         emulator.device.reboot()
@@ -482,7 +482,7 @@ async def test_message_that_does_not_fit_its_frame_is_dropped_and_logged(
 ) -> None:
     async with EmulatedCamera() as emulator, await TcpClient.open(emulator) as client:
         await wire.greet(client)
-        link: Any = emulator._active
+        link: Any = emulator._session_link
 
         def refuse(_: object, message: m.Message) -> None:
             raise LocalProtocolError("too long for its header")

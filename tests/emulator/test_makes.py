@@ -15,7 +15,7 @@ from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedErro
 from smartcam.protocols import BVS
 from smartcam.registry import GENERATORS, PROTOCOLS
 from smartcam.testing import ThreadedCamera
-from tests.emulator.inside import _FOUND
+from tests.emulator.inside import _LOADED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +48,7 @@ def provide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         monkeypatch.setattr(
             GENERATORS, registry_part, None if registry_part == "_points_found" else {}
         )
-    monkeypatch.setattr("smartcam.emulator._generators._FOUND", dict(_FOUND))
+    monkeypatch.setattr("smartcam.emulator._generators._LOADED", dict(_LOADED))
     return add
 
 

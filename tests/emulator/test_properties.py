@@ -262,7 +262,7 @@ class OpenHouse(TcpListener):
 def open_link() -> tuple[_TcpLink, Owner]:
     owner = Owner()
     listener = OpenHouse(owner)
-    listener.down = False
+    listener.is_down = False
     link = _TcpLink(listener, owner)
     link.connection_made(Transport())
     return link, owner

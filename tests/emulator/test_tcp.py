@@ -426,14 +426,14 @@ async def test_tcp_idle_connection_has_a_small_buffer_also_after_a_long_input(
     emulator: EmulatedCamera, session: TcpClient
 ) -> None:
     (link,) = cast("Any", emulator._listener).all_links
-    sizes = {len(link._room)}
+    sizes = {len(link._read_buffer)}
     data = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
     for count in range(1, 4):
         session.send(data + bytes(MAX_INPUT))
         await emulator.wait_received(0x21, count=count)
-        sizes.add(len(link._room))
+        sizes.add(len(link._read_buffer))
         await session.expect_nothing_but(wire.GET_CLOCK, wire.CLOCK_0)
-    assert len(link._room) == FIRST_READ_BYTES
+    assert len(link._read_buffer) == FIRST_READ_BYTES
     assert max(sizes) <= MAX_READ_BYTES
 
 

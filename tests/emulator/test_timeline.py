@@ -55,7 +55,7 @@ def test_cue_at_a_time_happens_then_and_once() -> None:
     assert bench.happened == []
     bench.clock.advance(100)
     assert bench.happened == [(2.5, "stop")]
-    assert bench.timeline.done == [1]
+    assert bench.timeline.injected_counts == [1]
 
 
 def test_cue_comes_again_as_often_as_it_says_without_drift() -> None:
@@ -79,8 +79,8 @@ def test_cues_of_one_instant_happen_in_the_order_of_the_file() -> None:
 def test_cue_on_a_state_counts_and_waits() -> None:
     bench = Bench({"entering": "running", "nth": 2, "times": 2, "after": 0.25, "do": STOP})
     for _ in range(5):
-        bench.timeline.entered(DeviceState.RUNNING)
-        bench.timeline.entered(DeviceState.STOPPED)
+        bench.timeline.note_entered(DeviceState.RUNNING)
+        bench.timeline.note_entered(DeviceState.STOPPED)
         bench.clock.advance(1)
     assert bench.happened == [(1.25, "stop"), (2.25, "stop")]
 
@@ -89,7 +89,7 @@ def test_cue_on_command_happens_each_time() -> None:
     bench = Bench({"command": "jam", "do": STOP}, {"command": "jam", "nth": 3, "do": STOP})
     for _ in range(3):
         bench.timeline.command("jam")
-    assert bench.timeline.done == [3, 1]
+    assert bench.timeline.injected_counts == [3, 1]
 
 
 def test_unknown_command_is_refused_and_the_known_are_named() -> None:
@@ -132,7 +132,7 @@ def test_same_seed_is_the_same_chance_and_another_is_not() -> None:
 def test_cues_that_wait_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench({"entering": "busy", "after": 10, "times": 20_000, "do": STOP})
     for _ in range(MAX_PENDING + 5):
-        bench.timeline.entered(DeviceState.BUSY)
+        bench.timeline.note_entered(DeviceState.BUSY)
     assert caplog.text.count("cues wait, one is dropped") == 5
     bench.clock.advance(10)
     assert len(bench.happened) == MAX_CUES_AT_ONCE
@@ -506,8 +506,8 @@ class _Count:
 
 
 def test_scenario_ids_are_compared_once_each() -> None:
-    from smartcam.emulator._scenario.scenario import _first_double
+    from smartcam.emulator._scenario.scenario import _first_duplicate
 
     _Count.compared = 0
-    assert _first_double(_Count(number) for number in range(5000)) is None
+    assert _first_duplicate(_Count(number) for number in range(5000)) is None
     assert _Count.compared < 5000

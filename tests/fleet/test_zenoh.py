@@ -507,7 +507,7 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
         session, done = says._session, threading.Event()
 
         def waiting() -> int:
-            return hears._bytes - hears._taken_bytes
+            return hears._queued_bytes - hears._handled_bytes
 
         def say() -> None:
             for _ in range(count):
@@ -656,10 +656,10 @@ async def test_each_question_waits_as_its_key_says(monkeypatch: pytest.MonkeyPat
         listens.answer("q/*", answer, patient=lambda key: key.endswith("look"))
         assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]
         with listens._lock:
-            listens._patient_bytes += 10_000  # as if so much waited
+            listens._queued_patient_bytes += 10_000  # as if so much waited
         assert await connects.ask("q/look", b"", PATIENCE) == []
         assert await connects.ask("q/do", b"", PATIENCE) == [("q/do", b"yes")]
         assert await connects.ask("q/do", bytes(20_000), PATIENCE) == []
         with listens._lock:
-            listens._patient_bytes -= 10_000
+            listens._queued_patient_bytes -= 10_000
         assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]

@@ -61,7 +61,7 @@ class Camera:
         )
         policy = dataclasses.replace(
             POLICIES_ON_A_BAD_FRAME[quirks.bad_frame],
-            tells=self.device.behaviour.tells_bad_messages,
+            reports_malformed=self.device.behaviour.answers_bad_messages,
         )
         self.dialect = dialect
         self.machine = Machine(dialect, Role.CAMERA, Transport.TCP, max_length=LIMIT, policy=policy)
@@ -140,7 +140,7 @@ class Camera:
                 assert message.application in APPLICATIONS
             case m.Acknowledgement(code=code) if self.dialect.has(type(message)):
                 assert code in CODES
-            case m.UnknownMessage(payload=payload) if self.device.behaviour.tells_bad_messages:
+            case m.UnknownMessage(payload=payload) if self.device.behaviour.answers_bad_messages:
                 assert int.from_bytes(payload, "little") in CODES
             case _:
                 raise AssertionError(f"a camera says no {message}")

@@ -42,7 +42,9 @@ CHOSEN_POLICIES = (
     OWN_POLICY,
     Policy(fatal=(FrameError,), exact_length=True),  # of an emulator that hangs up
     Policy(fatal=(), exact_length=False),
-    Policy(fatal=(), exact_length=True, tells=True),  # of a camera that answers with codes
+    Policy(
+        fatal=(), exact_length=True, reports_malformed=True
+    ),  # of a camera that answers with codes
 )
 ANSWERED = (None, True, False)
 ENDED = {State.FAILED, State.CLOSED}
@@ -119,7 +121,7 @@ class Link:
         dialect, sender = self.machine.dialect, self.machine.role.receives
         message = check_decoding(dialect, sender, frame)
         surplus = dialect.surplus(sender, frame)  # less than 0 where a code comes alone
-        if self.policy.tells and (message is None or surplus):
+        if self.policy.reports_malformed and (message is None or surplus):
             message = m.MalformedMessage(message_id=frame.message_id, payload=frame.payload)
             surplus = 0
         surplus = max(surplus, 0)

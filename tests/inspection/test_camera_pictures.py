@@ -131,7 +131,7 @@ async def test_results_of_a_free_run_keep_their_pictures_after_earlier_sessions(
         await listen(camera)
         emulator: Any = camera._device.emulator
         before = emulator.device.sessions
-        emulator._active.close("the cable is cut")
+        emulator._session_link.close("the cable is cut")
         await until(lambda: emulator.device.sessions > before)
         await listen(camera)
     assert len(seen.results) >= 6

@@ -35,7 +35,7 @@ class Ifm(EmulatedIfm):
 
     @property
     def runs(self) -> int:
-        return self._run
+        return self._run_number
 
 
 class Iv3(EmulatedIv3):

@@ -525,7 +525,9 @@ async def _check_state(bench: Bench, call: Call) -> None:
         await asyncio.sleep(0)
     await camera.wait_connected()
     async with inside(camera)._lock.hold(BOUND):  # behind every way back
-        active = await inside(camera)._commands.query(inside(camera)._connection.deadline(BOUND))
+        active = await inside(camera)._commands.query_application(
+            inside(camera)._connection.deadline(BOUND)
+        )
     assert active == camera.active_application == device.active_application
     assert active in call.homes
     assert inside(camera)._state.wanted.application in {None, active}
@@ -533,7 +535,7 @@ async def _check_state(bench: Bench, call: Call) -> None:
         await camera.query_status()
     bits = bench.box.spoken.status_bits
     assert camera.status == bits.read(bits.write(device.status))
-    while not inside(camera)._waits.answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
+    while not inside(camera)._waits.pending_answers.keys() <= call.owes:  # noqa: ASYNC110 - the client's own question
         await asyncio.sleep(0)
 
 
@@ -581,9 +583,9 @@ def _check_waiters(camera: Camera) -> None:
     """Assert that nobody is left who waits, and no turn is held."""
     lock, listeners = inside(camera)._lock, camera._listeners
     assert inside(camera)._results.correlation.pending is None
-    assert not inside(camera)._waits.statuses
+    assert not inside(camera)._waits.status_waiters
     assert not [future for future in listeners._next_results if not future.done()]
-    assert not lock._leaving
+    assert not lock._running_jobs
     assert not lock._lock.locked()
     names = [task.get_name() for task in asyncio.all_tasks()]
     ours = [name for name in names if name.startswith("smartcam[")]

@@ -311,7 +311,7 @@ class ClientJudge:
         """There is a client, and another has not taken its camera."""
         if self.camera is None:
             return False
-        return not isinstance(inside(self.camera)._waits.end, ConnectionTakenError)
+        return not isinstance(inside(self.camera)._waits.end_reason, ConnectionTakenError)
 
     @property
     def can_call(self) -> bool:
@@ -434,7 +434,7 @@ class ClientJudge:
             return False
         camera = self.camera
         # a way back that failed is told to the next command
-        return camera is not None and camera.connected and inside(camera)._lock._failed is None
+        return camera is not None and camera.connected and inside(camera)._lock._job_error is None
 
     def _agrees(self) -> bool:
         """Assert that the client knows the camera's state; whether there is a session."""
@@ -450,7 +450,7 @@ class ClientJudge:
         assert active == camera.active_application == device.active_application
         bits = self.box.spoken.status_bits
         assert camera.status == bits.read(bits.write(device.status))
-        assert not inside(camera)._waits.answers
+        assert not inside(camera)._waits.pending_answers
         return True
 
     def _settle_calls(self) -> None:
@@ -548,7 +548,7 @@ class ClientJudge:
         receivers = [name for name in ours if name.endswith(".receive")]
         jobs = [name for name in ours if name not in {*supervisors, *receivers}]
         assert self.camera is not None
-        ended = isinstance(inside(self.camera)._waits.end, ConnectionTakenError)
+        ended = isinstance(inside(self.camera)._waits.end_reason, ConnectionTakenError)
         assert len(supervisors) == (0 if ended else 1)
         assert len(receivers) <= len(supervisors)
         assert len(jobs) <= MAX_CALLS + 1

@@ -394,7 +394,7 @@ class ClientMachine(ClientJudge, RuleBasedStateMachine):
         assert camera is not None
         if not self._is_alone() or not self._agrees():
             return
-        assert not inside(camera)._waits.statuses
+        assert not inside(camera)._waits.status_waiters
         assert not inside(camera)._lock._lock.locked()
         takes_one = device.running and device.applications[device.active_application].triggered
         if takes_one and Status.SYSTEM_ERROR not in device.status:

@@ -78,7 +78,9 @@ class Line:
     def renew_camera_end(self) -> None:
         """Give the camera a new machine, as for a datagram of an address that it has forgotten."""
         datagrams = self.transport is Transport.UDP
-        policy = dataclasses.replace(POLICIES[Role.CAMERA, self.transport], tells=self.tells)
+        policy = dataclasses.replace(
+            POLICIES[Role.CAMERA, self.transport], reports_malformed=self.tells
+        )
         self.camera = Machine(
             self.dialect, Role.CAMERA, self.transport, max_length=LIMIT, policy=policy
         )

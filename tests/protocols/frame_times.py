@@ -30,9 +30,9 @@ def small_reads(**sizes: Any) -> AbstractContextManager[object]:
 class JudgingMachine(Machine):
     """A machine that reads and writes each frame by itself."""
 
-    def _take_up(self, dialect: Any) -> None:
-        super()._take_up(dialect)
-        self._plain = False
+    def _use_dialect(self, dialect: Any) -> None:
+        super()._use_dialect(dialect)
+        self._recognizes = False
 
 
 class ShortMachine(Machine):
@@ -40,7 +40,7 @@ class ShortMachine(Machine):
 
     taken = 0
 
-    def _receive_known(self) -> bool:
-        taken = super()._receive_known()
+    def _receive_known_delivery(self) -> bool:
+        taken = super()._receive_known_delivery()
         ShortMachine.taken += taken
         return taken

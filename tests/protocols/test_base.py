@@ -48,7 +48,7 @@ def test_policies_only_a_client_on_tcp_fails_and_only_a_camera_wants_exact_lengt
         (Role.CAMERA, TCP): Policy(fatal=(), exact_length=True),
         (Role.CAMERA, UDP): Policy(fatal=(), exact_length=True),
     }
-    assert not any(policy.tells for policy in POLICIES.values())
+    assert not any(policy.reports_malformed for policy in POLICIES.values())
 
 
 def test_verdicts_are_the_four_that_a_request_can_have() -> None:

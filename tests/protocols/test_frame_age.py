@@ -11,7 +11,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._framed.dialect import MAX_SURPLUS_BYTES
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event
 from tests.machines import B16, DIALECTS, THESIS, camera, client, label
-from tests.protocols.inside import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
+from tests.protocols.inside import FRAME_RATE, FRAME_TIME, HINT_TIME, UnfinishedFrame
 from tests.strategies import over
 
 RESULT, UNKNOWN = 0x20, 0x77
@@ -184,7 +184,7 @@ def test_one_pause_does_not_count_it_may_have_been_ours() -> None:
 
 
 def test_age_is_the_time_since_the_first_bytes_without_the_longest_pause() -> None:
-    begun = Unfinished()
+    begun = UnfinishedFrame()
     assert [begun.age(1, 10.0, now) for now in (11.0, 11.5, 14.5, 15.5)] == [0, 0.5, 1.5, 2.5]
     begun.searched = 99
     assert [begun.age(2, 16.0, now) for now in (16.5, 17.0)] == [0, 0.5]

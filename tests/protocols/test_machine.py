@@ -59,7 +59,7 @@ from tests.machines import (
 )
 from tests.strategies import over
 
-MAX_FAMILIAR = 64
+MAX_KNOWN_MESSAGES = 64
 
 
 TCP, UDP = Transport.TCP, Transport.UDP
@@ -697,7 +697,7 @@ def _said(made: Machine, message: m.Message) -> list[bytes] | None:
 
 
 def test_camera_says_of_many_messages_what_each_one_is() -> None:
-    made, sizes = camera(), range(3 * MAX_FAMILIAR)
+    made, sizes = camera(), range(3 * MAX_KNOWN_MESSAGES)
     for _ in range(2):
         for number in sizes:  # an object that is gone may have left its id to the next
             for one in (m.StatusReport(status=Status(number)), result(b"%d" % number, 5)):
@@ -759,7 +759,7 @@ def test_statuses_of_many_kinds_are_all_told() -> None:
     said = [m.StatusReport(status=Status(0x80), endian=number) for number in range(200)] * 2
     made.receive_data(b"".join(map(HANDBOOK.encode, said)))
     assert made.events() == said
-    assert len(made._familiar[0x12]) == MAX_FAMILIAR
+    assert len(made._known_messages[0x12]) == MAX_KNOWN_MESSAGES
 
 
 TOLD_UNASKED_TOO = (m.ConnectAnswer, m.DisconnectAnswer, m.StatusReport)
@@ -787,7 +787,7 @@ def test_answer_that_came_before_is_reported_once_a_request_and_else_counted(
             made.send(request)
         made.receive_data(frame * 2)
         assert made.events() == [answer]
-        assert made._open == ()
+        assert made._pending_ids == ()
         assert made.counters.unexpected_messages == turn
         assert made.counters.frames_received == 1 + 2 * turn
 
@@ -866,7 +866,7 @@ def test_result_as_there_was_one_before_has_its_own_data(dialect: FramedDialect)
             heard = b"".join(map(dialect.encode, message))
             assert feed(made, heard) == feed(traced, heard)
     assert made.counters == traced.counters
-    assert len(made._results) == (0 if dialect is NO_ID else 8)
+    assert len(made._known_results) == (0 if dialect is NO_ID else 8)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS, ids=label)
@@ -894,14 +894,14 @@ def test_datagram_as_there_was_one_before_is_read_as_if_it_were_the_first(
                 each.send(m.Disconnect())
         elif step < 1000 and not step % 7:
             request = chance.choice(asked)
-            if not made._open:
+            if not made._pending_ids:
                 for each in made, traced:
                     each.send(request, answered=True)
         datagram = chance.choice(frames if chance.random() < 0.8 else wrong)
         for each in made, traced:
             each.receive_data(datagram)
         assert made.events() == traced.events()
-        assert made._open == traced._open
+        assert made._pending_ids == traced._pending_ids
     assert made.counters == traced.counters
     assert made.counters.ignored_frames > 100
 
@@ -931,7 +931,7 @@ def test_result_as_there_was_one_before_is_told_to_who_asked_for_it() -> None:
     for _ in range(3):
         made.send(request, answered=True)
         feed(made, frame)
-        assert made._open == ()
+        assert made._pending_ids == ()
 
 
 def test_results_of_many_kinds_are_all_told() -> None:
@@ -939,7 +939,7 @@ def test_results_of_many_kinds_are_all_told() -> None:
     said = [result(b"abcd", number) for number in range(200)] * 2
     for one in said:
         assert feed(made, HANDBOOK.encode(one)) == [one]
-    assert len(made._results) == MAX_FAMILIAR
+    assert len(made._known_results) == MAX_KNOWN_MESSAGES
 
 
 @pytest.mark.parametrize("dialect", [one for one in DIALECTS if one is not NO_ID], ids=label)
@@ -1105,7 +1105,7 @@ def test_bid_answer_to_an_unknown_request_comes_under_its_id() -> None:
 
 # ---------------------------------------------------------------------- bodies of a wrong length
 
-TELLING = Policy(fatal=(), exact_length=True, tells=True)
+TELLING = Policy(fatal=(), exact_length=True, reports_malformed=True)
 
 
 @each_transport

@@ -240,22 +240,22 @@ class Talkative(Machine):
 
     def receive_data(self, data: bytes) -> None:
         if self.state is State.FAILED:
-            self._held.pass_on((m.QueryAnswer(application=1),))
+            self._held.add_ready((m.QueryAnswer(application=1),))
         super().receive_data(data)
 
 
 class Nonsense(Machine):
-    def _read(self, line: str) -> None:
+    def _handle_line(self, line: str) -> None:
         try:
-            super()._read(line)
+            super()._handle_line(line)
         except FrameError:
-            self._held.pass_on((m.Trigger(),))
+            self._held.add_ready((m.Trigger(),))
 
 
 class Verbose(Machine):
-    def _read(self, line: str) -> None:
+    def _handle_line(self, line: str) -> None:
         try:
-            super()._read(line)
+            super()._handle_line(line)
         except FrameError:
             raise FrameError("what? " * 200) from None
 
@@ -327,21 +327,21 @@ class Impatient(Machine):
     def send(
         self, message: m.Message, *, answered: bool | None = None, again: bool = False
     ) -> None:
-        asked, self._open = self._open, []
+        asked, self._open_requests = self._open_requests, []
         try:
             super().send(message, answered=answered)
         finally:
-            self._open[:0] = asked
+            self._open_requests[:0] = asked
 
 
 class Credulous(Machine):
     """Knows an answer by its looks."""
 
-    def _read(self, line: str) -> None:
-        if line.isdecimal() and not self._open:
-            self._held.pass_on((m.QueryAnswer(application=int(line)),))
+    def _handle_line(self, line: str) -> None:
+        if line.isdecimal() and not self._open_requests:
+            self._held.add_ready((m.QueryAnswer(application=int(line)),))
         else:
-            super()._read(line)
+            super()._handle_line(line)
 
 
 class Restless(Machine):

@@ -623,7 +623,7 @@ async def test_jitter_is_the_same_again_with_the_same_seed() -> None:
             begin = asyncio.get_running_loop().time()
             await in_pieces(camera, proxy, b"0")
             pipe = proxy._relay.members[1]._pipes["down"]  # type: ignore[union-attr]
-            delays.append(pipe._line._queue[0].due * 1e-9 - begin)
+            delays.append(pipe._line._queue[0].due_at * 1e-9 - begin)
     assert delays[0] == pytest.approx(delays[1], abs=3)
     assert abs(delays[0] - delays[2]) > 50
 

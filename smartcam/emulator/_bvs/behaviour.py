@@ -18,8 +18,8 @@ class Behaviour:
     """The behaviour of a camera beyond its answers to requests."""
 
     coded: bool = False  # answers have a result code
-    acknowledges: bool = False  # every request is answered with a result code
-    tells_bad_messages: bool = False  # unknown and malformed requests, too
+    acknowledges: bool = False  # each request is answered with a result code
+    answers_bad_messages: bool = False  # unknown and malformed requests are answered, too
     answers_disconnect: bool = False  # Disconnect is answered, too
     runs_always: bool = False  # there is no run mode to enter or leave; not Ready is BUSY
     status_with_session: bool = True  # a status comes after Connect
@@ -27,7 +27,7 @@ class Behaviour:
     sticky_errors: bool = False  # error bits stay until they are reset
 
     @property
-    def refused(self) -> int:
+    def refusal_code(self) -> int:
         """Code of a switch that cannot be done."""
         return ResultCode.INSPECTION_ERROR if self.coded else 1
 
@@ -47,7 +47,7 @@ def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:
     return Behaviour(
         coded=True,
         acknowledges=True,
-        tells_bad_messages=quirks.bad_message == "code",
+        answers_bad_messages=quirks.bad_message == "code",
         answers_disconnect=quirks.disconnect_answer == "code",
         runs_always=True,
         status_with_session=False,

@@ -77,22 +77,22 @@ class InputQueue:
         return bool(self._queue) or self._last is not None
 
     def put(self, values: Mapping[str, Any]) -> bool:
-        """Queue a container; False if the oldest was dropped for it."""
-        fits = len(self._queue) < self._depth
-        if not fits:
+        """Queue a container; return False if the oldest one was dropped for it."""
+        is_in_step = len(self._queue) < self._depth
+        if not is_in_step:
             self._queue.popleft()
         self._queue.append(values)
-        return fits
+        return is_in_step
 
     def take(self) -> tuple[Mapping[str, Any] | None, bool]:
-        """Return the next container, or the last one again and False.
+        """Return the next container and True, or the last container again and False.
 
-        None stands for the values before the first container: zeros.
+        None in place of a container means zeros: there was none yet.
         """
-        fits = bool(self._queue)
-        if fits:
+        is_in_step = bool(self._queue)
+        if is_in_step:
             self._last = self._queue.popleft()
-        return self._last, fits
+        return self._last, is_in_step
 
     def clear(self) -> None:
         """Forget all containers, including the last one."""
@@ -104,6 +104,6 @@ class InputQueue:
 class RunChange:
     """The changes that faults make to one inspection."""
 
-    late: int = 0  # additional duration of the inspection, nanoseconds
-    silent: bool = False  # whether the evaluation sends nothing
-    extra: int = 0  # number of repetitions of its container
+    delay: int = 0  # additional duration of the inspection, nanoseconds
+    sends_nothing: bool = False  # whether the evaluation sends nothing
+    extra_copies: int = 0  # number of repetitions of its container

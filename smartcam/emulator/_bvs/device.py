@@ -3,8 +3,8 @@
 It knows no socket, loop or clock. Messages of the active session go in by :meth:`Device.handle`,
 time by :meth:`Device.tick`; the camera's messages are taken with :meth:`Device.take_output`.
 
-Inside, time is in whole nanoseconds, and each future event is a row of one small table: instant by
-kind. Events at the same instant happen in the order of :class:`_Event`.
+Internally, time is in whole nanoseconds. Future events are in one small table, with one instant for
+each kind of event; events at the same instant happen in the order of :class:`_Event`.
 
 Facts stand in ``docs/protocol.md``. Where the documents are silent, a field of
 :class:`~smartcam.emulator.Quirks` decides, or the choice is marked *inferred* in this module.
@@ -52,14 +52,14 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.emulator")
 
 PROTOCOL_VERSION = 1
-"""The answer to Connect (SC manual p. 29, published)."""
+"""The protocol version in the answer to Connect (SC manual p. 29, published)."""
 
 OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
 """Bits that only an operator sets, by :meth:`Device.set_condition`."""
 
-_DATA = "data"  # the only value of input data that the device does not read
+_DATA_KEY = "data"  # key of input data that is passed to an inspector unread
 
-_NUMBERS = 1 << 32  # sequence numbers are UINT32
+_NUMBER_COUNT = 1 << 32  # sequence numbers are UINT32
 
 # the status is a plain number, since each step of an IntFlag costs a call
 _BUSY = Status.BUSY.value
@@ -120,7 +120,7 @@ class Device:
 
     Args:
         applications: the programs stored on it; at least one, with different ids.
-        active: id of the loaded application; by default the first.
+        active: id of the loaded application; by default that of the first one.
         running: True for run mode from the beginning.
         quirks: assumptions about unknown behaviour of real cameras.
         clock_time: first time of its clock; a time without a zone is used unchanged.
@@ -154,10 +154,10 @@ class Device:
         self.scene: TableScene = scene or TableScene()
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         self._on_entered: Callable[[DeviceState], None] | None = None
-        self._entered: list[DeviceState] = []
-        self._bits = 0  # bits of the status word, as last seen
+        self._entered_states: list[DeviceState] = []
+        self._last_word = 0  # status word when states were last noted
         first = next(iter(self._applications)) if active is None else active
-        self._take_up(self._applications[self._known_application(first)])
+        self._set_active_application(self._applications[self._check_known(first)])
         self._now = 0
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
@@ -166,15 +166,15 @@ class Device:
         self._switch_answer_due = False  # an answer to a switch is due in this session
         self.last_report: LastReport | None = None
         self._output: list[m.Message] = []
-        self._reported: tuple[int, int] | None = None
+        self._last_sent: tuple[int, int] | None = None
         self._conditions = 0
         self._endian = 0
         self._next_number = 0
         self._processing = False
         self._inspector: Inspector | None = None  # inspector of the present run
         self._held_busy = False
-        self._trigger_drops = 0  # number of triggers still to be dropped
-        self._change = RunChange()  # change of the running inspection, else of the next
+        self._triggers_to_drop = 0  # number of triggers still to be dropped
+        self._run_change = RunChange()  # changes to the running inspection, or else to the next one
         # a reference value stays until the next one; it does not queue
         depth = 1 if behaviour.acknowledges else self.quirks.input_queue_depth
         self._inputs = InputQueue(depth)
@@ -258,7 +258,7 @@ class Device:
         mode = self._mode
         if mode is Mode.SWITCHING or self._held_busy:
             word |= _BUSY
-        if self.behaviour.runs_always and (mode is not Mode.RUNNING or self._faulty):
+        if self.behaviour.runs_always and (mode is not Mode.RUNNING or self._has_system_error):
             word |= _BUSY  # not Ready
         if mode is Mode.RUNNING:
             word |= _RUNNING
@@ -281,11 +281,11 @@ class Device:
         if isinstance(message, m.Connect):
             self.connect()
         elif isinstance(message, m.Disconnect):
-            answered = self._session and self.behaviour.answers_disconnect
+            is_answered = self._session and self.behaviour.answers_disconnect
             self.disconnect()
-            self._output = [m.DisconnectAnswer()] if answered else []
+            self._output = [m.DisconnectAnswer()] if is_answered else []
         elif self._session:
-            self._obey(message)
+            self._handle_request(message)
         self._advance(self._now)
 
     def connect(self) -> None:
@@ -295,13 +295,13 @@ class Device:
         """
         self._session, self._switch_answer_due = True, False
         self.sessions += 1
-        self._enter(DeviceState.CONNECTED)
+        self._note_entered(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
-        self._reported = None
+        self._last_sent = None
         if self.behaviour.status_with_session:
-            self._report()
+            self._send_changed_status()
         else:
-            self._reported = (self._status_word(), self._endian)
+            self._last_sent = (self._status_word(), self._endian)
 
     def disconnect(self) -> None:
         """End the session; the camera continues without sending anything.
@@ -309,7 +309,7 @@ class Device:
         Source: SC manual p. 28 (published for the silence); that its state survives is inferred.
         """
         if self._session:
-            self._enter(DeviceState.DISCONNECTED)
+            self._note_entered(DeviceState.DISCONNECTED)
         self._session = self._switch_answer_due = False  # only the asking client gets an answer
         self._output = []
 
@@ -320,12 +320,12 @@ class Device:
         action, by the next :meth:`report_entered`.
         """
         self._on_entered = on_entered
-        self._bits = self._status_word()
+        self._last_word = self._status_word()
 
     def report_entered(self) -> None:
-        """Report the states that were entered since the last call."""
-        while self._entered and self._on_entered is not None:
-            states, self._entered = self._entered, []
+        """Call the function of :meth:`watch` for each state entered since the last call."""
+        while self._entered_states and self._on_entered is not None:
+            states, self._entered_states = self._entered_states, []
             for state in states:
                 self._on_entered(state)
 
@@ -386,7 +386,7 @@ class Device:
         """
         application = check_application(application, owner="device")
         running = check_flag(running, "running", "device")
-        target = self._applications[self._known_application(application)]
+        target = self._applications[self._check_known(application)]
         with self.around():
             if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
                 return False
@@ -422,9 +422,9 @@ class Device:
         with self.around():
             bits = condition.value
             self._conditions = self._conditions | bits if on else self._conditions & ~bits
-            if self._faulty:
+            if self._has_system_error:
                 self._void_run()
-            self._report()
+            self._send_changed_status()
 
     def set_endian(self, endian: int) -> None:
         """Set the byte order of result containers and input data: 0 little, 1 big.
@@ -434,7 +434,7 @@ class Device:
         endian = check_integer(endian, "endian", 0, 0xFFFFFFFF, "device")
         with self.around():
             self._endian = endian
-            self._report()
+            self._send_changed_status()
 
     # ------------------------------------------------------------------ faults
 
@@ -452,12 +452,12 @@ class Device:
             self._events.pop(_Event.BUSY_ENDS, None)
             if seconds is not None:
                 self._after(seconds, _Event.BUSY_ENDS, self._end_busy)
-            self._report()
+            self._send_changed_status()
             self._advance(self._now)
 
     def drop_triggers(self, count: int) -> None:
         """Drop the next ``count`` triggers, as if the last image were still being analysed."""
-        self._trigger_drops += check_integer(count, "count", 0, owner="device")
+        self._triggers_to_drop += check_integer(count, "count", 0, owner="device")
 
     def change_inspection(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the running inspection, or else the next one.
@@ -471,9 +471,9 @@ class Device:
         silent = check_flag(silent, "silent", "device")
         extra = check_integer(extra, "extra", 0, MAX_EXTRA, "device")
         with self.around():
-            self._change.late += nanoseconds(late)
-            self._change.silent |= silent
-            self._change.extra += extra
+            self._run_change.delay += nanoseconds(late)
+            self._run_change.sends_nothing |= silent
+            self._run_change.extra_copies += extra
             if _Event.INSPECTED in self._events:
                 when, action = self._events[_Event.INSPECTED]
                 self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
@@ -482,39 +482,39 @@ class Device:
         """Undo all faults: BUSY is cleared, and triggers are accepted again."""
         with self.around():
             self._forget_faults()
-            self._report()
+            self._send_changed_status()
 
     def _end_busy(self) -> None:
         self._held_busy = False
-        self._report()
+        self._send_changed_status()
 
     def _forget_faults(self) -> None:
         self._held_busy = False
         self._events.pop(_Event.BUSY_ENDS, None)
-        self._trigger_drops = 0
-        self._change = RunChange()
+        self._triggers_to_drop = 0
+        self._run_change = RunChange()
 
     # ------------------------------------------------------------------ requests
 
-    def _obey(self, message: m.Message) -> None:
+    def _handle_request(self, message: m.Message) -> None:
         match message:
             case m.Trigger():
                 if self.behaviour.acknowledges:
                     self._acknowledge(message, self._ready_code)
                 self._trigger()
             case m.Query():
-                self._send(self._name_active())
+                self._send(self._make_query_answer())
             case m.SwitchApplication(application=application):
                 self._switch(application)
             case m.GetClock():
                 code = ResultCode.OK_DATE_TIME if self.behaviour.coded else 0
                 self._send(self._clock.answer(self._now, code=code))
             case m.SetClock():
-                done = self._clock.set(message, self._now)
-                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
+                is_done = self._clock.set(message, self._now)
+                self._acknowledge(message, ResultCode.OK if is_done else ResultCode.ERROR)
             case m.SetInput(data=data):
-                done = self._take_input(data)
-                self._acknowledge(message, ResultCode.OK if done else ResultCode.ERROR)
+                is_done = self._take_input(data)
+                self._acknowledge(message, ResultCode.OK if is_done else ResultCode.ERROR)
             case m.SetSequenceNumber(number=number):
                 self._next_number = number
             case m.Start():
@@ -528,9 +528,9 @@ class Device:
             case m.ResetErrors():
                 self._reset_errors(message)
             case m.UnknownMessage(message_id=message_id):
-                self._complain(message_id, ResultCode.INVALID_COMMAND)
+                self._answer_bad_message(message_id, ResultCode.INVALID_COMMAND)
             case m.MalformedMessage(message_id=message_id):
-                self._complain(message_id, ResultCode.ERROR)
+                self._answer_bad_message(message_id, ResultCode.ERROR)
             case _:
                 pass
 
@@ -540,17 +540,17 @@ class Device:
         if self.behaviour.acknowledges and answer and issubclass(answer, m.Acknowledgement):
             self._send(answer(code=code))
 
-    def _complain(self, message_id: int, code: int) -> None:
+    def _answer_bad_message(self, message_id: int, code: int) -> None:
         """Answer a bad message with a result code; a smart camera ignores it (SC manual p. 28)."""
-        if self.behaviour.tells_bad_messages:
+        if self.behaviour.answers_bad_messages:
             self._send(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
 
     @property
     def _ready_code(self) -> int:
         return ResultCode.BUSY if self._status_word() & _BUSY else ResultCode.OK
 
-    def _name_active(self) -> m.QueryAnswer:
-        """Send the active application; ``bid`` waits while another one is being loaded."""
+    def _make_query_answer(self) -> m.QueryAnswer:
+        """Return the answer to a Query; with ``bid`` it is BUSY while an application is loaded."""
         if self.behaviour.acknowledges and self._mode is Mode.SWITCHING:
             return m.QueryAnswer(code=ResultCode.BUSY, application=0)
         code = ResultCode.OK_INSPECTION_ID if self.behaviour.coded else 0
@@ -568,7 +568,7 @@ class Device:
         self._set_mode(Mode.RUNNING)
         if not self._active.triggered:
             self._plan_free_run(self._now, 0)
-        self._report()
+        self._send_changed_status()
 
     def _leave_run_mode(self) -> None:
         if self._mode is not Mode.RUNNING:
@@ -576,7 +576,7 @@ class Device:
         self._set_mode(Mode.STOPPED)
         self._void_run()
         self._events.pop(_Event.FREE_RUN, None)
-        self._report()
+        self._send_changed_status()
 
     def _trigger(self) -> bool:
         """Begin an inspection, or drop the trigger and report that.
@@ -584,33 +584,35 @@ class Device:
         A stopped or switching application ignores it, and so does one without triggers
         (mvBlueGEMINI manual p. 31 and the newest SC manual p. 48, published).
         """
-        if self._mode is not Mode.RUNNING or not self._active.triggered or not self._takes_runs:
+        if self._mode is not Mode.RUNNING or not self._active.triggered or not self._can_run:
             return False
-        if self._processing or self._trigger_drops:
-            self._trigger_drops = max(0, self._trigger_drops - 1)
+        if self._processing or self._triggers_to_drop:
+            self._triggers_to_drop = max(0, self._triggers_to_drop - 1)
             self._conditions |= _OVERTRIGGERED
             if not self.behaviour.sticky_errors:
                 self._after(
                     self.quirks.overtriggered_time, _Event.OVERTRIGGER_ENDS, self._end_overtrigger
                 )
-            self._report()
+            self._send_changed_status()
             return False
         self._begin_run()
         return True
 
     def _switch(self, application: int) -> None:
-        always = self.behaviour.runs_always
-        if always and self._status_word() & _BUSY:
+        runs_always = self.behaviour.runs_always
+        if runs_always and self._status_word() & _BUSY:
             self._send(m.SwitchAnswer(code=ResultCode.BUSY, application=self._active.id))
             return
         if self._mode is Mode.SWITCHING:
             return  # not answered: inferred
         target = self._applications.get(application)  # no application has id 0
-        stopped = always or self._mode is not Mode.RUNNING
-        how = "allow" if stopped else self.quirks.switch_while_running
-        if target is None or how == "refuse":
-            self._send(m.SwitchAnswer(code=self.behaviour.refused, application=self._active.id))
-        elif how == "allow":
+        stopped = runs_always or self._mode is not Mode.RUNNING
+        policy = "allow" if stopped else self.quirks.switch_while_running
+        if target is None or policy == "refuse":
+            self._send(
+                m.SwitchAnswer(code=self.behaviour.refusal_code, application=self._active.id)
+            )
+        elif policy == "allow":
             self._load(target, answer=True, running=False)
 
     def _load(self, target: Application, *, answer: bool, running: bool) -> None:
@@ -621,7 +623,7 @@ class Device:
         self._switch_answer_due = answer
         finish = functools.partial(self._finish_load, target, running=running)
         self._after(target.load_time, _Event.LOADED, finish)
-        self._report()
+        self._send_changed_status()
 
     def _reboot(self, seconds: float | None = None) -> None:
         """Restart: the session ends without a message.
@@ -652,15 +654,15 @@ class Device:
             _, action = self._events.pop(event)
             self._now = max(self._now, when)
             action()
-            if self._entered:
+            if self._entered_states:
                 self.report_entered()
         self._now = target
 
     def _end_overtrigger(self) -> None:
         self._conditions &= ~_OVERTRIGGERED
-        self._report()
+        self._send_changed_status()
 
-    def _take_up(self, application: Application) -> None:
+    def _set_active_application(self, application: Application) -> None:
         """Make an application the active one."""
         self._active = application
         self._period = application.period
@@ -668,7 +670,7 @@ class Device:
         self._runs = 0  # runs since the application was loaded
 
     def _finish_load(self, target: Application, *, running: bool) -> None:
-        self._take_up(target)
+        self._set_active_application(target)
         self._forget_inputs()
         self._set_mode(Mode.STOPPED)
         message = m.SwitchAnswer(code=0, application=target.id)
@@ -676,7 +678,7 @@ class Device:
         before = self.quirks.switch_answer == "before_status"
         if answer and before:
             self._send(message)
-        self._report()
+        self._send_changed_status()
         if answer and not before:
             self._send(message)
         if running or self.behaviour.runs_always:
@@ -699,19 +701,19 @@ class Device:
     # ------------------------------------------------------------------ inspections
 
     @property
-    def _faulty(self) -> bool:
+    def _has_system_error(self) -> bool:
         return bool(self._conditions & _SYSTEM_ERROR)
 
     @property
-    def _takes_runs(self) -> bool:
-        return not self._faulty and not self._held_busy
+    def _can_run(self) -> bool:
+        return not self._has_system_error and not self._held_busy
 
     @property
     def _byte_order(self) -> ByteOrder:
         return "big" if self._endian == 1 else "little"
 
     def _plan_free_run(self, origin: int, count: int) -> None:
-        """Schedule run ``count`` of a free-running application, timed from its start: no drift."""
+        """Schedule free run ``count``, timed from the first one, so that runs do not drift."""
         when = origin + nanoseconds(count / (self._active.rate or 1.0))
         self._events[_Event.FREE_RUN] = (
             when,
@@ -720,35 +722,35 @@ class Device:
 
     def _begin_free_run(self, origin: int, count: int) -> None:
         self._plan_free_run(origin, count + 1)
-        if not self._takes_runs or self._processing:  # the last run is late
+        if not self._can_run or self._processing:  # the last run is late
             return
         self._begin_run()
-        if not self._change.late and _Event.INSPECTED in self._events:
+        if not self._run_change.delay and _Event.INSPECTED in self._events:
             # a run never overlaps with the next, whatever the rounding
-            (ends, action), (following, _) = (
+            (end_at, action), (next_begin, _) = (
                 self._events[_Event.INSPECTED],
                 self._events[_Event.FREE_RUN],
             )
-            self._events[_Event.INSPECTED] = (min(ends, following), action)
+            self._events[_Event.INSPECTED] = (min(end_at, next_begin), action)
 
     def _begin_run(self) -> None:
         """Begin a run with the next number and the next input container."""
-        change = self._change
+        change = self._run_change
         run = _Inspection(self._next_number, self._runs, self.time, self._next_input(), change)
-        self._next_number = (self._next_number + 1) % _NUMBERS
+        self._next_number = (self._next_number + 1) % _NUMBER_COUNT
         self._runs += 1
         self._processing = True
-        self._enter(DeviceState.INSPECTING)
+        self._note_entered(DeviceState.INSPECTING)
         if isinstance(self._active, InspectedApplication):
             self._inspect(self._active, run)
         else:
-            ends = self._now + nanoseconds(self._active.processing_time) + change.late
-            self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
-        self._report()
+            end_at = self._now + nanoseconds(self._active.processing_time) + change.delay
+            self._events[_Event.INSPECTED] = (end_at, functools.partial(self._finish_run, run))
+        self._send_changed_status()
 
     def _inspect(self, application: InspectedApplication, run: _Inspection) -> None:
         """Start the inspection of a picture; the run ends when it is done."""
-        data = b"" if run.input is None else run.input[_DATA]
+        data = b"" if run.input is None else run.input[_DATA_KEY]
         order = InspectionOrder(application.id, run.number, data)
         self._inspector = application.inspector
         application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
@@ -758,24 +760,24 @@ class Device:
         self._inspector = None
         with self.around():
             finish = functools.partial(self._finish_run, run, values)
-            self._events[_Event.INSPECTED] = (self._now + run.change.late, finish)
+            self._events[_Event.INSPECTED] = (self._now + run.change.delay, finish)
             self._advance(self._now)
 
     def _finish_run(self, run: _Inspection, values: Values | None = None) -> None:
         """Send the result, and set Waiting for Trigger (the order is a quirk)."""
         self._processing = False
-        self._change = RunChange()
+        self._run_change = RunChange()
         result = self._result(run, values)
         if self.quirks.waiting_before_result:
-            self._report()
-        if result is not None and not run.change.silent:
+            self._send_changed_status()
+        if result is not None and not run.change.sends_nothing:
             self.last_report = LastReport(self.time, self._byte_order, result)
-            for _ in range(1 + run.change.extra):
+            for _ in range(1 + run.change.extra_copies):
                 self._send(result)
-        self._report()
+        self._send_changed_status()
 
     def _result(self, run: _Inspection, values: Values | None) -> m.ResultContainer | None:
-        """Return the result; a repeated one is built only once."""
+        """Return the result; equal results of an application are built only once."""
         if self._period is None:
             return self._build_result(run, values)
         key = (run.turn % self._period, self._byte_order)
@@ -813,7 +815,7 @@ class Device:
     def _void_run(self) -> None:
         """Drop the running inspection: it gives no result (inferred)."""
         if self._processing:
-            self._change = RunChange()
+            self._run_change = RunChange()
         self._processing = False
         self._events.pop(_Event.INSPECTED, None)
         inspector, self._inspector = self._inspector, None
@@ -823,19 +825,19 @@ class Device:
     # ------------------------------------------------------------------ input data
 
     def _take_input(self, data: bytes) -> bool:
-        """Queue a container; drop one that does not fit the layout, and return False (inferred)."""
+        """Queue a container; return False if it is dropped, since it does not fit (inferred)."""
         values = None if self._mode is Mode.SWITCHING else self._read_input(data)
         if values is None:
             return False
         if not self._inputs.put(values):
-            self._in_step(fits=False)
-            self._report()
+            self._set_input_bit(is_in_step=False)
+            self._send_changed_status()
         return True
 
     def _read_input(self, data: bytes) -> Mapping[str, Any] | None:
         """Return the values of input data; None if the application takes no such data."""
         if isinstance(self._active, InspectedApplication):
-            return {_DATA: data}
+            return {_DATA_KEY: data}
         layout = self._active.input_layout
         if layout is None:
             return None
@@ -853,23 +855,23 @@ class Device:
             return None  # a program may use no input data
         if not inspected and self._active.input_layout is None:
             return None
-        values, fits = self._inputs.take()
-        self._in_step(fits=fits)
+        values, is_in_step = self._inputs.take()
+        self._set_input_bit(is_in_step=is_in_step)
         return values
 
-    def _in_step(self, *, fits: bool) -> None:
-        """Set the bit if containers and inspections are out of step, else clear it.
+    def _set_input_bit(self, *, is_in_step: bool) -> None:
+        """Set Input Container if containers and inspections are out of step, else clear it.
 
         A reference value is not queued, so it cannot get out of step.
         """
         self._conditions &= ~_INPUT_CONTAINER
-        if not fits and not self.behaviour.acknowledges:
+        if not is_in_step and not self.behaviour.acknowledges:
             self._conditions |= _INPUT_CONTAINER
 
     def _forget_inputs(self) -> None:
         """Empty the queue, as for a newly loaded application (inferred)."""
         self._inputs.clear()
-        self._in_step(fits=True)
+        self._set_input_bit(is_in_step=True)
 
     # ------------------------------------------------------------------ output
 
@@ -877,34 +879,34 @@ class Device:
         if self._session:
             self._output.append(message)
 
-    def _enter(self, state: DeviceState) -> None:
+    def _note_entered(self, state: DeviceState) -> None:
         if self._on_entered is not None:
-            self._entered.append(state)
+            self._entered_states.append(state)
 
     def _set_mode(self, mode: Mode) -> None:
         self._mode = mode
-        self._enter(DeviceState(mode.value))
+        self._note_entered(DeviceState(mode.value))
 
-    def _note_bits(self, word: int) -> None:
-        """Note which bits of the status word were set anew."""
-        risen, self._bits = word & ~self._bits, word
-        self._entered += risen_states(risen)
+    def _note_risen_bits(self, word: int) -> None:
+        """Note the states whose bits have risen in the status word."""
+        risen, self._last_word = word & ~self._last_word, word
+        self._entered_states += risen_states(risen)
 
-    def _report(self) -> None:
-        """Send the status if it differs from the last one that the client got."""
+    def _send_changed_status(self) -> None:
+        """Send the status if it differs from the status that was sent last."""
         now = (self._status_word(), self._endian)
         if self._on_entered is not None:
-            self._note_bits(now[0])
-        if now != self._reported and self.behaviour.reports_changes:
-            self._reported = now
+            self._note_risen_bits(now[0])
+        if now != self._last_sent and self.behaviour.reports_changes:
+            self._last_sent = now
             self._send(_status_report(*now))
 
     def _send_status(self) -> None:
         """Send the status, even if the client has it already."""
-        self._reported = now = (self._status_word(), self._endian)
+        self._last_sent = now = (self._status_word(), self._endian)
         self._send(_status_report(*now))
 
-    def _known_application(self, application: int) -> int:
+    def _check_known(self, application: int) -> int:
         if application not in self._applications:
             known = ", ".join(str(key) for key in self._applications)
             raise ConfigurationError(f"no application has the id {application}; there are {known}")

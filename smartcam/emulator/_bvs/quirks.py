@@ -4,8 +4,8 @@ Each field is one open question: its default is the emulator's choice, its descr
 reason and its grade. Grades: *published* in a manual of this product or a sibling, *inferred*,
 *recommended* (nothing is known; some choice had to be made).
 
-``device.py`` and ``behaviour.py`` beside this file carry out most of them; the link and the camera,
-``bad_frame`` and ``second_client``; ``protocols/_bvs.py`` those of :meth:`Quirks.of_the_wire`.
+``device.py`` and ``behaviour.py`` in this folder implement most of them; the link and the camera
+implement ``bad_frame`` and ``second_client``, ``protocols/_bvs.py`` :meth:`Quirks.of_the_wire`.
 """
 
 from __future__ import annotations

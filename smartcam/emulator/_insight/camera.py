@@ -22,7 +22,7 @@ from smartcam._arguments import (
     check_text,
     check_texts,
 )
-from smartcam.emulator._camera import SHOWN
+from smartcam.emulator._camera import SHOWN_FIELDS
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.commands import InSightCommands, InSightQuirks, image_answer
 from smartcam.emulator._insight.connection import MAX_SESSIONS, ROWS, WRITE_LIMIT, TelnetClient
@@ -52,11 +52,11 @@ if TYPE_CHECKING:
     from smartcam.protocols import Protocol
 
 MAX_ORDERED = 1000
-"""Largest number of answers that may be ordered in advance."""
+"""Largest number of answers to future commands that may be set."""
 
 
 class _Ordered(NamedTuple):
-    """An answer that was ordered in advance."""
+    """An answer to a future command, which replaces the command's own."""
 
     code: int
     command: str | None
@@ -84,8 +84,8 @@ class EmulatedInSight(LineCamera):
     Attributes:
         device: the camera itself, to be read only; to make it act, use the emulator's
             methods.
-        refuse_login: refuse every user.
-        silent: carry commands out, but send no answer.
+        refuse_login: True: every user is refused.
+        silent: True: commands are carried out, but not answered.
 
     Raises:
         ConfigurationError: an argument is wrong.
@@ -137,7 +137,7 @@ class EmulatedInSight(LineCamera):
         )
         self._ordered: deque[_Ordered] = deque()
         self._commands_received: Tally[str] = Tally()
-        self._offset = 0  # nanoseconds from the device's time, which stands still while stopped
+        self._clock_offset = 0  # clock minus device's time, nanoseconds; the latter may stand still
         self._was_online = online
         super().__init__(**options)
         self.device.around = self.step
@@ -168,13 +168,13 @@ class EmulatedInSight(LineCamera):
 
     @property
     def application_ids(self) -> list[int]:
-        """Ids of its jobs, as far as they have one."""
+        """Ids of its jobs; jobs without an id are left out."""
         return [job.id for job in self.device.jobs.values() if job.id is not None]
 
     def shown(self) -> dict[str, Any]:
         """Return the state of the camera that its page shows."""
         device, job = self.device, self.device.job
-        jobs = [each for each in device.jobs.values() if each.id is not None]
+        jobs = [stored_job for stored_job in device.jobs.values() if stored_job.id is not None]
         return {
             **super().shown(),
             "mode": device.mode,
@@ -186,14 +186,14 @@ class EmulatedInSight(LineCamera):
             "run_ends": "TriggerAnswer",
             "applications": [
                 {
-                    **dict.fromkeys(SHOWN),
-                    "id": each.id,
-                    "name": each.file,
-                    "rate": each.rate,
-                    "load_time": each.load_time,
-                    "processing_time": each.processing_time,
+                    **dict.fromkeys(SHOWN_FIELDS),
+                    "id": stored_job.id,
+                    "name": stored_job.file,
+                    "rate": stored_job.rate,
+                    "load_time": stored_job.load_time,
+                    "processing_time": stored_job.processing_time,
                 }
-                for each in jobs
+                for stored_job in jobs
             ],
             "cells": dict(device.cells),
             "quirks": self.quirks,
@@ -218,12 +218,12 @@ class EmulatedInSight(LineCamera):
     @property
     def sessions(self) -> list[str]:
         """Address and port of the clients that are logged in, the oldest session first."""
-        return [client.peer for client in self._by_number() if client.logged_in]
+        return [client.peer for client in self._clients_by_number() if client.logged_in]
 
     @property
     def links(self) -> list[str]:
         """Address and port of all clients that are connected."""
-        return [client.peer for client in self._by_number()]
+        return [client.peer for client in self._clients_by_number()]
 
     @classmethod
     def image_answer(cls, image: NDArray[np.uint8]) -> bytes:
@@ -260,7 +260,7 @@ class EmulatedInSight(LineCamera):
         self.device.load(check_application_or_name(job, "job", "emulator"))
 
     def answer_next(self, code: int, *, command: str | None = None) -> None:
-        """Answer a command with a status code instead of carrying it out; the oldest order counts.
+        """Answer a command with a status code instead of carrying it out; oldest call first.
 
         Args:
             code: the code.
@@ -278,7 +278,7 @@ class EmulatedInSight(LineCamera):
 
     def drop_connections(self) -> None:
         """End every connection at once, like a broken network. Running events continue."""
-        for client in self._by_number():
+        for client in self._clients_by_number():
             client.close("dropped")
 
     async def wait_heard(self, command: str, *, count: int = 1, timeout: float = 5.0) -> None:
@@ -324,7 +324,7 @@ class EmulatedInSight(LineCamera):
 
     def make_client(self, link: ClientLink, server: LineServer) -> TelnetClient:
         """Return a new client."""
-        taken = {client.number for client in self._by_number()}
+        taken = {client.number for client in self._clients_by_number()}
         number = next(number for number in range(MAX_SESSIONS + 1) if number not in taken)
         return TelnetClient(self, link, server, number)
 
@@ -336,7 +336,7 @@ class EmulatedInSight(LineCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Carry out a line."""
         if isinstance(client, TelnetClient):
-            client.take(line)
+            client.handle_line(line)
 
     def serves(self, link: ClientLink) -> bool:
         """Return True if the client on the link is logged in."""
@@ -377,24 +377,26 @@ class EmulatedInSight(LineCamera):
                 return ordered.code
         return None
 
-    def _by_number(self) -> list[TelnetClient]:
+    def _clients_by_number(self) -> list[TelnetClient]:
         clients = [client for client in self._clients.values() if isinstance(client, TelnetClient)]
         return sorted(clients, key=lambda client: client.number)
 
     def _after_start(self) -> None:
-        self._offset = nanoseconds(self.clock.now) - self.device.now
+        self._clock_offset = nanoseconds(self.clock.now) - self.device.now
 
-    def _move(self, now: float) -> None:
-        self.device.advance_to(nanoseconds(now) - self._offset)
-        super()._move(now)
+    def _advance_device(self, now: float) -> None:
+        self.device.advance_to(nanoseconds(now) - self._clock_offset)
+        super()._advance_device(now)
 
-    def _settle(self) -> None:
+    def _finish_step(self) -> None:
         if self.device.online != self._was_online:
             self._was_online = self.device.online
-            self._timeline.entered(DeviceState.RUNNING if self._was_online else DeviceState.STOPPED)
-        super()._settle()
+            self._timeline.note_entered(
+                DeviceState.RUNNING if self._was_online else DeviceState.STOPPED
+            )
+        super()._finish_step()
 
-    def _due(self) -> int | None:
-        due, later = self.device.due, super()._due()
-        device_due = None if due is None else due + self._offset
-        return min((time for time in (device_due, later) if time is not None), default=None)
+    def _next_call_at(self) -> int | None:
+        event_at, call_at = self.device.next_event_at, super()._next_call_at()
+        device_event_at = None if event_at is None else event_at + self._clock_offset
+        return min((time for time in (device_event_at, call_at) if time is not None), default=None)

@@ -55,7 +55,7 @@ class Respond(Protocol):
     """A function that sends the answer to a command."""
 
     def __call__(self, data: bytes, *, more: bool = False) -> None:
-        """Send bytes; with ``more`` the rest comes in another call."""
+        """Send bytes; with ``more``, another call sends the remaining bytes."""
 
 
 class InSightCommands:
@@ -82,7 +82,7 @@ class InSightCommands:
         for option, texts in (("info", self._info), ("evaluations", self._evaluations)):
             for name, text in texts.items():
                 _check_sendable(f"{option}: {name}", text)
-        self._at_once: Mapping[str, Callable[[str], bytes]] = {
+        self._immediate_commands: Mapping[str, Callable[[str], bytes]] = {
             "GO": lambda _: _line(str(int(device.online))),
             "SO": self._set_online,
             "GF": lambda _: _value_answer(None if device.job is None else device.job.file),
@@ -94,7 +94,7 @@ class InSightCommands:
             "GI": self._get_info,
             "EV": self._evaluate,
         }
-        self._in_time: Mapping[str, Callable[[str, Respond], None]] = {
+        self._timed_commands: Mapping[str, Callable[[str, Respond], None]] = {
             "SE": self._set_event,
             "SW": self._set_event_and_wait,
             "LF": lambda argument, respond: self._load(argument or None, respond),
@@ -108,35 +108,37 @@ class InSightCommands:
         mnemonic, argument = line[:2].upper(), line[2:]
         row = words.COMMANDS.get(mnemonic)
         if row is None or (argument and not row.arguments):
-            respond(_coded(StatusCode.UNRECOGNIZED))
-        elif mnemonic in self._at_once:
-            respond(self._at_once[mnemonic](argument))
+            respond(_code_answer(StatusCode.UNRECOGNIZED))
+        elif mnemonic in self._immediate_commands:
+            respond(self._immediate_commands[mnemonic](argument))
         else:
-            self._in_time[mnemonic](argument, respond)
+            self._timed_commands[mnemonic](argument, respond)
 
     # ------------------------------------------------------------------ mode and events
 
     def _set_online(self, argument: str) -> bytes:
         if argument not in {"0", "1"}:
-            return _coded(StatusCode.INVALID_ARGUMENT)
-        return _coded(self._device.request_online(argument == "1"))
+            return _code_answer(StatusCode.INVALID_ARGUMENT)
+        return _code_answer(self._device.request_online(argument == "1"))
 
     def _set_event(self, argument: str, respond: Respond) -> None:
-        def done(code: StatusCode) -> None:
-            sized = code == StatusCode.DONE and self.quirks.event_answer == "sized"
-            respond(_sized("") if sized else _coded(code))
+        def report_code(code: StatusCode) -> None:
+            is_sized = code == StatusCode.DONE and self.quirks.event_answer == "sized"
+            respond(_sized_answer("") if is_sized else _code_answer(code))
 
-        self._event(argument, done, at_image=True)
+        self._request_event(argument, report_code, at_image=True)
 
     def _set_event_and_wait(self, argument: str, respond: Respond) -> None:
-        self._event(argument, lambda code: respond(_coded(code)), at_image=False)
+        self._request_event(argument, lambda code: respond(_code_answer(code)), at_image=False)
 
-    def _event(self, argument: str, done: Callable[[StatusCode], None], *, at_image: bool) -> None:
+    def _request_event(
+        self, argument: str, report_code: Callable[[StatusCode], None], *, at_image: bool
+    ) -> None:
         event = _integer(argument)
         if event is None or not 0 <= event <= words.TRIGGER_EVENT:
-            done(StatusCode.INVALID_ARGUMENT)
+            report_code(StatusCode.INVALID_ARGUMENT)
         else:
-            self._device.request_event(event, done, at_image=at_image)
+            self._device.request_event(event, report_code, at_image=at_image)
 
     # ------------------------------------------------------------------ jobs
 
@@ -146,37 +148,37 @@ class InSightCommands:
 
     def _load(self, job: str | int | None, respond: Respond) -> None:
         if job is None:
-            respond(_coded(StatusCode.INVALID_ARGUMENT))
+            respond(_code_answer(StatusCode.INVALID_ARGUMENT))
         else:
-            self._device.request_job(job, lambda code: respond(_coded(code)))
+            self._device.request_job(job, lambda code: respond(_code_answer(code)))
 
     # ------------------------------------------------------------------ cells
 
     def _get_value(self, argument: str) -> bytes:
         cell = words.parse_wire_cell(argument)
-        key = self._named(argument) if cell is None else cell[0].wire
+        key = self._key_of_name(argument) if cell is None else cell[0].wire
         if key is None or (cell is not None and cell[1]):
-            return _coded(StatusCode.INVALID_ARGUMENT)
+            return _code_answer(StatusCode.INVALID_ARGUMENT)
         return _value_answer(self._device.cells.get(key))
 
     def _set_value(
         self, argument: str, kind: str, read: Callable[[str], int | float | str | None]
     ) -> bytes:
-        key, text = self._target(argument)
+        key, text = self._cell_to_set(argument)
         value = read(text)
         if key is None or value is None:
-            return _coded(StatusCode.INVALID_ARGUMENT)
-        return _coded(self._device.request_value(key, kind, value))
+            return _code_answer(StatusCode.INVALID_ARGUMENT)
+        return _code_answer(self._device.request_value(key, kind, value))
 
-    def _target(self, argument: str) -> tuple[str | None, str]:
+    def _cell_to_set(self, argument: str) -> tuple[str | None, str]:
         """Return the key of the cell to set, None if there is no such cell, and the rest."""
         cell = words.parse_wire_cell(argument)
         if cell is not None:
             return cell[0].wire, cell[1]
         name, _, text = argument.partition(" ")
-        return self._named(name), text
+        return self._key_of_name(name), text
 
-    def _named(self, name: str) -> str | None:
+    def _key_of_name(self, name: str) -> str | None:
         """Return the key of a cell with a name, None if there is no such cell.
 
         Cells are kept in upper case, so one without its three digits is not found.
@@ -188,11 +190,11 @@ class InSightCommands:
 
     def _get_info(self, _argument: str) -> bytes:
         lines = (_line(f"{name}: {value}") for name, value in self._info.items())
-        return _coded(StatusCode.DONE) + b"".join(lines)
+        return _code_answer(StatusCode.DONE) + b"".join(lines)
 
     def _evaluate(self, argument: str) -> bytes:
         text = self._evaluations.get(argument.strip())
-        return _coded(StatusCode.FAILED) if text is None else _sized(text)
+        return _code_answer(StatusCode.FAILED) if text is None else _sized_answer(text)
 
     def _read_image(self, _argument: str, respond: Respond) -> None:
         device = self._device
@@ -200,18 +202,18 @@ class InSightCommands:
             self._send_image(coded_image(device.image), respond)
             return
         # a sensor's image is large: it is written in a thread
-        writing = asyncio.get_running_loop().run_in_executor(None, _seen_image, device.sight)
+        writing_future = asyncio.get_running_loop().run_in_executor(None, _last_image, device.sight)
 
-        def written(done: asyncio.Future[CodedImage | None]) -> None:
-            if not done.cancelled():
+        def on_written(future: asyncio.Future[CodedImage | None]) -> None:
+            if not future.cancelled():
                 with device.around():
-                    self._send_image(done.result(), respond)
+                    self._send_image(future.result(), respond)
 
-        writing.add_done_callback(written)
+        writing_future.add_done_callback(on_written)
 
     def _send_image(self, image: CodedImage | None, respond: Respond) -> None:
         if image is None:
-            respond(_coded(StatusCode.FAILED))
+            respond(_code_answer(StatusCode.FAILED))
             return
         digits = self.quirks.image_size == "digits"
         respond(_value_answer(image.digits if digits else image.size), more=True)
@@ -238,10 +240,10 @@ def coded_image(image: NDArray[np.uint8]) -> CodedImage:
     return CodedImage(len(data), *words.hex_lines(data))
 
 
-def _seen_image(sight: Callable[[], Any]) -> CodedImage | None:
+def _last_image(read_image: Callable[[], Any]) -> CodedImage | None:
     """Return the image of the last run; None if the camera could not have taken it."""
     try:
-        return coded_image(check_image(sight()))
+        return coded_image(check_image(read_image()))
     except ConfigurationError as exc:
         _log.warning("! no image is sent: %s", exc)
         return None
@@ -270,18 +272,18 @@ def _line(text: str) -> bytes:
     return text.encode(words.ENCODING) + words.LINE_END
 
 
-def _coded(code: StatusCode) -> bytes:
+def _code_answer(code: StatusCode) -> bytes:
     return _line(str(int(code)))
 
 
 def _value_answer(value: str | int | None) -> bytes:
     """Return the answer with a value; None: not possible."""
     if value is None:
-        return _coded(StatusCode.FAILED)
-    return _coded(StatusCode.DONE) + _line(str(value))
+        return _code_answer(StatusCode.FAILED)
+    return _code_answer(StatusCode.DONE) + _line(str(value))
 
 
-def _sized(text: str) -> bytes:
+def _sized_answer(text: str) -> bytes:
     return _value_answer(len(text)) + _line(text)
 
 

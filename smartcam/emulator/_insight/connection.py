@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_codec import LineServer
 
 MAX_SESSIONS = 16
-"""Largest number of connections at a time. The connection that has waited longest for its login
-makes room for a newcomer; if all are logged in, the newcomer is closed. The real camera's bound is
-not published."""
+"""Largest number of connections at a time. For a new one, the connection that has waited longest
+for its login is closed; if all are logged in, the new one is closed. The real camera's bound is not
+published."""
 
 WRITE_LIMIT = 1 << 25
-"""Bytes kept for a client that does not read; more end its connection. An image
-of 8 megapixels makes 17 million."""
+"""Bytes kept for a client that does not read; if there are more, its connection ends. An image of 8
+megapixels needs 17 million."""
 
 
 def _code(line: str) -> int:
@@ -62,7 +62,7 @@ ROWS = (
     LineRow(m.Trigger, "SW8", m.TriggerAnswer, lambda line: m.TriggerAnswer(code=_code(line))),
     LineRow(m.ReadImage, "RI", m.Image, lambda line: m.Image(code=_code(line), data=b"")),
 )
-"""The commands that are requests of the library, whose names faults use."""
+"""The commands that are requests of the library; faults name them by these requests."""
 
 
 class _LoginState(enum.Enum):
@@ -94,7 +94,7 @@ class TelnetClient(LineClient):
         """True once the client is logged in, so that its commands are carried out."""
         return self._state is _LoginState.COMMANDS
 
-    def take(self, line: str) -> None:
+    def handle_line(self, line: str) -> None:
         """Handle a line."""
         if self._state is _LoginState.COMMANDS:
             self._emulator.execute(self, line)
@@ -111,7 +111,7 @@ class TelnetClient(LineClient):
             self.end("the login was refused")
 
     def respond(self, data: bytes, *, more: bool = False) -> None:
-        """Answer the current line; without ``more`` the answer is complete."""
+        """Answer the current line; with ``more``, another call sends the remaining bytes."""
         self.say_bytes(data)
         if not more:
             self.end_line()

@@ -19,8 +19,8 @@ from smartcam.emulator._insight.job import (
     Control,
     InspectedJob,
     Job,
+    cell_text,
     make_job,
-    shown,
 )
 from smartcam.emulator._inspected import InspectionOrder
 from smartcam.exceptions import ConfigurationError
@@ -47,7 +47,7 @@ class _PendingEvent:
     """An acquisition with its evaluation, or a soft event."""
 
     def __init__(self, on_code: OnCode | None) -> None:
-        self.over: bool = False
+        self.is_finished: bool = False
         self._on_code = on_code
 
     def report(self, code: StatusCode) -> None:
@@ -58,7 +58,7 @@ class _PendingEvent:
 
     def end(self, code: StatusCode) -> None:
         """Finish the event, also after a failure."""
-        self.over = True
+        self.is_finished = True
         self.report(code)
 
 
@@ -85,27 +85,28 @@ class InSightDevice:
         self.jobs: Mapping[str, Job] = _by_file([make_job(job) for job in jobs])
         # active job; None for one that was never saved
         self.job: Job | None = next(iter(self.jobs.values()), None)
-        # context around an operator's actions, if something has to follow them
+        # context around an operator's actions; the emulator sets one that sends messages at its end
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
         # function that returns the image of the last run, if an inspector takes the pictures
         self.sight: Callable[[], Any] | None = None
         self.runs: int = 0  # number of acquisitions with a result since the device was created
         self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
         self._now = 0
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._scheduled_calls: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
         self._wanted_online = online  # whether clients have switched it online
         self._allowed_online = True  # False while the operator or an input holds it offline
         self._loading = False
-        self._blind = False  # whether the source of its pictures is lost
+        self._has_no_pictures = False  # whether the source of its pictures is lost
         self._inspector: Inspector | None = None  # inspector of the running run
-        self._run: _PendingEvent | None = None
-        self._turn = 0  # number of acquisitions since the job was loaded
+        self._running_event: _PendingEvent | None = None
+        self._runs_since_load = 0  # number of acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
-        self._generation = 0  # count of free runs begun; timers of older ones stop
+        # counts loads and changes of the mode; a free run from before one stops
+        self._generation = 0
         if active is not None:
             self.job = self.find(active)
-        self._begin_job()
+        self._reset_job()
 
     # ------------------------------------------------------------------ properties
 
@@ -124,7 +125,7 @@ class InSightDevice:
     @property
     def busy(self) -> bool:
         """True while a run or the loading of a job is under way."""
-        return self._loading or self._run is not None
+        return self._loading or self._running_event is not None
 
     @property
     def cells(self) -> Mapping[str, str]:
@@ -146,9 +147,9 @@ class InSightDevice:
         Raises:
             ConfigurationError: there is no such job.
         """
-        for each in self.jobs.values():
-            if each.id == job if isinstance(job, int) else each.is_called(job):
-                return each
+        for job_on_camera in self.jobs.values():
+            if job_on_camera.id == job if isinstance(job, int) else job_on_camera.is_called(job):
+                return job_on_camera
         known = ", ".join(self.jobs) or "none"
         raise ConfigurationError(f"job {job!r} is not on the camera; there are: {known}")
 
@@ -160,18 +161,18 @@ class InSightDevice:
         return self._now
 
     @property
-    def due(self) -> int | None:
+    def next_event_at(self) -> int | None:
         """Time of the next scheduled event, nanoseconds; None if there is none."""
-        return self._agenda[0][0] if self._agenda else None
+        return self._scheduled_calls[0][0] if self._scheduled_calls else None
 
     def advance_to(self, now: int) -> None:
         """Advance the device's time, nanoseconds, and run the due events in order of time.
 
         A time before the present one changes nothing.
         """
-        while self._agenda and self._agenda[0][0] <= now:
-            at, _, action = heapq.heappop(self._agenda)
-            self._now = max(self._now, at)
+        while self._scheduled_calls and self._scheduled_calls[0][0] <= now:
+            time, _, action = heapq.heappop(self._scheduled_calls)
+            self._now = max(self._now, time)
             action()
         self._now = max(self._now, now)
 
@@ -180,15 +181,15 @@ class InSightDevice:
         if seconds <= 0:
             action()
             return
-        at = self._now + max(1, nanoseconds(seconds))
-        heapq.heappush(self._agenda, (at, next(self._numbers), action))
+        time = self._now + max(1, nanoseconds(seconds))
+        heapq.heappush(self._scheduled_calls, (time, next(self._numbers), action))
 
     # ------------------------------------------------------------------ the operator
 
     def set_online(self, online: bool) -> None:
         """Go online, or hold the camera offline, as by hand or an input: then ``SO1`` fails."""
         with self.around():
-            self._switch(wanted=self._wanted_online or online, allowed=online)
+            self._set_online_state(wanted=self._wanted_online or online, allowed=online)
 
     def start(self) -> None:
         """Go online by hand."""
@@ -213,9 +214,9 @@ class InSightDevice:
         if self._loading:
             raise ConfigurationError(f"job {job!r}: another one is being loaded")
         with self.around():
-            self._break_run()
+            self._abort_run()
             self.job = next_job
-            self._begin_job()
+            self._reset_job()
 
     def set_blind(self, blind: bool) -> None:
         """Note that no pictures come, or that they come again.
@@ -223,9 +224,9 @@ class InSightDevice:
         Without pictures the running run fails, and so does every trigger.
         """
         with self.around():
-            self._blind = blind
+            self._has_no_pictures = blind
             if blind:
-                self._break_run()
+                self._abort_run()
 
     def switch_application(self, application: int, *, running: bool = False) -> bool:
         """Load the job with an id by hand, then go online or offline; False during another load.
@@ -246,7 +247,7 @@ class InSightDevice:
         """Go online or offline for a client (``SO``)."""
         if self._loading:
             return StatusCode.FAILED
-        self._switch(wanted=online, allowed=self._allowed_online)
+        self._set_online_state(wanted=online, allowed=self._allowed_online)
         return StatusCode.STILL_OFFLINE if online and not self.online else StatusCode.DONE
 
     def request_job(self, job: str | int, on_code: OnCode) -> None:
@@ -261,13 +262,13 @@ class InSightDevice:
             return
         self._loading = True
 
-        def loaded() -> None:
+        def on_loaded() -> None:
             self._loading = False
             self.job = next_job
-            self._begin_job()
+            self._reset_job()
             on_code(StatusCode.DONE)
 
-        self.after(next_job.load_time, loaded)
+        self.after(next_job.load_time, on_loaded)
 
     def request_event(self, event: int, on_code: OnCode, *, at_image: bool) -> None:
         """Cause an event, 0 to 8, for a client; ``on_code`` gets the code.
@@ -285,90 +286,94 @@ class InSightDevice:
             return StatusCode.FAILED
         if not source.admits(value):
             return StatusCode.FAILED
-        self._cells[key] = shown(value)
+        self._cells[key] = cell_text(value)
         return StatusCode.DONE
 
     # ------------------------------------------------------------------ internals
 
-    def _begin_job(self) -> None:
-        self._turn = 0
-        self._cells = {} if self.job is None else self.job.fresh_cells()
+    def _reset_job(self) -> None:
+        self._runs_since_load = 0
+        self._cells = {} if self.job is None else self.job.loaded_cells()
         self._generation += 1
         self._run_freely()
 
-    def _switch(self, *, wanted: bool, allowed: bool) -> None:
-        before = self.online
+    def _set_online_state(self, *, wanted: bool, allowed: bool) -> None:
+        was_online = self.online
         self._wanted_online, self._allowed_online = wanted, allowed
-        if self.online == before:
+        if self.online == was_online:
             return
         self._generation += 1
         if self.online:
             self._run_freely()
         else:
-            self._break_run()
+            self._abort_run()
 
     def _begin_run(self, event: int, on_code: OnCode | None, *, at_image: bool) -> bool:
         job = _UNSAVED if self.job is None else self.job
         acquires = event == TRIGGER_EVENT
-        if not self.online or self.busy or (acquires and (self._blind or not job.triggered)):
+        if (
+            not self.online
+            or self.busy
+            or (acquires and (self._has_no_pictures or not job.triggered))
+        ):
             return False
-        run = self._run = _PendingEvent(on_code)
+        run = self._running_event = _PendingEvent(on_code)
         if acquires and isinstance(job, InspectedJob):
             self._inspect(job, run, at_image=at_image)
             return True
 
-        def seen() -> None:
-            if run.over:
+        def on_image() -> None:
+            if run.is_finished:
                 return
             if at_image:
                 run.report(StatusCode.DONE)
-            self.after(job.processing_time, done)
+            self.after(job.processing_time, on_done)
 
-        def done() -> None:
-            if run.over:
+        def on_done() -> None:
+            if run.is_finished:
                 return
-            self._run = None
+            self._running_event = None
             if acquires:
                 self._finish_acquisition(job)
             run.end(StatusCode.DONE)
 
-        self.after(job.acquisition_time if acquires else 0.0, seen)
+        self.after(job.acquisition_time if acquires else 0.0, on_image)
         return True
 
     def _inspect(self, job: InspectedJob, run: _PendingEvent, *, at_image: bool) -> None:
         """Start the inspection of a picture for a run."""
 
-        def seen() -> None:
+        def on_image() -> None:
             with self.around():
-                if at_image and not run.over:
+                if at_image and not run.is_finished:
                     run.report(StatusCode.DONE)
 
-        def done(values: Values | None) -> None:
+        def on_done(values: Values | None) -> None:
             with self.around():
-                if run.over:
+                if run.is_finished:
                     return
-                self._run = self._inspector = None
+                self._running_event = self._inspector = None
                 self._count_run()
-                job.take(self._cells, values)
+                job.fill_cells(self._cells, values)
                 run.end(StatusCode.DONE)
 
         self._inspector = job.inspector
         number = self.runs & _MAX_NUMBER
-        job.inspector.begin(InspectionOrder(job.application, number, b""), seen, done)
+        job.inspector.begin(InspectionOrder(job.application, number, b""), on_image, on_done)
 
     def _finish_acquisition(self, job: Job) -> None:
         self._count_run()
-        job.update_cells(self._cells, self._turn)
+        job.update_cells(self._cells, self._runs_since_load)
 
     def _count_run(self) -> None:
         self.runs += 1
-        self._turn += 1
+        self._runs_since_load += 1
 
-    def _break_run(self) -> None:
+    def _abort_run(self) -> None:
         inspector, self._inspector = self._inspector, None
         if inspector is not None:
             inspector.cancel()
-        run, self._run = self._run, None
+        run, self._running_event = self._running_event, None
         if run is not None:
             run.end(StatusCode.FAILED)
 
@@ -378,17 +383,19 @@ class InSightDevice:
             return
         generation, period = self._generation, 1 / job.rate
 
-        def turn() -> None:
+        def run_once() -> None:
             if generation != self._generation:
                 return
             if not isinstance(job, InspectedJob):
                 self._finish_acquisition(job)
-            elif not (self.busy or self._blind):  # skip the run if the last one still runs
-                run = self._run = _PendingEvent(None)
+            elif not (
+                self.busy or self._has_no_pictures
+            ):  # skip the run if the last one still runs
+                run = self._running_event = _PendingEvent(None)
                 self._inspect(job, run, at_image=False)
-            self.after(period, turn)
+            self.after(period, run_once)
 
-        self.after(period, turn)
+        self.after(period, run_once)
 
 
 _UNSAVED = Job(file="unsaved")

@@ -24,9 +24,9 @@ _PALETTE = b"".join(bytes((grey, grey, grey, 0)) for grey in range(256))
 
 def grey_pattern(width: int = 64, height: int = 48) -> NDArray[np.uint8]:
     """Return a picture that shows its orientation: grey levels rise to the right and downwards."""
-    across = np.linspace(0, 191, width)
-    down = np.linspace(0, 64, height)
-    return (across[np.newaxis, :] + down[:, np.newaxis]).astype(np.uint8)
+    columns = np.linspace(0, 191, width)
+    rows_down = np.linspace(0, 64, height)
+    return (columns[np.newaxis, :] + rows_down[:, np.newaxis]).astype(np.uint8)
 
 
 def check_image(image: Any) -> NDArray[np.uint8]:

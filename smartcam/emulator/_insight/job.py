@@ -135,28 +135,28 @@ class Job(EmulatorData):
         """Sources of the job's cells by :func:`cell_key`."""
         return {cell_key(name): source for name, source in self.cells.items()}
 
-    def fresh_cells(self) -> dict[str, str]:
-        """Return the cells' texts right after loading: cells that need a run are in error."""
-        return {key: self._show(key, source, 0) for key, source in self.sources.items()}
+    def loaded_cells(self) -> dict[str, str]:
+        """Return the cells' texts after the job is loaded: cells that need a run are in error."""
+        return {key: self._source_text(key, source, 0) for key, source in self.sources.items()}
 
     def update_cells(self, cells: dict[str, str], run: int) -> None:
-        """Bring the cells up to date after a run, from 1; controls keep their values."""
+        """Update the cells after run number ``run``, from 1; controls keep their values."""
         for key, source in self.sources.items():
             if not isinstance(source, Control):
-                cells[key] = self._show(key, source, run)
+                cells[key] = self._source_text(key, source, run)
 
-    def _show(self, key: str, source: Any, run: int) -> str:
+    def _source_text(self, key: str, source: Any, run: int) -> str:
         if isinstance(source, Control):
-            return shown(source.value)
+            return cell_text(source.value)
         if isinstance(source, list):
-            return shown(source[(run - 1) % len(source)]) if run else words.ERROR_VALUE
+            return cell_text(source[(run - 1) % len(source)]) if run else words.ERROR_VALUE
         if callable(source):
-            return self._call(key, source, run) if run else words.ERROR_VALUE
-        return shown(source)
+            return self._function_text(key, source, run) if run else words.ERROR_VALUE
+        return cell_text(source)
 
-    def _call(self, key: str, function: Callable[[int], Any], run: int) -> str:
+    def _function_text(self, key: str, function: Callable[[int], Any], run: int) -> str:
         try:
-            return shown(function(run))
+            return cell_text(function(run))
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - a cell that fails shows it, as on the camera
@@ -182,12 +182,12 @@ class Job(EmulatorData):
 
     @model_validator(mode="after")
     def _check_cells(self) -> Job:
-        seen: dict[str, str] = {}
+        names_by_key: dict[str, str] = {}
         for name, source in self.cells.items():
             key = cell_key(name)
-            if key in seen:
-                raise ValueError(f"cells {seen[key]!r} and {name!r} are the same")
-            seen[key] = name
+            if key in names_by_key:
+                raise ValueError(f"cells {names_by_key[key]!r} and {name!r} are the same")
+            names_by_key[key] = name
             if isinstance(source, Control) or callable(source):
                 continue
             values = source if isinstance(source, list) else [source]
@@ -195,7 +195,7 @@ class Job(EmulatorData):
                 raise ValueError(f"cell {name}: the list is empty")
             for value in values:
                 try:
-                    shown(value)
+                    cell_text(value)
                 except (TypeError, ValueError) as exc:
                     raise ValueError(f"cell {name}: {exc}") from exc
         return self
@@ -211,21 +211,21 @@ class InspectedJob(Job):
     inspector: Inspector = Field(description="the program that inspects the pictures")
     application: int = Field(description="id of the program for the inspector")
 
-    def fresh_cells(self) -> dict[str, str]:
-        """Return the cells' texts right after loading: all need a run."""
+    def loaded_cells(self) -> dict[str, str]:
+        """Return the cells' texts after the job is loaded: all need a run, so are in error."""
         return dict.fromkeys(self.sources, words.ERROR_VALUE)
 
-    def take(self, cells: dict[str, str], values: Values | None) -> None:
-        """Put an inspector's findings into the cells; those without a value are in error."""
-        cells.update(self.fresh_cells())
+    def fill_cells(self, cells: dict[str, str], values: Values | None) -> None:
+        """Put an inspector's values into the cells; cells without a value are in error."""
+        cells.update(self.loaded_cells())
         for name, value in _named_values(values):
             key = cell_key(name)
             if key in self.sources:
-                cells[key] = self._show(key, value, 0)
+                cells[key] = self._source_text(key, value, 0)
 
-    def _show(self, key: str, source: Any, run: int) -> str:
+    def _source_text(self, key: str, source: Any, run: int) -> str:
         try:
-            return shown(source)
+            return cell_text(source)
         except (TypeError, ValueError) as exc:
             _log.warning("! job %s: cell %s: %s", self.file, key, exc)
             return words.ERROR_VALUE
@@ -260,8 +260,8 @@ def cell_key(name: str) -> str:
             raise exc from not_a_cell
 
 
-def shown(value: Any) -> str:
-    """Return a value in the form of the answer to ``GV``: numbers with three decimals (derived).
+def cell_text(value: Any) -> str:
+    """Return a value as the text of a cell, like ``GV``: numbers have three decimals (derived).
 
     A number that is not finite gives a cell in error.
 

@@ -26,9 +26,10 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
     """
     first, *others = load_scenarios(path, dialect=dialect)
     if others:
+        names = ", ".join(scenario.name for scenario in (first, *others))
         raise ConfigurationError(
-            f"scenario {path}: one camera was expected, it has {1 + len(others)}: "
-            f"{', '.join(each.name for each in (first, *others))}; EmulatedFleet takes them all"
+            f"scenario {path}: one camera was expected, it has {1 + len(others)}: {names}; "
+            "EmulatedFleet takes them all"
         )
     return first
 
@@ -48,21 +49,21 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
     if dialect is not None:
         dialect = check_text(dialect, "dialect", "scenario")
 
-    def each(file: ScenarioFile) -> tuple[Scenario, ...]:
-        scenarios = file.each()
+    def cameras_of(file: ScenarioFile) -> tuple[Scenario, ...]:
+        scenarios = file.split_cameras()
         if dialect is None:
             return scenarios
         return tuple(scenario.model_copy(update={"dialect": dialect}) for scenario in scenarios)
 
     def mistake(file: ScenarioFile) -> Mistake | None:
-        for index, scenario in enumerate(each(file)):
+        for index, scenario in enumerate(cameras_of(file)):
             problem = scenario.mistake()
             if problem is not None:
                 place, text = problem
-                return file.place(index, place), text
+                return file.place_in_file(index, place), text
         return None
 
-    return each(read_model(path, "scenario", ScenarioFile, "applications", mistake))
+    return cameras_of(read_model(path, "scenario", ScenarioFile, "applications", mistake))
 
 
 def scenario_schema() -> dict[str, Any]:

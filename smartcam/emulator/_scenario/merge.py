@@ -40,11 +40,11 @@ def make_plan(
     for option, names in _KNOWN.items():
         if option not in changes:
             continue
-        word = changes[option] = check_text(changes[option], option, "emulator", most=100)
-        if word not in names:
+        name = changes[option] = check_text(changes[option], option, "emulator", most=100)
+        if name not in names:
             raise ConfigurationError(
-                f"emulator: {option} {word!r} is unknown; known are {', '.join(names)}"
-                f"{did_you_mean(word, names)}"
+                f"emulator: {option} {name!r} is unknown; known are {', '.join(names)}"
+                f"{did_you_mean(name, names)}"
             )
     if scenario is None:
         base = Scenario()
@@ -54,8 +54,8 @@ def make_plan(
         base = load_scenario(scenario, dialect=changes.get("dialect"))
     if "quirks" in changes:
         changes["quirks"] = validated(Quirks, changes["quirks"], "quirks")
-    given_ones = check_all(applications, "applications", "a list of applications", "emulator")
-    added = [make_application(application) for application in given_ones]
+    checked = check_all(applications, "applications", "a list of applications", "emulator")
+    added = [make_application(application) for application in checked]
     ids = {application.id for application in added}
     changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
     timeline = check_all(timeline, "timeline", "a list of cues", "emulator")

@@ -1,4 +1,4 @@
-"""Scenarios: emulated cameras as data; :mod:`.scenario_file` reads files of them."""
+"""Scenarios: emulated cameras as data; ``file.py`` reads files of them."""
 
 from __future__ import annotations
 
@@ -78,9 +78,9 @@ class Scenario(EmulatorData):
     @model_validator(mode="after")
     def _check(self) -> Scenario:
         ids = [application.id for application in self.applications]
-        twice = _first_double(ids)
-        if twice is not None:
-            raise ValueError(f"application id {twice} is there twice")
+        duplicate = _first_duplicate(ids)
+        if duplicate is not None:
+            raise ValueError(f"application id {duplicate} is there twice")
         return self
 
     @property
@@ -105,13 +105,13 @@ class Scenario(EmulatorData):
         from smartcam.emulator._makes import emulated_class  # that module imports this one
 
         try:
-            kind = emulated_class(self.protocol)
+            camera_class = emulated_class(self.protocol)
         except (ConfigurationError, UnsupportedError) as exc:
             return ("protocol",), str(exc)
-        return kind.mistake(self)
+        return camera_class.mistake(self)
 
     def changed(self) -> set[str]:
-        """Return the names of the fields that do not have their default value."""
+        """Return the names of the fields that have another value than their default."""
         fields = type(self).model_fields
         return {
             name
@@ -121,7 +121,7 @@ class Scenario(EmulatorData):
 
 
 class ScenarioFile(Scenario):
-    """A scenario file: one camera; or several, and their common fields."""
+    """A scenario file: one camera, or several with their common fields."""
 
     cameras: tuple[Scenario, ...] = Field(
         default=(),
@@ -136,13 +136,13 @@ class ScenarioFile(Scenario):
     def _check_cameras(self) -> ScenarioFile:
         if self.cameras and "port" in self.model_fields_set:
             raise ValueError("port: with several cameras each has its own")
-        names = [camera.name for camera in self.each()]
-        twice = _first_double(names)
-        if twice is not None:
-            raise ValueError(f"two cameras are called {twice!r}")
+        names = [camera.name for camera in self.split_cameras()]
+        duplicate = _first_duplicate(names)
+        if duplicate is not None:
+            raise ValueError(f"two cameras are called {duplicate!r}")
         return self
 
-    def each(self) -> tuple[Scenario, ...]:
+    def split_cameras(self) -> tuple[Scenario, ...]:
         """Return the cameras, each with the common fields."""
         common = {name: getattr(self, name) for name in self.model_fields_set - {"cameras"}}
         if not self.cameras:
@@ -170,26 +170,26 @@ class ScenarioFile(Scenario):
         }
         return Scenario(**merged)
 
-    def place(self, index: int, place: tuple[str | int, ...]) -> tuple[str | int, ...]:
+    def place_in_file(self, index: int, place: tuple[str | int, ...]) -> tuple[str | int, ...]:
         """Return the place in the file of a place in one camera."""
         if not self.cameras:
             return place
         camera = self.cameras[index]
         name, *inner = place
         if name == "timeline" and isinstance(inner[0], int):
-            own = inner[0] - len(self.timeline)
-            return place if own < 0 else ("cameras", index, name, own, *inner[1:])
+            own_index = inner[0] - len(self.timeline)
+            return place if own_index < 0 else ("cameras", index, name, own_index, *inner[1:])
         if name == "applications" and isinstance(inner[0], int):
-            own = inner[0] - len(camera.applications)
-            return ("cameras", index, *place) if own < 0 else (name, own, *inner[1:])
+            own_index = inner[0] - len(camera.applications)
+            return ("cameras", index, *place) if own_index < 0 else (name, own_index, *inner[1:])
         return ("cameras", index, *place) if name in camera.model_fields_set else place
 
 
-def _first_double(values: Iterable[T]) -> T | None:
+def _first_duplicate(values: Iterable[T]) -> T | None:
     """Return the first value that occurred before; None without one."""
-    seen: set[T] = set()
+    earlier_values: set[T] = set()
     for value in values:
-        if value in seen:
+        if value in earlier_values:
             return value
-        seen.add(value)
+        earlier_values.add(value)
     return None

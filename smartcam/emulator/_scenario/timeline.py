@@ -45,8 +45,8 @@ MAX_PENDING = 10_000
 """Largest number of cues that wait for their time; a further one is dropped, with a warning."""
 
 MAX_CUES_AT_ONCE = 1000
-"""Largest number of cues at one instant, since cues that cause each other would go on forever. A
-further one is dropped, with a warning."""
+"""Largest number of cues at one instant: cues that cause each other would never end. A further one
+is dropped, with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
 """Largest number of faults of one cue, far more than useful."""
@@ -153,29 +153,29 @@ class _CueState:
 
     cue: Cue
     random: Random  # the cue's random numbers, so that no cue changes another's
-    seen: int = 0  # number of times that its moment came
-    done: int = 0  # number of times that its faults were injected
+    moment_count: int = 0  # number of times that its moment came
+    injected_count: int = 0  # number of times that its faults were injected
 
     @property
-    def over(self) -> bool:
+    def is_finished(self) -> bool:
         """True if no later moment matters."""
         limit = self.cue.limit
-        return limit is not None and self.seen >= self.cue.nth - 1 + limit
+        return limit is not None and self.moment_count >= self.cue.nth - 1 + limit
 
-    def comes(self) -> float | None:
+    def count_moment(self) -> float | None:
         """Count a moment; return the seconds until the cue happens, None for never."""
-        if self.over:
+        if self.is_finished:
             return None
-        self.seen += 1
-        if self.seen < self.cue.nth:
+        self.moment_count += 1
+        if self.moment_count < self.cue.nth:
             return None
         happens = self.random.random() < self.cue.chance
-        later = self.cue.after + self.random.random() * self.cue.spread
-        return later if happens else None
+        delay = self.cue.after + self.random.random() * self.cue.spread
+        return delay if happens else None
 
 
 class Timeline:
-    """Runs cues; made anew for each start of the emulator.
+    """Runs cues; each start of the emulator makes a new timeline.
 
     Cues at the same instant happen in their order; all random numbers come from ``seed``.
     """
@@ -188,52 +188,52 @@ class Timeline:
         seed: int,
         inject: Callable[[Sequence[Fault]], None],
     ) -> None:
-        self._rows = [
+        self._cue_states = [
             _CueState(cue, Random(f"{seed}/{number}"))  # noqa: S311  chance in a test, no secret
             for number, cue in enumerate(cues)
         ]
-        self._entering = [row for row in self._rows if row.cue.entering is not None]
+        self._state_cues = [row for row in self._cue_states if row.cue.entering is not None]
         self._clock = clock
         self._inject = inject
         self._pending: list[tuple[int, int, _CueState, bool]] = []
         self._order = itertools.count()
         self._timer = OneTimer(clock, self._run)
-        self._waiting: list[_CueState] = []
-        self._acting = False
-        self._instant: tuple[float, int] = (0.0, 0)
+        self._due_cues: list[_CueState] = []
+        self._is_running = False
+        self._count_at_instant: tuple[float, int] = (0.0, 0)
 
     @property
-    def watches(self) -> bool:
+    def watches_states(self) -> bool:
         """True if a cue waits for a state."""
-        return bool(self._entering)
+        return bool(self._state_cues)
 
     @property
-    def done(self) -> list[int]:
+    def injected_counts(self) -> list[int]:
         """Number of times that each cue has happened."""
-        return [row.done for row in self._rows]
+        return [row.injected_count for row in self._cue_states]
 
     def start(self) -> None:
-        """Begin: now is second 0."""
+        """Start the timeline: the present time is second 0."""
         begin = nanoseconds(self._clock.now)
-        for row in self._rows:
+        for row in self._cue_states:
             cue = row.cue
             if cue.at is not None:
-                self._put(begin + nanoseconds(cue.at), row, comes=True)
+                self._schedule(begin + nanoseconds(cue.at), row, is_moment=True)
             elif cue.entering is None and cue.command is None:
-                self._come(row)
+                self._handle_moment(row)
         self._run()
 
     def stop(self) -> None:
         """Drop the waiting cues. Harmless when called twice."""
         self._pending.clear()
-        self._waiting.clear()
+        self._due_cues.clear()
         self._timer.set(None)
 
-    def entered(self, state: DeviceState) -> None:
+    def note_entered(self, state: DeviceState) -> None:
         """Note that the camera has entered a state."""
-        for row in self._entering:
+        for row in self._state_cues:
             if row.cue.entering is state:
-                self._come(row)
+                self._handle_moment(row)
         self._run()
 
     def command(self, name: str) -> None:
@@ -242,63 +242,65 @@ class Timeline:
         Raises:
             ConfigurationError: no cue has it.
         """
-        rows = [row for row in self._rows if row.cue.command == name]
+        rows = [row for row in self._cue_states if row.cue.command == name]
         if not rows:
-            known = sorted({row.cue.command for row in self._rows if row.cue.command})
+            known = sorted({row.cue.command for row in self._cue_states if row.cue.command})
             raise ConfigurationError(
                 f"no cue of the timeline has the command {name!r}; there are "
                 f"{', '.join(known) or 'none'}"
             )
         for row in rows:
-            self._come(row)
+            self._handle_moment(row)
         self._run()
 
-    def _come(self, row: _CueState) -> None:
+    def _handle_moment(self, row: _CueState) -> None:
         """Count a moment of a cue, and run or schedule it."""
-        later = row.comes()
-        if later:
-            self._put(nanoseconds(self._clock.now) + nanoseconds(later), row, comes=False)
-        elif later is not None:
-            self._waiting.append(row)
+        delay = row.count_moment()
+        if delay:
+            self._schedule(nanoseconds(self._clock.now) + nanoseconds(delay), row, is_moment=False)
+        elif delay is not None:
+            self._due_cues.append(row)
 
-    def _put(self, when: int, row: _CueState, *, comes: bool) -> None:
+    def _schedule(self, when: int, row: _CueState, *, is_moment: bool) -> None:
         if len(self._pending) >= MAX_PENDING:
             _log.warning("! timeline: more than %d cues wait, one is dropped", MAX_PENDING)
             return
-        heapq.heappush(self._pending, (when, next(self._order), row, comes))
+        heapq.heappush(self._pending, (when, next(self._order), row, is_moment))
 
     def _run(self) -> None:
-        """Run all cues that are due, one after the other, never nested."""
-        if self._acting:
+        """Run all cues that are due, one after the other, never inside another call."""
+        if self._is_running:
             return
-        self._acting = True
+        self._is_running = True
         try:
-            self._happen()
+            self._inject_due_cues()
             now = nanoseconds(self._clock.now)
             while self._pending and self._pending[0][0] <= now:
-                when, _, row, comes = heapq.heappop(self._pending)
-                if comes:
-                    self._come(row)
-                    if row.cue.every is not None and not row.over:
-                        self._put(when + nanoseconds(row.cue.every), row, comes=True)
+                when, _, row, is_moment = heapq.heappop(self._pending)
+                if is_moment:
+                    self._handle_moment(row)
+                    if row.cue.every is not None and not row.is_finished:
+                        self._schedule(when + nanoseconds(row.cue.every), row, is_moment=True)
                 else:
-                    self._waiting.append(row)
-                self._happen()
+                    self._due_cues.append(row)
+                self._inject_due_cues()
         finally:
-            self._acting = False
+            self._is_running = False
         self._timer.set(self._pending[0][0] if self._pending else None)
 
-    def _happen(self) -> None:
-        while self._waiting:
-            row = self._waiting.pop(0)
-            now, count = self._instant
-            self._instant = (now, count + 1) if now == self._clock.now else (self._clock.now, 1)
-            if self._instant[1] > MAX_CUES_AT_ONCE:
+    def _inject_due_cues(self) -> None:
+        while self._due_cues:
+            row = self._due_cues.pop(0)
+            now, count = self._count_at_instant
+            self._count_at_instant = (
+                (now, count + 1) if now == self._clock.now else (self._clock.now, 1)
+            )
+            if self._count_at_instant[1] > MAX_CUES_AT_ONCE:
                 _log.warning(
                     "! timeline: more than %d cues at once, one is dropped", MAX_CUES_AT_ONCE
                 )
                 continue
-            row.done += 1
+            row.injected_count += 1
             try:
                 self._inject(row.cue.do)
             except ConfigurationError as exc:  # too many faults wait

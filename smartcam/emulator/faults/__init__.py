@@ -520,11 +520,11 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
         ConfigurationError: one of the faults is wrong; the text gives its number, from 1, and
             the field.
     """
-    made: list[Fault] = []
+    converted: list[Fault] = []
     faults = check_all(given, "faults", "a list of faults", "emulator")
     for number, fault in enumerate(faults, start=1):
         try:
-            made.append(_ADAPTER.validate_python(fault))
+            converted.append(_ADAPTER.validate_python(fault))
         except ValidationError as exc:
             raise ConfigurationError(f"fault {number}: {validation_text(exc)}") from exc
-    return tuple(made)
+    return tuple(converted)

@@ -85,7 +85,7 @@ class BaseFault(EmulatorData):
     senders: ClassVar[frozenset[m.Sender]] = frozenset(m.Sender)
     """Senders whose messages the fault can wait for."""
     can_act_at_once: ClassVar[bool]
-    """True if the fault acts at once if it has no message to wait for."""
+    """True if a fault without a message to wait for acts at once."""
 
     on: On = Field(
         default=None,

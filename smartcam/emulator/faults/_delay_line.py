@@ -1,6 +1,6 @@
-"""Send transmissions in order, each at its time, without knowledge of sockets and faults.
+"""Send transmissions in order, each at its time; this module knows no sockets or faults.
 
-The emulator's faults delay messages by this module; the link proxy, bytes of a stream or datagrams.
+The emulator's faults use it to delay messages, the link proxy to delay bytes and datagrams.
 """
 
 from __future__ import annotations
@@ -60,31 +60,36 @@ class Transmission:
 T = TypeVar("T", bound=Transmission)
 
 
-class _Waiting(Generic[T]):
-    """A waiting transmission; ``missing``: number of later parts that it still waits for."""
+class _WaitingTransmission(Generic[T]):
+    """A waiting transmission; ``missing_count``: number of later parts for which it still waits."""
 
-    __slots__ = ("company", "due", "missing", "paused", "sent", "turns", "until")
+    __slots__ = (
+        *("due_at", "gather_until", "gathered", "missing_count", "pause_is_due", "sent"),
+        "turns_left",
+    )
 
     def __init__(self, sent: T, now: int) -> None:
         self.sent = sent
-        self.due = now + nanoseconds(sent.delay)  # instant when its next part may pass, nanoseconds
-        self.missing, seconds = sent.gather or (0, 0.0)
-        # time until which it waits for others, nanoseconds
-        self.until = self.due + nanoseconds(seconds)
-        self.company: list[T] = []  # parts that it waited for, without an order
-        self.paused = False  # whether a part was sent, and its pause has not begun
-        self.turns = 0  # turns of the timer before the next part is sent
+        self.due_at = now + nanoseconds(
+            sent.delay
+        )  # instant when its next part may pass, nanoseconds
+        self.missing_count, seconds = sent.gather or (0, 0.0)
+        # time until which it waits for later parts, nanoseconds
+        self.gather_until = self.due_at + nanoseconds(seconds)
+        self.gathered: list[T] = []  # parts that it waited for, without an order
+        self.pause_is_due = False  # whether a part was sent, and its pause has not begun
+        self.turns_left = 0  # turns of the timer before the next part is sent
 
     @property
-    def when(self) -> int:
+    def send_at(self) -> int:
         """Time at which the message is sent if no later one arrives, nanoseconds."""
-        return self.until if self.missing > 0 else self.due
+        return self.gather_until if self.missing_count > 0 else self.due_at
 
     def pause(self, now: int, turns: int) -> None:
         """Begin the pause before the next part."""
         seconds = self.sent.pauses.pop(0)
-        self.paused, self.due = False, now + nanoseconds(seconds)
-        self.turns = 0 if seconds else turns
+        self.pause_is_due, self.due_at = False, now + nanoseconds(seconds)
+        self.turns_left = 0 if seconds else turns
 
 
 @dataclass(eq=False)
@@ -96,8 +101,8 @@ class DelayLine(Generic[T]):
 
     clock: Clock
     _: KW_ONLY
-    # with an order (TCP), nothing passes a waiting transmission unless it may be overtaken, and
-    # all transmissions of one time are carried together; without it (UDP) each part goes by itself
+    # True (TCP): nothing passes a waiting transmission unless it may be overtaken, and all
+    # transmissions of one time are carried together. False (UDP): each part is carried by itself
     ordered: bool
     wake: Callable[[], None]  # called when run() is due
     # gets passing transmissions and the bytes of each, for one write; it may stop() the line
@@ -109,13 +114,13 @@ class DelayLine(Generic[T]):
     def __post_init__(self) -> None:
         self.size: int = 0  # bytes of all waiting transmissions
         self.stopped: bool = False  # whether nothing passes until go_on()
-        self._queue: deque[_Waiting[T]] = deque()
-        self._loose: list[_Waiting[T]] = []
+        self._queue: deque[_WaitingTransmission[T]] = deque()
+        self._unordered: list[_WaitingTransmission[T]] = []
         self._timer = OneTimer(self.clock, self._tick)
         self._running = False
 
     def __len__(self) -> int:
-        return len(self._queue) + len(self._loose)
+        return len(self._queue) + len(self._unordered)
 
     def put(self, sent: Iterable[T], amount: int = 1) -> None:
         """Add the transmissions of a message; call :meth:`run` next.
@@ -123,15 +128,15 @@ class DelayLine(Generic[T]):
         They count as ``amount`` for transmissions that wait for later ones.
         """
         now = self._now
-        gatherer = self._count(amount, now)
+        gatherer = self._count_new(amount, now)
         for transmission in sent:
             self.size += transmission.size
             if gatherer is not None and not transmission.delay:
-                gatherer.company.append(transmission)
+                gatherer.gathered.append(transmission)
             elif self.ordered and not transmission.overtaken:
-                self._queue.append(_Waiting(transmission, now))
+                self._queue.append(_WaitingTransmission(transmission, now))
             else:
-                self._loose.append(_Waiting(transmission, now))
+                self._unordered.append(_WaitingTransmission(transmission, now))
 
     def run(self) -> None:
         """Send all transmissions whose time has come."""
@@ -139,11 +144,11 @@ class DelayLine(Generic[T]):
             return
         self._running = True
         try:
-            self._run_loose()
-            self._run_queue()
+            self._send_unordered()
+            self._send_queued()
         finally:
             self._running = False
-        self._arm()
+        self._set_timer()
 
     def stop(self) -> None:
         """Send nothing until :meth:`go_on`."""
@@ -159,91 +164,91 @@ class DelayLine(Generic[T]):
         """Drop all transmissions. Harmless when called twice."""
         self._timer.set(None)
         self.size = 0
-        left = [*self._queue, *self._loose]
+        dropped = [*self._queue, *self._unordered]
         self._queue.clear()
-        self._loose.clear()
-        for waiting in left:
-            for transmission in (waiting.sent, *waiting.company):
+        self._unordered.clear()
+        for waiting in dropped:
+            for transmission in (waiting.sent, *waiting.gathered):
                 self.lost(transmission)
 
     @property
     def _now(self) -> int:
         return nanoseconds(self.clock.now)
 
-    def _count(self, amount: int, now: int) -> _Waiting[T] | None:
+    def _count_new(self, amount: int, now: int) -> _WaitingTransmission[T] | None:
         """Count new transmissions for waiting ones; return the transmission to join."""
-        waiting = [entry for entry in (*self._queue, *self._loose) if entry.missing > 0]
+        waiting = [entry for entry in (*self._queue, *self._unordered) if entry.missing_count > 0]
         for entry in waiting:
-            entry.missing -= amount
-            if entry.sent.behind and entry.missing <= 0:
-                entry.due = max(entry.due, now)
-        together = [entry for entry in waiting if not self.ordered and not entry.sent.behind]
-        return together[0] if together else None
+            entry.missing_count -= amount
+            if entry.sent.behind and entry.missing_count <= 0:
+                entry.due_at = max(entry.due_at, now)
+        gatherers = [entry for entry in waiting if not self.ordered and not entry.sent.behind]
+        return gatherers[0] if gatherers else None
 
-    def _run_loose(self) -> None:
+    def _send_unordered(self) -> None:
         """Send transmissions that may be overtaken, and all without an order."""
         now = self._now
-        due = [entry for entry in self._loose if entry.when <= now]
-        for entry in sorted(due, key=lambda entry: (entry.when, entry.sent.behind)):
-            if entry not in self._loose:  # closed meanwhile
+        due_at = [entry for entry in self._unordered if entry.send_at <= now]
+        for entry in sorted(due_at, key=lambda entry: (entry.send_at, entry.sent.behind)):
+            if entry not in self._unordered:  # closed meanwhile
                 return
             if self.ordered:
-                self._loose.remove(entry)
+                self._unordered.remove(entry)
                 self._queue.append(entry)
             else:
-                self._pass_datagrams(entry)
+                self._send_datagrams(entry)
 
-    def _pass_datagrams(self, entry: _Waiting[T]) -> None:
+    def _send_datagrams(self, entry: _WaitingTransmission[T]) -> None:
         """Send the due parts, one datagram each; joined parts are one datagram."""
         sent = entry.sent
         if sent.gather is not None and not sent.behind:
-            self._loose.remove(entry)
-            together = [sent, *entry.company]
-            self._hand_over([self._next(each, whole=True) for each in together])
-            for each in together:
+            self._unordered.remove(entry)
+            gatherers = [sent, *entry.gathered]
+            self._carry_batch([self._take_next(each, whole=True) for each in gatherers])
+            for each in gatherers:
                 self._finish(each)
             return
-        entry.missing = 0
-        while entry in self._loose and entry.due <= self._now:
-            self._hand_over([self._next(sent)])
+        entry.missing_count = 0
+        while entry in self._unordered and entry.due_at <= self._now:
+            self._carry_batch([self._take_next(sent)])
             if sent.parts:
                 entry.pause(self._now, 0)
-            elif entry in self._loose:
-                self._loose.remove(entry)
+            elif entry in self._unordered:
+                self._unordered.remove(entry)
                 self._finish(sent)
 
-    def _run_queue(self) -> None:
+    def _send_queued(self) -> None:
         batch: list[tuple[T, bytes]] = []
-        while self._queue and not self.stopped and self._queue[0].when <= self._now:
-            first = self._queue[0]
-            if first.paused:
-                first.pause(self._now, self.turns)
-            if first.turns or first.due > self._now:
+        while self._queue and not self.stopped and self._queue[0].send_at <= self._now:
+            oldest = self._queue[0]
+            if oldest.pause_is_due:
+                oldest.pause(self._now, self.turns)
+            if oldest.turns_left or oldest.due_at > self._now:
                 break
-            first.missing = 0
-            sent = first.sent
-            batch.append(self._next(sent))
+            oldest.missing_count = 0
+            sent = oldest.sent
+            batch.append(self._take_next(sent))
             if sent.parts:
-                first.paused = True
-                batch = self._hand_over(batch)
+                oldest.pause_is_due = True
+                batch = self._carry_batch(batch)
                 continue
             self._queue.popleft()
             if sent.end is not None:
-                batch = self._hand_over(batch)
+                batch = self._carry_batch(batch)
                 if self.stopped:  # bytes before the end were not sent yet
-                    self._queue.appendleft(first)
+                    self._queue.appendleft(oldest)
                 else:
                     self._finish(sent)
-        self._hand_over(batch)
+        self._carry_batch(batch)
 
-    def _next(self, sent: T, *, whole: bool = False) -> tuple[T, bytes]:
+    def _take_next(self, sent: T, *, whole: bool = False) -> tuple[T, bytes]:
         data = sent.take()
         while whole and sent.parts:
             data += sent.take()
         self.size -= len(data)
         return sent, data
 
-    def _hand_over(self, batch: list[tuple[T, bytes]]) -> list[tuple[T, bytes]]:
+    def _carry_batch(self, batch: list[tuple[T, bytes]]) -> list[tuple[T, bytes]]:
         """Carry a batch and return an empty one."""
         if batch:
             self.carry(batch)
@@ -253,13 +258,13 @@ class DelayLine(Generic[T]):
         if sent.end is not None:
             self.end(sent.end)
 
-    def _arm(self) -> None:
+    def _set_timer(self) -> None:
         """Set the timer for the next transmission."""
-        waiting = [*list(self._queue)[:1], *self._loose]
-        when = min((entry.when for entry in waiting), default=None)
-        self._timer.set(None if self.stopped else when)
+        waiting = [*list(self._queue)[:1], *self._unordered]
+        send_at = min((entry.send_at for entry in waiting), default=None)
+        self._timer.set(None if self.stopped else send_at)
 
     def _tick(self) -> None:
-        if self._queue and self._queue[0].turns:
-            self._queue[0].turns -= 1
+        if self._queue and self._queue[0].turns_left:
+            self._queue[0].turns_left -= 1
         self.wake()

@@ -60,7 +60,7 @@ _ACTIONS: Mapping[type[DeviceFault], Callable[[FaultTargets, Any], object]] = {
 }
 
 
-_NEEDS: Mapping[type[DeviceFault], str] = {
+_NEEDED_ATTRIBUTES: Mapping[type[DeviceFault], str] = {
     f.BusyForEver: "hold_busy",
     f.Overtrigger: "drop_triggers",
     f.SecondClient: "disconnect",  # the camera calls it to free its session
@@ -86,11 +86,11 @@ def supported_faults(device: object) -> frozenset[str]:
         kind
         for kind, fault in f.FAULTS.items()
         if not issubclass(fault, DeviceFault)
-        or fault not in _NEEDS
-        or hasattr(device, _NEEDS[fault])
+        or fault not in _NEEDED_ATTRIBUTES
+        or hasattr(device, _NEEDED_ATTRIBUTES[fault])
     )
 
 
-def act(targets: FaultTargets, fault: DeviceFault) -> None:
+def apply_fault(targets: FaultTargets, fault: DeviceFault) -> None:
     """Apply a device fault."""
     _ACTIONS[type(fault)](targets, fault)

@@ -1,4 +1,4 @@
-"""Match faults with messages; keep waiting, triggered and past faults."""
+"""Match faults with messages; keep the faults that wait, and those that have happened."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ class Row:
     """A fault that waits."""
 
     fault: Fault
-    left: int | None  # number of times that it will still apply; None: always
-    seen: int = 0  # messages that fitted so far
+    times_left: int | None  # number of times that it will still apply; None: always
+    fitting_count: int = 0  # messages that fitted so far
 
-    def count(self) -> bool:
+    def count_message(self) -> bool:
         """Count a message that fits; True if the fault applies to it."""
-        self.seen += 1
-        if self.seen < self.fault.nth:
+        self.fitting_count += 1
+        if self.fitting_count < self.fault.nth:
             return False
-        if self.left is not None:
-            self.left -= 1
+        if self.times_left is not None:
+            self.times_left -= 1
         return True
 
 
@@ -59,17 +59,17 @@ class Row:
 class FaultQueue:
     """The faults that wait, in the order in which they were given.
 
-    The lists of rows are always the same objects, so that it is cheap to see that a list is empty.
+    The lists stay the same objects, so that links can check cheaply whether a list is empty.
     """
 
     _dialect: WireCodec
     _clock: Clock  # clock of the times in the record
     _applications: Container[int] = ()  # ids of the camera's applications
-    _kinds: frozenset[str] = frozenset(FAULTS)  # kinds of faults that the camera can do
+    _supported_kinds: frozenset[str] = frozenset(FAULTS)  # kinds of faults that the camera can do
 
     def __post_init__(self) -> None:
-        self.on_camera: list[Row] = []  # wire faults on messages of the camera
-        self.on_client: list[Row] = []  # wire faults on messages of a client
+        self.wire_on_camera: list[Row] = []  # wire faults on messages of the camera
+        self.wire_on_client: list[Row] = []  # wire faults on messages of a client
         self.device_on_camera: list[Row] = []  # device faults on messages of the camera
         self.device_on_client: list[Row] = []  # device faults on messages of a client
         # the last faults that have happened, oldest first
@@ -107,14 +107,14 @@ class FaultQueue:
         except MessageError:
             message = m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
         name = self._dialect.message_type(m.Sender.CLIENT, frame.message_id).__name__
-        return self._take(rows, name, frame.message_id, message)
+        return self._fire_matching(rows, name, frame.message_id, message)
 
     def by_message(self, rows: list[Row], message: m.Message) -> list[Fault]:
         """Return the faults among ``rows`` that a message triggers, as :meth:`by_frame`."""
         number = self._dialect.message_id(message)
-        unnamed = isinstance(message, m.UnknownMessage)  # a refusing code without a body
+        unnamed = isinstance(message, m.UnknownMessage)  # a refusal of only a code
         kind = type(message) if unnamed else self._dialect.message_type(message.sender, number)
-        return self._take(rows, kind.__name__, number, message)
+        return self._fire_matching(rows, kind.__name__, number, message)
 
     def at_once(self) -> list[Fault]:
         """Return the faults that wait for no message, in order."""
@@ -126,10 +126,14 @@ class FaultQueue:
         """Forget all waiting faults."""
         self._forget(list(self._all))
 
-    def _take(self, rows: list[Row], name: str, message_id: int, message: m.Message) -> list[Fault]:
-        hits = [row for row in rows if row.fault.fits(name, message_id) and row.count()]
-        self._forget([row for row in hits if row.left == 0])
-        return self._record([row.fault for row in hits], message)
+    def _fire_matching(
+        self, rows: list[Row], name: str, message_id: int, message: m.Message
+    ) -> list[Fault]:
+        fired_rows = [
+            row for row in rows if row.fault.fits(name, message_id) and row.count_message()
+        ]
+        self._forget([row for row in fired_rows if row.times_left == 0])
+        return self._record([row.fault for row in fired_rows], message)
 
     def _record(self, faults: list[Fault], message: m.Message | None) -> list[Fault]:
         for fault in faults:
@@ -147,18 +151,18 @@ class FaultQueue:
         if speaker is None:
             return self._at_once
         if isinstance(fault, WireFault):
-            return self.on_camera if speaker is m.Sender.CAMERA else self.on_client
+            return self.wire_on_camera if speaker is m.Sender.CAMERA else self.wire_on_client
         return self.device_on_camera if speaker is m.Sender.CAMERA else self.device_on_client
 
     def _check(self, number: int, fault: Fault) -> None:
         """Refuse a fault that this camera does not support."""
-        wrong = misfit(fault, self._dialect, self._applications, self._kinds)
-        if wrong is not None:
-            field, text = wrong
+        problem = find_unsupported(fault, self._dialect, self._applications, self._supported_kinds)
+        if problem is not None:
+            field, text = problem
             raise ConfigurationError(f"fault {number}: {fault.kind}.{field}: {text}")
 
 
-def misfit(
+def find_unsupported(
     fault: Fault,
     dialect: WireCodec,
     applications: Container[int],
@@ -166,8 +170,8 @@ def misfit(
 ) -> tuple[str, str] | None:
     """Return the unsupported field of a fault and the reason, None if all is supported."""
     if fault.kind not in kinds:
-        able = ", ".join(kind for kind in FAULTS if kind in kinds)
-        return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"
+        supported = ", ".join(kind for kind in FAULTS if kind in kinds)
+        return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {supported}"
     if isinstance(fault.on, str) and not dialect.has(MESSAGE_NAMES[fault.on]):
         return "on", f"dialect {dialect.label} has no {fault.on}"
     if isinstance(fault, Insert) and fault.inserted is not None:

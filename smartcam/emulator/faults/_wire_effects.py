@@ -1,4 +1,4 @@
-"""Make the transmissions of one message as faults change them; pure."""
+"""Make the transmissions of one message as faults change them, without side effects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WireFramer(Protocol):
         """Add received bytes."""
 
     def next_frame(self) -> Frame | None:
-        """Return the next frame, None if it is incomplete; FrameError: no frame begins there."""
+        """Return the next frame, None if it is incomplete; FrameError: the bytes are no frame."""
         ...
 
     def resync(self) -> int:
@@ -38,7 +38,7 @@ class WireFramer(Protocol):
 
 
 class WireCodec(Protocol):
-    """The messages of a wire, for links, faults and the log; a framed dialect is one."""
+    """The messages on a wire, for links, faults and the log; each framed dialect is a codec."""
 
     @property
     def label(self) -> str:
@@ -65,7 +65,7 @@ class WireCodec(Protocol):
         ...
 
     def message_type(self, sender: m.Sender, message_id: int) -> type[m.Message]:
-        """Return the message of an id."""
+        """Return the type of the message with an id."""
         ...
 
     def encode(self, message: m.Message) -> bytes:
@@ -81,7 +81,7 @@ class WireCodec(Protocol):
         ...
 
     def decode(self, sender: m.Sender, frame: Frame) -> m.Message:
-        """Return a frame's message; MessageError: it has none."""
+        """Return a frame's message; MessageError: the body does not fit."""
         ...
 
     def surplus(self, sender: m.Sender, frame: Frame) -> int:
@@ -93,26 +93,26 @@ class WireCodec(Protocol):
 class WireMessage(Transmission):
     """A message on its way, or an insertion."""
 
-    what: Frame | bytes  # the frame before faults, or bytes that make no frame
+    content: Frame | bytes  # the frame before faults, or bytes that make no frame
     original: bytes  # original bytes of the message
     changeable: bool = True  # whether later faults act on the message
-    passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
+    passed_bytes: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
     def of(cls, content: Frame | bytes, data: bytes) -> WireMessage:
         """Return a message that passes unchanged."""
-        return cls([data], what=content, original=data)
+        return cls([data], content=content, original=data)
 
     @property
     def wire(self) -> bytes | None:
         """The bytes that passed, None if no fault changed them."""
-        return None if self.passed == self.original else bytes(self.passed)
+        return None if self.passed_bytes == self.original else bytes(self.passed_bytes)
 
-    def place(self, offset: int) -> tuple[int, int]:
+    def find_byte(self, offset: int) -> tuple[int, int]:
         """Return the index of the part with the byte at ``offset``, and the place in that part."""
         ends = list(accumulate(map(len, self.parts)))
-        index = next(number for number, end in enumerate(ends) if offset < end)
-        return index, offset - (ends[index] - len(self.parts[index]))
+        part_index = next(index for index, end in enumerate(ends) if offset < end)
+        return part_index, offset - (ends[part_index] - len(self.parts[part_index]))
 
     def drop(self) -> None:
         """Drop all bytes of the message; later faults do not act on it."""
@@ -127,7 +127,7 @@ class WireMessage(Transmission):
             parts=list(self.parts),
             pauses=list(self.pauses),
             faults=list(self.faults),
-            passed=bytearray(),
+            passed_bytes=bytearray(),
         )
 
 
@@ -142,11 +142,11 @@ def _delay(fault: f.Delay, message: WireMessage) -> None:
 def _split(fault: f.Split, message: WireMessage) -> None:
     if fault.after >= message.size:
         return
-    index, inner = message.place(fault.after)
-    if inner:  # otherwise it is cut there already
-        part = message.parts[index]
-        message.parts[index : index + 1] = [part[:inner], part[inner:]]
-        message.pauses.insert(index, fault.pause)
+    part_index, byte_index = message.find_byte(fault.after)
+    if byte_index:  # otherwise it is cut there already
+        part = message.parts[part_index]
+        message.parts[part_index : part_index + 1] = [part[:byte_index], part[byte_index:]]
+        message.pauses.insert(part_index, fault.pause)
 
 
 def _coalesce(fault: f.Coalesce, message: WireMessage) -> None:
@@ -157,9 +157,9 @@ def _truncate(fault: f.Truncate, message: WireMessage) -> None:
     if fault.keep == 0:
         message.drop()
     elif fault.keep < message.size:
-        index, inner = message.place(fault.keep - 1)
-        message.parts[index:] = [message.parts[index][: inner + 1]]
-        del message.pauses[index:]
+        part_index, byte_index = message.find_byte(fault.keep - 1)
+        message.parts[part_index:] = [message.parts[part_index][: byte_index + 1]]
+        del message.pauses[part_index:]
     if fault.then != "continue":
         message.end = Ending(fault.then, fault.kind)
 
@@ -169,10 +169,10 @@ def _corrupt(fault: f.Corrupt, message: WireMessage) -> None:
     offset = fault.offset if fault.offset >= 0 else size + fault.offset
     if not 0 <= offset < size:
         return
-    index, inner = message.place(offset)
-    part = bytearray(message.parts[index])
-    part[inner] = part[inner] ^ (fault.xor or 0) if fault.value is None else fault.value
-    message.parts[index] = bytes(part)
+    part_index, byte_index = message.find_byte(offset)
+    part = bytearray(message.parts[part_index])
+    part[byte_index] = part[byte_index] ^ (fault.xor or 0) if fault.value is None else fault.value
+    message.parts[part_index] = bytes(part)
 
 
 _CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
@@ -183,7 +183,7 @@ _CHANGES: Mapping[type[object], Callable[[Any, WireMessage], None]] = {
     f.Corrupt: _corrupt,
     f.Drop: lambda _, message: message.drop(),
 }
-"""Faults that act on each transmission of a message by itself."""
+"""Faults that act on each transmission of a message separately."""
 
 
 # ---------------------------------------------------------------------- all together
@@ -202,20 +202,20 @@ def _duplicate(fault: f.Duplicate, sent: _Sent, dialect: WireCodec) -> _Sent:
 
 
 def _insert(fault: f.Insert, sent: _Sent, dialect: WireCodec) -> _Sent:
-    places = [number for number, message in enumerate(sent) if message.changeable]
-    if not places:
+    indices = [index for index, message in enumerate(sent) if message.changeable]
+    if not indices:
         return sent
     inserted = fault.inserted
     data = dialect.encode(inserted) if inserted is not None else fault.data or b""
-    new = cut_datagram(data, dialect)
-    new.faults.append(fault.kind)
-    new.changeable = fault.where == "instead"
-    if new.changeable:
-        for number in places:
-            sent[number].drop()
-            sent[number].faults.append(fault.kind)
-    place = places[0] if fault.where == "before" else places[-1] + 1
-    return [*sent[:place], new, *sent[place:]]
+    insertion = cut_datagram(data, dialect)
+    insertion.faults.append(fault.kind)
+    insertion.changeable = fault.where == "instead"
+    if insertion.changeable:
+        for index in indices:
+            sent[index].drop()
+            sent[index].faults.append(fault.kind)
+    find_byte = indices[0] if fault.where == "before" else indices[-1] + 1
+    return [*sent[:find_byte], insertion, *sent[find_byte:]]
 
 
 def _end(fault: f.HalfOpen | f.Reset | f.Close, sent: _Sent, dialect: WireCodec) -> _Sent:
@@ -257,7 +257,7 @@ def apply_faults(message: WireMessage, faults: Sequence[f.Fault], dialect: WireC
 def cut(data: bytes, framer: WireFramer, dialect: WireCodec) -> list[WireMessage]:
     """Return the messages that are complete with these bytes: frames, and bytes between them.
 
-    The framer keeps the unfinished rest.
+    The framer keeps the bytes of an unfinished frame.
     """
     framer.feed(data)
     messages: list[WireMessage] = []

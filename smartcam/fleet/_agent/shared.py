@@ -103,23 +103,23 @@ class Tap(NamedTuple):
 class TappedListeners(Listeners):
     """Passes everything to the agent, too."""
 
-    hears_all_changes = True
+    wants_all_changes = True
     tap: Tap | None = None
 
     @property
-    def streams_results(self) -> bool:
+    def only_streams_results(self) -> bool:
         return True
 
     @property
-    def hears_results(self) -> bool:
+    def wants_results(self) -> bool:
         return True
 
     @property
-    def hears_statuses(self) -> bool:
+    def wants_statuses(self) -> bool:
         return True
 
     @property
-    def watches_status(self) -> bool:
+    def needs_polling(self) -> bool:
         return True
 
     def publish(self, event: CameraEvent) -> None:
@@ -203,7 +203,7 @@ class SharedCamera(SmartCamera[Carried]):
         If the camera may still have input data queued, from a trigger without a result, the
         application is loaded again first, which empties the queue.
         """
-        if not self._observed and request.input_data is None:
+        if not self._has_observers and request.input_data is None:
             return await self._trigger(application, request, timeout)
         called_at = datetime.now(UTC)
         try:
@@ -228,20 +228,20 @@ class SharedCamera(SmartCamera[Carried]):
     async def ensure(self, application: int, timeout: float) -> None:
         """Load and run an application, like ``application=`` at the start."""
         async with self._lock.hold(timeout) as deadline:
-            await self._commands.ensure(application, deadline)
+            await self._commands.ensure_running(application, deadline)
 
     async def enter(self, application: int, timeout: float) -> Any:
         """Switch like the start of :meth:`application`; return the argument for :meth:`leave`."""
         async with self._lock.hold(timeout) as deadline:
-            return await self._lock.enter(application, deadline)
+            return await self._lock.enter_application(application, deadline)
 
     def leave(self, before: Any) -> None:
         """Switch back in the background."""
-        self._lock.leave(before)
+        self._lock.go_back(before)
 
     async def leave_and_wait(self, before: Any) -> None:
         """Switch back, and wait for the end."""
-        await self._lock.leave_and_wait(before)
+        await self._lock.go_back_and_wait(before)
 
     async def refresh(self, timeout: float) -> bool:
         """Make sure that the last status is current; return whether the camera was asked."""

@@ -194,7 +194,7 @@ class FleetCamera(Camera[ValueT]):
 
     # ------------------------------------------------------------------ life
 
-    def _abandoned(self) -> bool:
+    def _release_unreferenced(self) -> bool:
         # the bus refers to the camera until it is closed; its own bus is dropped with it
         attributes = vars(self)
         opened = attributes.get("_opened", False) and attributes.get("_closed") is None
@@ -233,8 +233,8 @@ class FleetCamera(Camera[ValueT]):
         self._receiver.open()
         self._caller.open()
         await self._settle(deadline, session=session)
-        if self._observed:
-            self._listens(self._listeners.results)
+        if self._has_observers:
+            self._on_listener_added(self._listeners.results)
 
     async def _settle(self, deadline: float, *, session: bool) -> None:
         """Wait until the agent has a session with the camera, or has tried in vain; bounded."""
@@ -352,7 +352,7 @@ class FleetCamera(Camera[ValueT]):
     def _deadline(self, timeout: float) -> float:
         return asyncio.get_running_loop().time() + check_seconds(timeout, "timeout", self.name)
 
-    def _listens(self, subscribers: object) -> None:
+    def _on_listener_added(self, subscribers: object) -> None:
         if subscribers is not self._listeners.results or self._closed is not None:
             return
         if not self._opened:
@@ -365,7 +365,7 @@ class FleetCamera(Camera[ValueT]):
             self._listeners.waits_since(future, since)
         self._receiver.want_results(since)
 
-    def _over(self) -> tuple[SmartCamError | None] | None:
+    def _end_of_streams(self) -> tuple[SmartCamError | None] | None:
         if self._closed is None:
             return None
         return (None if isinstance(self._closed, ConnectionClosedError) else self._closed,)
@@ -385,8 +385,8 @@ class FleetCamera(Camera[ValueT]):
         if not self._receiver.misses_states(met):
             self._on_state({"kind": "Hello", **hello})
         self._receiver.meet(met)
-        if self._listeners.hears_results:
-            self._listens(self._listeners.results)
+        if self._listeners.wants_results:
+            self._on_listener_added(self._listeners.results)
 
     def _read_as(self, hello: dict[str, Any]) -> None:
         """Use the agent's knowledge of the results' contents, unless this program gives its own."""
@@ -550,11 +550,11 @@ class FleetCamera(Camera[ValueT]):
         listeners, previous = self._listeners, self._status
         self._status = status
         if state["kind"] == "Status":
-            if listeners.hears_statuses:
+            if listeners.wants_statuses:
                 listeners.offer_status(status, asyncio.get_running_loop().time())
         elif status == previous:
             return
-        if status != previous and listeners.sees_events:
+        if status != previous and listeners.wants_events:
             listeners.publish(
                 StatusChanged(camera=self.name, at=_time(state), status=status, previous=previous)
             )

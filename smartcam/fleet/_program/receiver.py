@@ -352,7 +352,7 @@ class Receiver:
             return
         self._count(payload)
         listeners = self._listeners
-        if not (listeners.hears_results or listeners.observed):
+        if not (listeners.wants_results or listeners.has_result_observer):
             self._leave_results()
             return
         self._see(batch.epoch)
@@ -434,7 +434,7 @@ class Receiver:
             if expected is not None and run.application != expected:
                 self._counters.count("wrong_application", len(run.payloads))
                 return
-            if listeners.streams_results and self._take_burst(run, now):
+            if listeners.only_streams_results and self._take_burst(run, now):
                 return
             for single in singles(run):
                 fate = "late" if run.flags & LATE else "streamed"
@@ -455,7 +455,7 @@ class Receiver:
         current, listeners = bool(run.flags & CURRENT), self._listeners
         if isinstance(outcome, InterpretationError):
             size = len(run.payloads[0])
-            listeners.offer_error(outcome, now, size, current=current, owned=owned)
+            listeners.offer_error(outcome, now, size, current=current, reported_by_caller=owned)
         else:
             listeners.offer_result(outcome, now, current=current, late=bool(run.flags & LATE))
 

@@ -1,8 +1,8 @@
-"""construct views of a dialect, generated from its message table.
+"""Views of a dialect's frames for the package construct, generated from its message table.
 
-They describe complete frames field by field, with offsets: for people (``smartcam decode``, the
-documentation) and as a second reading of the same table in tests. The hot path does not use them.
-construct is untyped; it is imported here and nowhere else.
+They describe whole frames field by field, with offsets, for people (``smartcam decode``, the
+documentation) and as a second implementation of the table in tests. The hot path does not use them.
+The package has no types, so it is imported only here.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def frame_view(dialect: FramedDialect, sender: Sender) -> c.Construct:
 
 
 def view_fields(dialect: FramedDialect, sender: Sender, data: bytes) -> list[FieldView]:
-    """Return every field of one complete frame, in order; bytes after them as ``surplus``.
+    """Return every field of one whole frame, in order, and surplus bytes as ``surplus``.
 
     Raises MessageError: it is no complete frame of this dialect from this sender.
     """

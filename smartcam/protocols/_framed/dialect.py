@@ -122,13 +122,13 @@ class StatusBits:
 
 
 MAX_KNOWN = 256
-"""Largest number of messages kept of each kind. Statuses and answers are few, but a peer could send
-any number."""
+"""Largest number of different messages of a type that are kept. A camera sends few, but a peer
+could send any number."""
 
 
 MAX_SURPLUS_BYTES = 1 << 12
-"""Largest number of bytes that a body of fixed length may be longer than documented. Newer firmware
-may append a few words; a larger number means a wrong length."""
+"""Largest number of bytes by which a body of fixed length may be longer than documented. Newer
+firmware may append a few words; more bytes mean a wrong length."""
 
 
 class Codec:
@@ -143,8 +143,8 @@ class Codec:
     """
 
     __slots__ = (
-        *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
-        *("_messages", "_meaning", "_omitted", "_status"),
+        *("_body", "_code", "_data", "_fields", "_setters", "_header_size"),
+        *("_messages", "_meaning", "_defaults", "_status"),
         *("has_data", "message_id", "names", "size", "type"),
     )
 
@@ -163,29 +163,29 @@ class Codec:
         )
         self.size: int = self._body.size
         self.has_data: bool = self._data is not None
-        # if each answer begins with a code, a refusing answer may be only that; but two
-        # bytes in answer to Connect are the version in another dialect
+        # if each answer begins with a code, a refusal may consist of the code only; but for the
+        # answer to Connect two bytes are the version in another dialect
         answers = issubclass(row.type, Acknowledgement) and row.type is not ConnectAnswer
         coded = answers and dialect.coded and "code" in self._fields
         self._code = struct.Struct(row.byte_order + codes[Wire.WORD]) if coded else None
         self._meaning = dialect.code
         self._messages: dict[bytes, Message] = {}  # received bodies; messages are immutable
-        # fills the slots of a frozen message, in half the time of its own constructor
-        self._fill = [_filler(row.type, name) for name in self.names]
-        self._omitted = [
-            (_filler(row.type, slot.name), slot.default)
+        # they set the slots of a frozen message, in half the time of its constructor
+        self._setters = [_slot_setter(row.type, name) for name in self.names]
+        self._defaults = [
+            (_slot_setter(row.type, slot.name), slot.default)
             for slot in dataclasses.fields(row.type)
             if slot.name not in self.names
         ]
 
     @property
     def may_be_a_code(self) -> bool:
-        """True if a refusing result code may come alone."""
+        """True if a refusal may consist of the result code only."""
         return self._code is not None and self._code.size < self.size
 
     @property
     def lengths(self) -> range:
-        """The lengths of a body that are accepted."""
+        """The accepted lengths of a body."""
         least = self.size if self._code is None else min(self._code.size, self.size)
         return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS_BYTES + 1)
 
@@ -209,9 +209,9 @@ class Codec:
         return body + getattr(message, self._data) if self._data is not None else body
 
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
-        """Return the message whose body is at a place; bytes after it are ignored.
+        """Return the message whose body is between two offsets; surplus bytes are ignored.
 
-        An answer that is only a refusing code is accepted; its other fields are 0. Raises
+        A refusal that consists of the code only is accepted; its other fields are 0. Raises
         MessageError: the body is shorter than its message.
         """
         if end - begin < self.size:
@@ -224,11 +224,11 @@ class Codec:
                     data=payload,
                 )
             buffer, begin, end = payload.ljust(self.size, b"\0"), 0, self.size
-        behind = begin + self.size
+        data_begin = begin + self.size
         if self.has_data:
-            data = bytes(buffer[behind:end])
+            data = bytes(buffer[data_begin:end])
             return self._make((*self._body.unpack_from(buffer, begin), data))
-        body = bytes(buffer[begin:behind])
+        body = bytes(buffer[begin:data_begin])
         message = self._messages.get(body)
         if message is None:
             values = self._body.unpack(body)
@@ -240,67 +240,67 @@ class Codec:
         return message
 
     def spell(self, body: bytes) -> dict[str, Any]:
-        """Return the fields of a body with data, which is long enough, as JSON values.
+        """Return the fields of a body with data as JSON values; the body must be long enough.
 
-        Its other fields are plain numbers. No message is made, since results are many.
+        No message is made, since there are many results.
         """
         fields: dict[str, Any] = dict(zip(self.names, self._body.unpack_from(body), strict=False))
         fields[self.names[-1]] = body[self.size :].hex()
         return fields
 
-    def like(self, message: Message) -> Callable[[bytes], Message]:
+    def make_copier(self, message: Message) -> Callable[[bytes], Message]:
         """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
         names = [slot.name for slot in dataclasses.fields(kind) if slot.name != data_name]
-        others = [(_filler(kind, name), getattr(message, name)) for name in names]
-        fill_data = _filler(kind, data_name)
+        shared = [(_slot_setter(kind, name), getattr(message, name)) for name in names]
+        fill_data = _slot_setter(kind, data_name)
 
         def make(data: bytes) -> Message:
-            made = new(kind)
-            for fill, value in others:
-                fill(made, value)
-            fill_data(made, data)
-            return made
+            copy = new(kind)
+            for set_slot, value in shared:
+                set_slot(copy, value)
+            fill_data(copy, data)
+            return copy
 
-        if len(others) != 4:
+        if len(shared) != 4:
             return make
-        (fill_1, value_1), (fill_2, value_2), (fill_3, value_3), (fill_4, value_4) = others
+        (fill_1, value_1), (fill_2, value_2), (fill_3, value_3), (fill_4, value_4) = shared
 
         def make_result(data: bytes) -> Message:  # same result as make(), without a loop
-            made = new(kind)
-            fill_1(made, value_1)
-            fill_2(made, value_2)
-            fill_3(made, value_3)
-            fill_4(made, value_4)
-            fill_data(made, data)
-            return made
+            copy = new(kind)
+            fill_1(copy, value_1)
+            fill_2(copy, value_2)
+            fill_3(copy, value_3)
+            fill_4(copy, value_4)
+            fill_data(copy, data)
+            return copy
 
         return make_result
 
     def _make(self, values: tuple[Any, ...]) -> Message:
         message = object.__new__(self.type)
-        for at, fill in enumerate(self._fill):
-            fill(message, values[at])
-        for fill, value in self._omitted:
-            fill(message, value)
+        for index, set_slot in enumerate(self._setters):
+            set_slot(message, values[index])
+        for set_slot, value in self._defaults:
+            set_slot(message, value)
         return message
 
 
-def _filler(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
+def _slot_setter(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
     """Return the setter of a field's slot, from the class that declares the slot."""
     owner = next(base for base in message_type.__mro__ if name in vars(base))
-    fill: Callable[[Message, Any], None] = vars(owner)[name].__set__
-    return fill
+    set_slot: Callable[[Message, Any], None] = vars(owner)[name].__set__
+    return set_slot
 
 
 class WireQuirk(NamedTuple):
-    """A deviation from a dialect that the documents leave open.
+    """A deviation from a dialect, where the documents are not clear.
 
     Attributes:
         about: one line for people.
         source: document that describes the dialect, with its grade.
-        rows: the messages that look different.
-        codes: meanings of result codes that differ.
+        rows: rows of the messages that differ.
+        codes: meanings of the result codes, if they differ.
     """
 
     about: str
@@ -325,7 +325,7 @@ _ABILITIES: Mapping[str, type[Message]] = {
     "reset_errors": m.ResetErrors,
     "read_image": m.ReadImage,
 }
-"""The message that each ability rests on."""
+"""The message that each ability needs."""
 
 SWITCH_CODES: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
@@ -420,11 +420,11 @@ class FramedDialect(Dialect):
         variant = self._variants.get(key)
         if variant is None:
             changes = [self.wire_quirks[name] for name in key]
-            other = {row.type: row for quirk in changes for row in quirk.rows}
+            changed_rows = {row.type: row for quirk in changes for row in quirk.rows}
             codes = [quirk.codes for quirk in changes if quirk.codes is not None]
             variant = self._variants[key] = dataclasses.replace(
                 self,
-                table=tuple(other.get(row.type, row) for row in self.table),
+                table=tuple(changed_rows.get(row.type, row) for row in self.table),
                 codes=codes[0] if codes else self.codes,
                 quirks=key,
             )
@@ -497,7 +497,7 @@ class FramedDialect(Dialect):
         return self.encoder(message if isinstance(message, type) else type(message)).message_id
 
     def restate(self, report: StatusReport, reader: Dialect) -> StatusReport:
-        """Return a status, which another dialect has read, as this dialect reads it."""
+        """Return a status as this dialect reads it; ``reader`` is the dialect that has read it."""
         if not isinstance(reader, FramedDialect):
             return report
         word = reader.status_bits.write(report.status)
@@ -522,7 +522,7 @@ class FramedDialect(Dialect):
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for users who know more than the table.
+        """Return a request by its id, for users who know messages that the dialect has not.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.
@@ -535,14 +535,14 @@ class FramedDialect(Dialect):
             raise LocalProtocolError("the session is the client's own")
         answer = self.message_type(Sender.CAMERA, message_id)
         return RawRequest(
-            self._as_named(Frame(message_id, payload)),
+            self._named_message(Frame(message_id, payload)),
             message_id if answer is UnknownMessage else answer,
             answered=self.answer_id(message_id) is not None,
             known=known is not UnknownMessage,
         )
 
-    def _as_named(self, frame: Frame) -> Message:
-        """Return a frame's message; an unnamed message if a named one would change its bytes."""
+    def _named_message(self, frame: Frame) -> Message:
+        """Return a frame's message, unnamed if a named one would have other bytes."""
         with contextlib.suppress(RemoteProtocolError):
             message = self.decode(Sender.CLIENT, frame)
             if self.to_frame(message) == frame:

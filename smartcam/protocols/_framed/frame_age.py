@@ -1,15 +1,15 @@
 """Bound the time that a frame may take to be received.
 
-With a wrong length a frame swallows the bytes that follow, so that no other message is received. A
-peer that stops sending is found by the liveness check. So it is enough to check the age when bytes
+A frame with a wrong length includes the bytes of the next messages, so that none is received. If a
+peer stops sending, the liveness check detects it, so it is enough to check the age when bytes
 arrive.
 """
 
 from __future__ import annotations
 
 FRAME_TIME = 5.0
-"""Seconds that a frame on TCP may take, plus the transfer time of its length. A camera writes a
-frame at once; TCP replaces lost segments within one or two seconds."""
+"""Seconds that a frame on TCP may take, in addition to the transfer time of its bytes. A camera
+writes a frame at once; TCP replaces lost segments within one or two seconds."""
 
 FRAME_RATE = 1 << 16
 """Rate of the slowest line, bytes per second: half a megabit. The 64 kB that a camera sends at most
@@ -20,10 +20,10 @@ HINT_TIME = 1.0
 wrong. Before, a frame may contain any bytes."""
 
 
-class Unfinished:
+class UnfinishedFrame:
     """The age of the frame that is being received.
 
-    The longest pause is not counted, since this side may not have read.
+    The longest pause is not counted, since it may be this side that did not read.
 
     Attributes:
         searched: number of the frame's bytes that were searched for another header.

@@ -1,12 +1,12 @@
-"""Cut frames out of bytes, by the length field only.
+"""Cut received bytes into frames, by the length field only.
 
 A frame is a header (a magic number in some dialects, a length, a message id) and a payload. The
 form of the header is data: :class:`HeaderLayout`. A length above the limit, or above the limit of
-its message, is refused as soon as the header is there, so no more than one header and one payload
-of the permitted size is ever kept.
+its message, is refused as soon as the header is received, so no more than one header and one
+payload of the permitted size is ever kept.
 
-A chunk is not copied: frames are found in it by offset. The rest of a large frame has a buffer of
-its own, into which the transport may write.
+A chunk is not copied: frames are found in it by offset. A large unfinished frame has its own
+buffer, into which the transport may write.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ script manual, p. 35); 1 MiB leaves room for its successors and refuses a length
 
 
 MIN_OWN_BUFFER_BYTES = 1 << 12
-"""The rest of a frame with at least this many bytes is collected in a buffer of its own. A smaller
-unfinished frame is copied in front of the next chunk, which costs less."""
+"""Least number of bytes of an unfinished frame that gets its own buffer. A smaller one is copied
+before the next chunk, which costs less."""
 
 Buffer: TypeAlias = bytes | memoryview
 Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
@@ -38,21 +38,20 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 
 
 FIRST_READ_BYTES = 1 << 12
-"""Largest number of bytes that the first reads take. It doubles after each read that was full."""
+"""Largest number of bytes of the first reads. It doubles after each read that filled the buffer."""
 
 MAX_READ_BYTES = 1 << 15
-"""Largest number of bytes that one read takes in the end, or the size of the frame after a large
-one. This many bytes of results fit into a subscriber's queue if each has 16 bytes or more, so a
-subscriber that keeps up loses nothing."""
+"""Largest number of bytes of a read, except while a large frame is received. This many bytes of
+results fit into a subscriber's queue if each has 16 bytes or more, so a subscriber that keeps up
+loses nothing."""
 
 
 MIN_READ_BYTES = 1 << 10
-"""Least number of bytes that one read takes while frames are many and small."""
+"""Least number of bytes to which the size of reads is reduced while frames are many and small."""
 
 
 MAX_ALIKE_FRAMES = 16
-"""Largest number of frames that are cut at once if they begin with the same bytes, including the
-length."""
+"""Number of frames that are cut at once if they begin with the same bytes, including the length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +62,8 @@ class HeaderLayout:
         magic: the magic number's bytes on the wire, empty for a dialect without one.
         code: ``struct`` code of length and message id: ``I`` or ``H``.
         order: order of length and message id on the wire.
-        length_includes: bytes that the length field counts beside the payload: 4 if it counts
-            the message id.
+        length_includes: number of bytes that the length field counts in addition to the payload: 4
+            if it counts the message id.
     """
 
     magic: bytes = b""
@@ -102,8 +101,8 @@ class HeaderLayout:
         """Return a reader of headers: magic, the two numbers, and ``more`` bytes after them."""
         reader = self._readers.get(more)
         if reader is None:
-            behind = f"{more}s" if more else ""
-            form = struct.Struct(f"<{len(self.magic)}s{2 * self.code}{behind}")
+            extra_bytes = f"{more}s" if more else ""
+            form = struct.Struct(f"<{len(self.magic)}s{2 * self.code}{extra_bytes}")
             reader = self._readers[more] = form.unpack_from
         return reader
 
@@ -115,7 +114,7 @@ class Lengths:
         by_id: lengths of a message's payload, by its id.
 
     Attributes:
-        shortest: a length up to which no message is too long.
+        shortest: the smallest of the largest lengths; no message up to this length is too long.
     """
 
     def __init__(self, by_id: Mapping[int, range]) -> None:
@@ -126,7 +125,7 @@ class Lengths:
 
 
 class Framer:
-    """Cuts frames out of bytes.
+    """Cuts received bytes into frames.
 
     :meth:`feed` bytes, then call :meth:`cut` or :meth:`next_frame` until it returns None. After a
     :exc:`FrameError` the stream has no frame boundary any more: drop the link, or call
@@ -138,34 +137,33 @@ class Framer:
     """
 
     __slots__ = (
-        *("buffer", "start", "_always", "_filled", "_header", "_large", "_lengths"),
-        *("_max_length", "_most", "_read", "_store", "_window"),
+        *("buffer", "start", "_always_allowed", "_filled", "_header", "_large", "_lengths"),
+        *("_max_length", "_max_read", "_read", "_store", "_read_buffer"),
     )
 
     def __init__(self, header: HeaderLayout, max_length: int = DEFAULT_MAX_LENGTH) -> None:
         self._header = header
         self._max_length = max_length
         self._lengths: Mapping[int, range] = {}
-        self._always = max_length  # length that any message may have
+        self._always_allowed = max_length  # length that any message may have
         self._read = header.reader()
-        self.buffer: Buffer = (
-            b""  # a received chunk, or one large frame; cut() returns offsets in it
-        )
+        # a received chunk, or one large frame; cut() returns offsets in it
+        self.buffer: Buffer = b""
         self.start: int = 0  # offset of the next frame
         self._large: memoryview | None = None  # whole size of an unfinished large frame
         self._filled = 0
-        # buffer that a transport writes into; large frames stay there
+        # buffer into which a transport writes; a large frame stays there
         self._store = memoryview(b"")
-        self._window = self._store  # size of the next read
-        self._most = MAX_READ_BYTES  # largest size of a read
+        self._read_buffer = self._store  # part of it for the next read
+        self._max_read = MAX_READ_BYTES  # largest size of a read
 
-    def expect(self, lengths: Lengths) -> None:
+    def limit_lengths(self, lengths: Lengths) -> None:
         """Refuse a payload that is longer than its message allows, even if it is below the limit.
 
-        Other messages than those of ``lengths`` are not limited.
+        Messages that are not in ``lengths`` may have any length up to ``max_length``.
         """
         self._lengths = lengths.by_id
-        self._always = min(self._max_length, lengths.shortest)
+        self._always_allowed = min(self._max_length, lengths.shortest)
 
     @property
     def buffered(self) -> int:
@@ -190,21 +188,21 @@ class Framer:
         filled, missing = self._filled, len(large) - self._filled
         if len(data) <= missing:
             large[filled : filled + len(data)] = data
-            self._fill(len(data))
+            self._count_large_bytes(len(data))
             return
         self.buffer, self.start, self._large = b"".join((large[:filled], data)), 0, None
 
     def room(self) -> memoryview:
         """Return the buffer for a transport's next bytes; call :meth:`filled` next.
 
-        The buffer is the rest of a large frame, or one that grows whenever it is filled: so an
-        idle camera has a small buffer, and a fast camera needs few reads.
+        It is the remaining part of a large frame, or a buffer that grows whenever it is filled: so
+        an idle camera has a small buffer, and a fast camera needs few reads.
         """
         if self._large is not None:
             return self._large[self._filled :]
         if not self._store:
-            self._window = self._store = memoryview(bytearray(FIRST_READ_BYTES))
-        return self._window
+            self._read_buffer = self._store = memoryview(bytearray(FIRST_READ_BYTES))
+        return self._read_buffer
 
     def filled(self, count: int) -> bool:
         """Accept ``count`` bytes that were written into :meth:`room`, like :meth:`feed`.
@@ -212,37 +210,37 @@ class Framer:
         Returns False if a large frame is unfinished, so that there is nothing to cut yet.
         """
         if self._large is not None:
-            self._fill(count)
+            self._count_large_bytes(count)
             return self._large is None
-        data = self._window[:count]
-        if count < len(self._window):
-            self._most = MAX_READ_BYTES
-        elif count < self._most:
-            self._window = self._store = memoryview(bytearray(min(2 * count, MAX_READ_BYTES)))
+        data = self._read_buffer[:count]
+        if count < len(self._read_buffer):
+            self._max_read = MAX_READ_BYTES
+        elif count < self._max_read:
+            self._read_buffer = self._store = memoryview(bytearray(min(2 * count, MAX_READ_BYTES)))
         if self.start < len(self.buffer):
             self.feed(data)
         elif count >= MIN_OWN_BUFFER_BYTES and self._header_at(data, 0)[1] >= MIN_OWN_BUFFER_BYTES:
             # not copied: the frame is cut before the next bytes come
             self.buffer, self.start = data, 0
-            self._window = self._store
+            self._read_buffer = self._store
         else:
             self.buffer, self.start = bytes(data), 0
-            if len(self._window) > MAX_READ_BYTES:
-                self._window = self._store[:MAX_READ_BYTES]
+            if len(self._read_buffer) > MAX_READ_BYTES:
+                self._read_buffer = self._store[:MAX_READ_BYTES]
         return True
 
-    def read_less(self) -> None:
-        """Halve the size of reads: the last one had too many frames for one turn.
+    def halve_reads(self) -> None:
+        """Halve the size of reads, since the last one had too many frames for one turn.
 
-        This applies only while reads are filled, so it does not slow a quiet camera.
+        The size grows again when a read does not fill the buffer.
         """
-        self._most = max(MIN_READ_BYTES, min(len(self._window), MAX_READ_BYTES) // 2)
-        self._window = self._store[: self._most]
+        self._max_read = max(MIN_READ_BYTES, min(len(self._read_buffer), MAX_READ_BYTES) // 2)
+        self._read_buffer = self._store[: self._max_read]
 
     def cut(self) -> tuple[int, int, int] | None:
-        """Return the id and the payload's place of the next whole frame, or None for "more bytes".
+        """Return the next whole frame's id and its payload's begin and end; None without one.
 
-        :meth:`take` returns the bytes at this place, before the next :meth:`feed`. Raises
+        :meth:`take` returns the bytes between these offsets, before the next :meth:`feed`. Raises
         FrameError: wrong magic, or a length that is impossible or above the limit; no bytes are
         consumed.
         """
@@ -253,7 +251,7 @@ class Framer:
         if available < header.size:
             if available:
                 self._check_magic(start, available)
-            self._keep(start)
+            self._copy_view(start)
             return None
         magic, message_id, length = self._read(buffer, start)
         if magic != header.magic:
@@ -261,29 +259,29 @@ class Framer:
         if not header.id_first:
             message_id, length = length, message_id
         size = length - header.length_includes
-        if not 0 <= size <= self._always:
+        if not 0 <= size <= self._always_allowed:
             self._check_length(message_id, size)
         begin = start + header.size
         end = begin + size
         if end > len(buffer):
             if header.size + size >= MIN_OWN_BUFFER_BYTES:
-                self._collect(header.size + size)
+                self._start_large_frame(header.size + size)
             else:
-                self._keep(start)
+                self._copy_view(start)
             return None
         self.start = end
         return message_id, begin, end
 
     def take(self, begin: int, end: int) -> bytes:
-        """Return the bytes at a place from :meth:`cut`."""
+        """Return the bytes between two offsets from :meth:`cut`."""
         return bytes(self.buffer[begin:end])
 
-    def following(self, read: Read, like: int, size: int) -> list[bytes]:
-        """Return the payloads of the next whole frames that are of the same kind.
+    def following(self, read: Read, model_start: int, size: int) -> list[bytes]:
+        """Return the ends of the payloads of the next whole frames, as long as they are alike.
 
-        They must have the id and the first ``size`` bytes of payload of the frame that begins at
-        ``like``; their other bytes are returned. The first frame that differs, or is wrong, ends
-        the list. ``read``: reader of a header and ``size`` more bytes.
+        They must have the same id and the same first ``size`` bytes of payload as the frame that
+        begins at ``model_start``; the bytes after these are returned. The first frame that differs,
+        or is wrong, ends the list. ``read``: reader of a header and ``size`` more bytes.
         """
         header, buffer, start = self._header, self.buffer, self.start
         payloads: list[bytes] = []
@@ -291,25 +289,32 @@ class Framer:
         least, last = before + size, available - before - size
         if start > last or isinstance(buffer, memoryview):
             return payloads
-        magic, wanted, other, first = read(buffer, like)
+        magic, wanted_id, wanted_length, first = read(buffer, model_start)
         if not id_first:
-            wanted, other = other, wanted
+            wanted_id, wanted_length = wanted_length, wanted_id
         before -= header.length_includes
         longest = self._max_length + header.length_includes
-        length = before + other
-        if start + MAX_ALIKE_FRAMES * length <= available and length >= least and other <= longest:
-            head, end = buffer[like : like + least], start + (MAX_ALIKE_FRAMES - 1) * length
+        length = before + wanted_length
+        if (
+            start + MAX_ALIKE_FRAMES * length <= available
+            and length >= least
+            and wanted_length <= longest
+        ):
+            head, end = (
+                buffer[model_start : model_start + least],
+                start + (MAX_ALIKE_FRAMES - 1) * length,
+            )
             if buffer[start : start + least] == head == buffer[end : end + least]:
                 start = _cut_alike(buffer, start, head, length, payloads)
         while start <= last:
-            mark, message_id, length, begins = read(buffer, start)
+            next_magic, message_id, length, next_first = read(buffer, start)
             if not id_first:
                 message_id, length = length, message_id
             end = start + before + length
             if (
-                message_id != wanted
-                or begins != first
-                or mark != magic
+                message_id != wanted_id
+                or next_first != first
+                or next_magic != magic
                 or length > longest
                 or end > available
                 or end < start + least
@@ -321,7 +326,7 @@ class Framer:
         return payloads
 
     def unfinished(self) -> tuple[int, int] | None:
-        """Return message id and size, header included, of a frame that is only partly received.
+        """Return message id and size, header included, of the frame that is partly received.
 
         None if its header is incomplete. Call it when :meth:`cut` has returned None.
         """
@@ -332,26 +337,25 @@ class Framer:
         return message_id, self._header.size + size
 
     def header_within(self, begin: int) -> int | None:
-        """Return the place of another header in the received part of a frame; None without one.
+        """Return the offset of another header in the unfinished frame; None if there is none.
 
-        The header has the magic number, an expected message id and a length allowed for it.
-        Dialects without a magic number have none. ``begin``: place in the frame where the search
-        begins.
+        A header has the magic number, an expected message id and a length allowed for it. Without a
+        magic number none is found. ``begin``: offset in the frame at which the search begins.
         """
         header = self._header
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         begin = max(begin, header.size)
         data = bytes(buffer[start + begin : start + self.buffered])
-        at = data.find(header.magic) if header.magic else -1
-        while 0 <= at <= len(data) - header.size:
-            message_id, size = self._header_at(data, at)
+        offset = data.find(header.magic) if header.magic else -1
+        while 0 <= offset <= len(data) - header.size:
+            message_id, size = self._header_at(data, offset)
             if size in self._lengths.get(message_id, ()) and size <= self._max_length:
-                return begin + at
-            at = data.find(header.magic, at + 1)
+                return begin + offset
+            offset = data.find(header.magic, offset + 1)
         return None
 
     def next_frame(self) -> Frame | None:
-        """Return the next whole frame, or None for "more bytes"; raises as :meth:`cut`."""
+        """Return the next whole frame, None if there is none yet; raise as :meth:`cut`."""
         frame = self.cut()
         if frame is None:
             return None
@@ -359,58 +363,58 @@ class Framer:
         return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:
-        """Skip to the next magic number after the present place; return the skipped bytes.
+        """Skip to the magic number after the present one; return the number of skipped bytes.
 
-        Without one in the buffer, only bytes that may begin one are kept. A dialect without a
-        magic number drops everything.
+        If there is none in the buffer, only bytes that may be its beginning are kept. A dialect
+        without a magic number drops everything.
         """
         magic = self._header.magic
         if self._large is not None:
             self.buffer, self.start, self._large = self.pending, 0, None
-        self._keep(self.start)  # a view would be copied at each place
+        self._copy_view(self.start)  # else each search would copy the view
         begin = self.start
         begin_of_next = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if begin_of_next < 0:
-            keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
-            while keep and not magic.startswith(bytes(self.buffer[-keep:])):
-                keep -= 1
-            begin_of_next = len(self.buffer) - keep
+            kept = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
+            while kept and not magic.startswith(bytes(self.buffer[-kept:])):
+                kept -= 1
+            begin_of_next = len(self.buffer) - kept
         self.start = begin_of_next
         return begin_of_next - begin
 
     def clear(self) -> None:
-        """Drop everything kept."""
+        """Drop all bytes that are kept."""
         self.buffer, self.start, self._large = b"", 0, None
 
-    def _fill(self, count: int) -> None:
+    def _count_large_bytes(self, count: int) -> None:
         """Count received bytes of a large frame, and finish it if it is complete."""
         self._filled += count
         large = self._large
         if large is not None and self._filled == len(large):
             self.buffer, self.start, self._large = large, 0, None
 
-    def _header_at(self, buffer: Buffer, at: int) -> tuple[int, int]:
-        """Return message id and payload size from the header at a place."""
-        _, message_id, length = self._read(buffer, at)
+    def _header_at(self, buffer: Buffer, offset: int) -> tuple[int, int]:
+        """Return message id and payload size from the header at an offset."""
+        _, message_id, length = self._read(buffer, offset)
         if not self._header.id_first:
             message_id, length = length, message_id
         return message_id, length - self._header.length_includes
 
-    def _keep(self, start: int) -> None:
-        """Keep a copy of the rest of a chunk that was a view."""
+    def _copy_view(self, start: int) -> None:
+        """Copy the remaining part of a chunk if the chunk is a view."""
         if isinstance(self.buffer, memoryview):
             self.buffer, self.start = bytes(self.buffer[start:]), 0
 
-    def _collect(self, size: int) -> None:
-        """Collect the rest of a large frame of ``size`` bytes in the transport's buffer."""
-        begun = self.buffer[self.start :]
-        in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
+    def _start_large_frame(self, size: int) -> None:
+        """Collect a large frame of ``size`` bytes in the transport's buffer from now on."""
+        first_bytes = self.buffer[self.start :]
+        in_place = isinstance(first_bytes, memoryview) and first_bytes.obj is self._store.obj
         if len(self._store) < size:
-            self._window = self._store = memoryview(bytearray(size))
+            self._read_buffer = self._store = memoryview(bytearray(size))
             in_place = False
         if not in_place or self.start:
-            self._store[: len(begun)] = begun
-        self._large, self._filled = self._store[:size], len(begun)
+            self._store[: len(first_bytes)] = first_bytes
+        self._large, self._filled = self._store[:size], len(first_bytes)
         self.buffer, self.start = b"", 0
 
     def _check_length(self, message_id: int, size: int) -> None:
@@ -430,10 +434,10 @@ class Framer:
         magic = self._header.magic
         if not magic:
             return
-        seen = bytes(self.buffer[start : start + min(available, len(magic))])
-        if not magic.startswith(seen):
+        begin = bytes(self.buffer[start : start + min(available, len(magic))])
+        if not magic.startswith(begin):
             raise FrameError(
-                f"wrong magic number: {hex_excerpt(seen)} came, {magic.hex(' ')} was expected",
+                f"wrong magic number: {hex_excerpt(begin)} came, {magic.hex(' ')} was expected",
                 data=bytes(self.buffer[start : start + 64]),
             )
 
@@ -441,11 +445,11 @@ class Framer:
 def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, pieces: list[bytes]) -> int:
     """Cut frames of ``length`` bytes that begin with ``head``, which includes that length.
 
-    Sixteen are cut at a time, or none of them: the first that differs may have another length, so
-    bytes after it would be no frame. The bytes after the heads are added to ``pieces``.
+    Sixteen frames are cut together, or none of them if one differs, since it may have another
+    length. The bytes after the heads are added to ``pieces``.
 
     Returns:
-        The place of the next frame.
+        The offset of the next frame.
     """
     cut = _cutter(MAX_ALIKE_FRAMES, len(head), length - len(head))
     last = len(buffer) - MAX_ALIKE_FRAMES * length

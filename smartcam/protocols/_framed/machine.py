@@ -1,7 +1,7 @@
 """The state machine of one link, in either role.
 
-Bytes go in, events come out; it imports no socket, loop or clock. Two rules: a transition outside
-:data:`TRANSITIONS` is illegal, and ``receive_*`` never raises for bad input. The role's
+It turns bytes into events; it imports no socket, loop or clock. Two rules hold: a transition
+outside :data:`TRANSITIONS` is illegal, and ``receive_*`` never raises for bad input. The role's
 :class:`~smartcam.protocols._base.Policy` says whether bad input ends the link with a
 :class:`LinkFailed` event, or is dropped and counted.
 """
@@ -40,35 +40,36 @@ if TYPE_CHECKING:
     from smartcam.protocols.messages import Message
 
 MAX_EVENTS_PER_READ = 64
-"""Number of events of one read above which the next read takes fewer bytes: cutting frames, and
-making messages of them, must not delay other cameras."""
+"""Number of events of one read above which the next read takes fewer bytes, so that the work on one
+read does not delay other cameras."""
 
 MAX_FRAMES_PER_READ = 512
-"""Number of frames of one read with the same effect, even if all are one burst of results: more
-than the receive task handles in a turn, so that reading would have to pause after each read."""
+"""Number of frames of one read above which the next read takes fewer bytes, even if all are one
+burst of results. The receive task handles fewer in a turn, so reading would pause after each read.
+"""
 
 
-MAX_FAMILIAR = 64
-"""Largest number of messages of a kind that are recognized by their frames. A camera has a handful
-of statuses and answers, but a peer could send any number."""
+MAX_KNOWN_MESSAGES = 64
+"""Largest number of messages of a type that are recognized by their frames. A camera has few
+different statuses and answers, but a peer could send any number."""
 
 MAX_KNOWN_CHUNKS = 16
-"""Largest number of whole chunks that a camera's machine recognizes; a client has a handful of
+"""Largest number of whole chunks that a camera's machine recognizes; a client has few different
 short requests."""
 
 MAX_KNOWN_CHUNK_BYTES = 64
-"""Largest number of bytes of such a chunk: a Query, a sequence number and a Trigger have 40."""
+"""Largest number of bytes of a recognized chunk: Query, sequence number and Trigger have 40."""
 
 MAX_KNOWN_DELIVERIES = 64
-"""Largest number of deliveries that a client's machine stores in one state, to recognize similar
-ones."""
+"""Largest number of deliveries that a client's machine stores in one state. A delivery is the bytes
+that one read returns; a stored one is recognized when it comes again with another result."""
 
 MAX_KNOWN_DELIVERY_BYTES = 1 << 12
-"""Largest number of bytes of such a delivery: the answers to a trigger, with a result of ordinary
+"""Largest number of bytes of a stored delivery: the answers to a trigger, with a result of ordinary
 size."""
 
 MAX_KNOWN_DELIVERY_FRAMES = 8
-"""Largest number of frames of such a delivery: a trigger's five, and more statuses around them."""
+"""Largest number of frames of a stored delivery: a trigger's five, and a few more statuses."""
 
 
 _SESSION_REQUESTS = (
@@ -98,7 +99,7 @@ _SESSION_REPORTS = (
 )
 
 
-# Messages that the camera sends unasked. A Disconnect may be answered or not; nothing waits for it.
+# Messages that the camera may send unasked; whether it answers a Disconnect does not matter.
 _BY_ITSELF = frozenset((m.StatusReport, m.ResultContainer, m.DisconnectAnswer))
 
 
@@ -106,13 +107,13 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
     client, camera = m.Sender.CLIENT, m.Sender.CAMERA
     idle, connecting, connected = State.IDLE, State.CONNECTING, State.CONNECTED
     table: dict[tuple[State, m.Sender, type[Message]], State] = {
-        # without a session it is harmless, and it ends a session that a dead client left
+        # harmless without a session; it also ends a session of a client that has crashed
         (idle, client, m.Disconnect): idle,
         (idle, client, m.Connect): connecting,
         (connecting, client, m.Disconnect): State.DISCONNECTED,
         (connecting, client, m.Connect): connecting,
         (connecting, camera, m.ConnectAnswer): connected,
-        # requests before it in the same bytes are still answered
+        # the answers to requests before it may still come
         (connected, client, m.Connect): connected,
         (connected, client, m.Disconnect): State.DISCONNECTED,
         (State.DISCONNECTED, client, m.Disconnect): State.DISCONNECTED,
@@ -126,7 +127,7 @@ def _transitions() -> dict[tuple[State, m.Sender, type[Message]], State]:
         table[state, camera, m.DisconnectAnswer] = state
     for request in (*_SESSION_REQUESTS, m.UnknownMessage, m.MalformedMessage):
         table[connected, client, request] = connected
-        # sent right after a Connect, before its answer: it is answered after that
+        # sent before the answer to Connect has come; the camera answers it after that
         table[connecting, client, request] = connecting
     for report in (*_SESSION_REPORTS, m.UnknownMessage):
         table[connected, camera, report] = connected
@@ -141,9 +142,9 @@ TRANSITIONS: Mapping[tuple[State, m.Sender, type[Message]], State] = _transition
 _NEXT_STATES: dict[m.Sender, dict[State, dict[type[Message], State]]] = {
     sender: {
         state: {
-            kind: following
-            for (before, who, kind), following in TRANSITIONS.items()
-            if (before, who) == (state, sender)
+            kind: next_state
+            for (before, message_sender, kind), next_state in TRANSITIONS.items()
+            if (before, message_sender) == (state, sender)
         }
         for state in State
     }
@@ -152,24 +153,24 @@ _NEXT_STATES: dict[m.Sender, dict[State, dict[type[Message], State]]] = {
 """:data:`TRANSITIONS` by sender and state, which is faster to look up for each message."""
 
 
-_Made: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
+_MadeFrame: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
 """Bytes of a frame, its id and the id of its answer; the frame."""
 
 
 class _Delivery(NamedTuple):
-    """A delivery of whole frames that were all seen before, with one result at most.
+    """A delivery of whole frames that were all received before, with at most one result.
 
     Attributes:
         head: bytes before the result's data; all bytes if there is no result.
-        begin: place where the data begins.
+        begin: offset where the data begins.
         tail: bytes after the data.
-        end: place where the data ends.
-        pending: ids of the answers that were pending before it.
-        pending_after: ids of the answers that were pending after it.
+        end: offset where the data ends.
+        pending: ids of the answers that were pending before the delivery.
+        pending_after: ids of the answers that were pending after the delivery.
         before: messages before the result; all messages if there is no result.
-        make: function that makes the result of its data.
-        behind: messages after the result.
-        frames: number of its frames.
+        make: function that makes the result from its data; None if there is no result.
+        after: messages after the result.
+        frames: number of frames.
     """
 
     head: bytes
@@ -180,19 +181,19 @@ class _Delivery(NamedTuple):
     pending_after: tuple[int, ...]
     before: list[Message]
     make: Callable[[bytes], Message] | None
-    behind: list[Message]
+    after: list[Message]
     frames: int
 
 
-class _Volley(NamedTuple):
+class _SentTogether(NamedTuple):
     """Messages that were sent together.
 
     Attributes:
-        messages: messages; the same tuple is recognized.
-        data: frames of these messages; on TCP joined.
-        frames: number of the frames.
+        messages: the messages; they are recognized by this tuple object.
+        data: frames of the messages; on TCP joined.
+        frames: number of frames.
         size: number of bytes of all frames.
-        pending: ids of the answers that were pending before.
+        pending: ids of the answers that were pending before they were sent.
         pending_after: ids of the answers that were pending afterwards.
     """
 
@@ -218,9 +219,9 @@ class Machine:
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: function that is called with the sender and each whole frame, in both directions, and
             with the error for bytes that make no frame.
-        kin: dialects that begin a session alike, of which the camera speaks one, ``dialect`` first.
-            Dialects that the answer to Connect does not fit are left out when it comes; if several
-            are left, :meth:`adopt` decides.
+        kin: dialects that begin a session alike, of which the camera speaks one; ``dialect`` is the
+            first. The answer to Connect removes the dialects that it does not fit; if several
+            remain, :meth:`adopt` decides.
 
     Attributes:
         room: function that returns the buffer for a stream's next bytes; call :meth:`filled` next.
@@ -230,14 +231,16 @@ class Machine:
 
     # an object with more than thirty attributes and no slots is slower at each of them
     __slots__ = (
-        *("_asks", "_begun", "_begun_at", "_bounded", "_burst_reader", "_burst_size", "_chunks"),
-        *("_constant", "_deaf", "_decoders", "_deliveries", "_events", "_familiar", "_framer"),
-        *("_header_size", "_may_come", "_may_go", "_narrows", "_next_to_come", "_next_to_go"),
-        *("_open", "_outbox", "_plain"),
-        *("_policy", "_result_head", "_result_id", "_results", "_says", "_sender"),
-        *("_sent_data_key", "_sent_frames", "_state", "_status_id", "_status_size", "_statuses"),
-        *("_takes_bursts", "_trace", "_unfinished", "_unknown_deliveries", "_volley", "counters"),
-        *("dialect", "error", "kin", "replies", "role", "room", "transport"),
+        *("_bounded", "_burst_reader", "_burst_size", "_constant_frames", "_decoders"),
+        *("_deliveries_left", "_events", "_framer", "_header_size", "_ignores_bytes"),
+        *("_is_client", "_is_connecting", "_known_chunks", "_known_deliveries"),
+        *("_known_messages", "_known_results", "_known_statuses", "_makes_bursts", "_outbox"),
+        *("_own_sender", "_peer_sender", "_pending_ids", "_policy", "_receivable"),
+        *("_receive_transitions", "_recognizes", "_result_head", "_result_id"),
+        *("_send_transitions", "_sendable", "_sent_data_key", "_sent_frames", "_sent_together"),
+        *("_state", "_status_id", "_status_size", "_trace", "_unfinished_age"),
+        *("_unfinished_number", "_unfinished_since"),
+        *("counters", "dialect", "error", "kin", "replies", "role", "room", "transport"),
     )
 
     transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
@@ -265,64 +268,67 @@ class Machine:
         self._header_size = dialect.header.size
         self._framer = Framer(dialect.header, max_length)
         self.room: Callable[[], memoryview] = self._framer.room
-        self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, and its time
-        self._unfinished = frame_age.Unfinished()
+        self._unfinished_number = -1  # number of the unfinished frame
+        self._unfinished_since = 0.0  # time at which its first bytes came
+        self._unfinished_age = frame_age.UnfinishedFrame()
         self._trace = trace
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
-        # ids of the pending answers (client role), in order; of requests sent ``again``, twice
-        self._open: tuple[int, ...] = ()
-        self._sender, self._says = role.receives, role.sends
-        self._next_to_come, self._next_to_go = _NEXT_STATES[self._sender], _NEXT_STATES[self._says]
-        self._asks = role is Role.CLIENT
-        self._plain = self._asks and trace is None
+        # ids of pending answers (client role), in order; twice if a request was sent ``again``
+        self._pending_ids: tuple[int, ...] = ()
+        self._peer_sender, self._own_sender = role.receives, role.sends
+        self._receive_transitions = _NEXT_STATES[self._peer_sender]
+        self._send_transitions = _NEXT_STATES[self._own_sender]
+        self._is_client = role is Role.CLIENT
+        self._recognizes = self._is_client and trace is None
         self._decoders: dict[int, Codec] = {}
-        # by ids: whole frames seen before, and their messages; in this state only
-        self._familiar: dict[int, dict[bytes, Message]] = {}
-        self._statuses: dict[bytes, Message] = {}  # messages of statuses, by their frames
-        # by the bytes before the data: bytes of the frame, function that makes the message
-        self._results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
-        # of a client: deliveries by their sizes; how many more are stored
-        self._deliveries: dict[int, _Delivery] = {}
-        self._unknown_deliveries = MAX_KNOWN_DELIVERIES
-        self._volley: _Volley | None = None  # last messages that a client sent together
-        # of a camera, by chunks seen before in this state: their messages and frames
-        self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
+        # by id: the messages received in this state, by their whole frames
+        self._known_messages: dict[int, dict[bytes, Message]] = {}
+        self._known_statuses: dict[bytes, Message] = {}  # messages of statuses, by their frames
+        # by the bytes before the data: size of the frame, function that makes the result
+        self._known_results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
+        # of a client: stored deliveries by their sizes; how many more may be stored
+        self._known_deliveries: dict[int, _Delivery] = {}
+        self._deliveries_left = MAX_KNOWN_DELIVERIES
+        # last messages that a client sent together
+        self._sent_together: _SentTogether | None = None
+        # of a camera: messages and frames of chunks received in this state
+        self._known_chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
         # of a camera, by the id of a message object sent before: the message and its frame
-        self._sent_frames: dict[int, tuple[Message, _Made]] = {}
+        self._sent_frames: dict[int, tuple[Message, _MadeFrame]] = {}
         self._sent_data_key = 0  # the key of the last message with data
         self._status_id = self._status_size = 0
         self.state = State.IDLE
-        self._take_up(dialect)
+        self._use_dialect(dialect)
 
     def adopt(self, dialect: Dialect) -> None:
-        """Speak this dialect of :attr:`kin`; statuses returned before are not read again.
+        """Speak this dialect of :attr:`kin`; statuses that were returned before stay unchanged.
 
         Raises:
             LocalProtocolError: the dialect is not in :attr:`kin`.
         """
-        same = [kin for kin in self.kin if kin is dialect]
-        if not same:
+        chosen = [kin for kin in self.kin if kin is dialect]
+        if not chosen:
             raise LocalProtocolError(f"{dialect.name} is none of {[d.name for d in self.kin]}")
-        self.kin = same
-        self._take_up(same[0])
+        self.kin = chosen
+        self._use_dialect(chosen[0])
 
-    def _take_up(self, dialect: FramedDialect) -> None:
+    def _use_dialect(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
-        self._decoders = dialect.decoders(self._sender)
-        self._constant = dialect.constant
+        self._decoders = dialect.decoders(self._peer_sender)
+        self._constant_frames = dialect.constant
         if self._bounded:
-            self._framer.expect(dialect.lengths(self._sender))
+            self._framer.limit_lengths(dialect.lengths(self._peer_sender))
         result = dialect.encoder(m.ResultContainer)
         self._burst_size = result.size
         self._result_id, self._result_head = result.message_id, dialect.header.size + result.size
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
-        self._takes_bursts = self._asks and result.size > 0
+        self._makes_bursts = self._is_client and result.size > 0
         self._sent_frames = {}
-        self._forget_familiar()
-        self._familiar = {self._status_id: self._statuses}
+        self._forget_known()
+        self._known_messages = {self._status_id: self._known_statuses}
 
     @property
     def state(self) -> State:
@@ -332,10 +338,13 @@ class Machine:
     @state.setter
     def state(self, state: State) -> None:
         self._state = state
-        self._deaf = state is State.FAILED or state is State.CLOSED
-        self._narrows = state is State.CONNECTING
-        self._may_come, self._may_go = self._next_to_come[state], self._next_to_go[state]
-        self._forget_familiar()
+        self._ignores_bytes = state is State.FAILED or state is State.CLOSED
+        self._is_connecting = state is State.CONNECTING
+        self._receivable, self._sendable = (
+            self._receive_transitions[state],
+            self._send_transitions[state],
+        )
+        self._forget_known()
 
     # ------------------------------------------------------------------ bytes in
 
@@ -354,18 +363,18 @@ class Machine:
 
         Never raises for bad bytes. In state FAILED or CLOSED they are dropped.
         """
-        if self._deaf:
+        if self._ignores_bytes:
             return
         self.counters.bytes_received += len(data)
         if (
-            self._asks
+            self._is_client
             or type(data) is not bytes
             or len(data) > MAX_KNOWN_CHUNK_BYTES
             or self._framer.buffered
         ):
             self._receive(data)
             return
-        known = self._chunks.get(data)
+        known = self._known_chunks.get(data)
         if known is None:
             self._receive_chunk(data)
             return
@@ -374,7 +383,7 @@ class Machine:
         self.counters.frames_received += len(frames)
         if self._trace is not None:
             for frame in frames:
-                self._trace(self._sender, frame)
+                self._trace(self._peer_sender, frame)
 
     def _receive(self, data: bytes | bytearray | memoryview) -> None:
         self._framer.feed(data)
@@ -384,25 +393,25 @@ class Machine:
             self._receive_frames()
 
     def _receive_chunk(self, data: bytes) -> None:
-        """Read a short chunk while no frame is unfinished; store it if it is plain.
+        """Read a short chunk while no frame is unfinished; store it if it can be recognized.
 
-        A plain chunk has whole frames that leave the state as it is, and its messages have exactly
-        its bytes: so it can be recognized next time without being read.
+        It can if it has only whole frames that leave the state unchanged, and if its messages,
+        encoded again, are exactly its bytes.
         """
         state, before = self._state, len(self._events)
         self._receive(data)
         if state is not self._state or self._framer.buffered:
             return
         messages = [event for event in self._events[before:] if isinstance(event, m.Message)]
-        if len(self._chunks) < MAX_KNOWN_CHUNKS and messages:
+        if len(self._known_chunks) < MAX_KNOWN_CHUNKS and messages:
             frames = [self.dialect.to_frame(message) for message in messages]
             if b"".join(map(self.dialect.encode_frame, frames)) == data:
-                self._chunks[data] = messages, frames
+                self._known_chunks[data] = messages, frames
 
     def filled(self, count: int, now: float = 0.0) -> bool:
         """Accept ``count`` bytes that were written into :meth:`room`; as :meth:`receive_data`.
 
-        A frame that is not complete in time is broken, if the policy bounds frames.
+        If the policy bounds frames, a frame that is not complete in time counts as broken.
 
         Args:
             count: number of the bytes.
@@ -411,29 +420,29 @@ class Machine:
         Returns:
                 False if a large frame is unfinished, so that there are no events yet.
         """
-        if self._deaf:
+        if self._ignores_bytes:
             return False
         self.counters.bytes_received += count
-        cut, left = self._framer.filled(count), True
-        if cut and self._deliveries and self._receive_known():
+        has_frames, is_unfinished = self._framer.filled(count), True
+        if has_frames and self._known_deliveries and self._receive_known_delivery():
             return True
-        if cut:
+        if has_frames:
             before = self.counters.frames_received
-            left = self._receive_frames()
+            is_unfinished = self._receive_frames()
             received = self.counters.frames_received - before
             if received > MAX_FRAMES_PER_READ or len(self._events) > MAX_EVENTS_PER_READ:
-                self._framer.read_less()
-        if left and self._bounded:
+                self._framer.halve_reads()
+        if is_unfinished and self._bounded:
             number = self.counters.frames_received
-            if number != self._begun:
-                self._begun, self._begun_at = number, now
+            if number != self._unfinished_number:
+                self._unfinished_number, self._unfinished_since = number, now
             else:
-                return self._is_overdue(now) or cut
-        return cut
+                return self._reject_overdue(now) or has_frames
+        return has_frames
 
     def receive_eof(self) -> None:
         """Note that the peer will send no more; call :meth:`events` next."""
-        if self._deaf:
+        if self._ignores_bytes:
             return
         self._events.append(LinkEnded(pending=self._framer.buffered))
         self._framer.clear()
@@ -462,28 +471,28 @@ class Machine:
                 the same id is pending (answers carry no request number). Nothing has changed.
         """
         kind = type(message)
-        following = self._may_go.get(kind)
-        if following is None:
+        next_state = self._sendable.get(kind)
+        if next_state is None:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant, frame = self._constant.get(kind), None
+        constant, frame = self._constant_frames.get(kind), None
         if constant is None:
             known = self._sent_frames.get(id(message))
-            constant, frame = self._made_of(message) if known is None else known[1]
+            constant, frame = self._make_frame(message) if known is None else known[1]
         data, message_id, pending = constant
         if answered is not None:
             pending = message_id if answered else None
-        if pending is not None and self._asks:
-            if self._open.count(pending) > again:
+        if pending is not None and self._is_client:
+            if self._pending_ids.count(pending) > again:
                 raise LocalProtocolError(
                     f"an answer to message {message_id:#04x} is still owed; one request of an id "
                     "can be open"
                 )
-            self._open += (pending,)
-        if following is not self._state:
-            self.state = following
+            self._pending_ids += (pending,)
+        if next_state is not self._state:
+            self.state = next_state
         self._outbox.append(data)
         counters = self.counters
         counters.frames_sent += 1
@@ -491,7 +500,7 @@ class Machine:
         if self._trace is not None:
             if frame is None:
                 frame = Frame(message_id, data[self._header_size :])
-            self._trace(self._says, frame)
+            self._trace(self._own_sender, frame)
 
     def send_all(self, messages: Sequence[Message]) -> None:
         """Send messages together, as :func:`~smartcam.protocols._machine.send_each` does.
@@ -501,23 +510,25 @@ class Machine:
         Raises:
             LocalProtocolError: the state forbids a message; those before it are sent.
         """
-        volley = self._volley
-        if volley is not None:
-            known, data, frames, size, pending, pending_after = volley
-            if known is messages and pending == self._open:
-                self._open = pending_after
+        sent_before = self._sent_together
+        if sent_before is not None:
+            known, data, frames, size, pending, pending_after = sent_before
+            if known is messages and pending == self._pending_ids:
+                self._pending_ids = pending_after
                 self._outbox += data
                 counters = self.counters
                 counters.frames_sent += frames
                 counters.bytes_sent += size
                 return
-        pending, state, sent = self._open, self._state, len(self._outbox)
+        pending, state, sent = self._pending_ids, self._state, len(self._outbox)
         send_each(self, messages)
-        if self._plain and state is self._state and isinstance(messages, tuple):
+        if self._recognizes and state is self._state and isinstance(messages, tuple):
             data = self._outbox[sent:]
             frames, size = len(data), sum(map(len, data))
             data = [b"".join(data)] if self.transport is Transport.TCP else data
-            self._volley = _Volley(messages, data, frames, size, pending, self._open)
+            self._sent_together = _SentTogether(
+                messages, data, frames, size, pending, self._pending_ids
+            )
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -526,8 +537,8 @@ class Machine:
 
     # ------------------------------------------------------------------ inside
 
-    def _made_of(self, message: Message) -> _Made:
-        """Return the frame of a message with a body; a camera's machine keeps it by the object.
+    def _make_frame(self, message: Message) -> _MadeFrame:
+        """Return the frame of a message with a body; a camera's machine keeps it for that object.
 
         Of messages with data, such as results, only the last frame is kept.
         """
@@ -535,18 +546,18 @@ class Machine:
         message_id = dialect.message_id(message)
         frame = dialect.to_frame(message)
         made = (dialect.encode_frame(frame), message_id, dialect.answer_id(message_id)), frame
-        if not self._asks and dialect.has(type(message)):
+        if not self._is_client and dialect.has(type(message)):
             if dialect.encoder(type(message)).has_data:
                 self._sent_frames.pop(self._sent_data_key, None)
                 self._sent_data_key = id(message)
-            if len(self._sent_frames) < MAX_FAMILIAR:
+            if len(self._sent_frames) < MAX_KNOWN_MESSAGES:
                 self._sent_frames[id(message)] = message, made
         return made
 
     def _receive_frames(self) -> bool:
-        """Make events of the whole received frames; return whether part of a frame is left."""
+        """Make events of the whole received frames; return True if a frame is unfinished."""
         framer = self._framer
-        self._receive_familiar()
+        self._receive_known_frames()
         while framer.start < len(framer.buffer):
             try:
                 frame = framer.cut()
@@ -560,96 +571,97 @@ class Machine:
             message = self._receive_frame(*frame)
             if framer.start == len(framer.buffer):
                 break
-            if self._takes_bursts and isinstance(message, m.ResultContainer):
+            if self._makes_bursts and isinstance(message, m.ResultContainer):
                 self._receive_burst(message, frame[1])
-            self._receive_familiar()
+            self._receive_known_frames()
         return False
 
-    def _receive_familiar(self) -> None:
-        """Read the next messages as long as they were seen before.
+    def _receive_known_frames(self) -> None:
+        """Read the next messages as long as their frames are known.
 
-        A camera has few statuses, and sends two around each result. Statuses and pending answers
-        are recognized byte for byte, results by all bytes before their data.
+        A camera has few different statuses, and sends two around each result. Statuses and pending
+        answers are recognized by all bytes, results by all bytes before their data.
         """
-        if not (self._statuses or self._results or len(self._familiar) > 1):
+        if not (self._known_statuses or self._known_results or len(self._known_messages) > 1):
             return
         framer, events = self._framer, self._events
         buffer, start = framer.buffer, framer.start
-        if not self._plain or isinstance(buffer, memoryview):
+        if not self._recognizes or isinstance(buffer, memoryview):
             return
-        known, size, status_id = self._statuses.get, self._status_size, self._status_id
+        known, size, status_id = self._known_statuses.get, self._status_size, self._status_id
         before, available = len(events), len(buffer)
-        looks = self._unknown_deliveries and available <= MAX_KNOWN_DELIVERY_BYTES
-        were = self._open if looks and not start and not before else None
+        may_store = self._deliveries_left and available <= MAX_KNOWN_DELIVERY_BYTES
+        pending_before = self._pending_ids if may_store and not start and not before else None
         while start < available:
             end = start + size
             message = known(buffer[start:end])
             if message is None:
                 match = self._find_result(buffer, start)
-                if match is None and self._open:
+                if match is None and self._pending_ids:
                     match = self._find_answer(buffer, start)
                 if match is None:
                     break
                 message, end = match
-            elif status_id in self._open:
-                self._close(status_id)
+            elif status_id in self._pending_ids:
+                self._remove_pending(status_id)
             events.append(message)
             start = end
         framer.start = start
         self.counters.frames_received += len(events) - before
-        if were is not None and 0 < start == available:
-            self._note_delivery(buffer, were)
+        if pending_before is not None and 0 < start == available:
+            self._store_delivery(buffer, pending_before)
 
-    def _note_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
-        """Store a delivery that consisted of familiar frames only, each of them an event."""
+    def _store_delivery(self, buffer: bytes, pending: tuple[int, ...]) -> None:
+        """Store a delivery that consisted only of known frames, each of which is an event."""
         framer = self._framer
         events = [event for event in self._events if isinstance(event, m.Message)]
         results = [at for at, event in enumerate(events) if isinstance(event, m.ResultContainer)]
-        self._unknown_deliveries -= 1
+        self._deliveries_left -= 1
         if len(results) > 1 or len(events) > MAX_KNOWN_DELIVERY_FRAMES:
             return
         at, begin, end = len(events), len(buffer), len(buffer)  # place of the result's data
         make = None
         framer.start = 0
         for number in range(len(events)):
-            place = framer.cut()
-            if place is not None and number in results:
-                at, begin, end = number, place[1] + self._burst_size, place[2]
-                make = self._results[buffer[begin - self._result_head : begin]][1]
-        self._deliveries[len(buffer)] = _Delivery(
+            frame = framer.cut()
+            if frame is not None and number in results:
+                at, begin, end = number, frame[1] + self._burst_size, frame[2]
+                make = self._known_results[buffer[begin - self._result_head : begin]][1]
+        self._known_deliveries[len(buffer)] = _Delivery(
             buffer[:begin],
             begin,
             buffer[end:],
             end,
             pending,
-            self._open,
+            self._pending_ids,
             events[:at],
             make,
             events[at + 1 :],
             len(events),
         )
 
-    def _receive_known(self) -> bool:
-        """Read a delivery that equals an earlier one in all bytes but its result's data.
+    def _receive_known_delivery(self) -> bool:
+        """Read a delivery that equals a stored one in all bytes except its result's data.
 
-        To cut and read it again would give the same messages, with other data in the result.
+        Its messages are those of the stored one, with other data in the result. Return False if
+        there is no such delivery.
         """
         framer, events = self._framer, self._events
         buffer = framer.buffer
         size = len(buffer)
-        known = self._deliveries.get(size)
+        known = self._known_deliveries.get(size)
         if known is None or events or framer.start or type(buffer) is not bytes:
             return False
-        head, begin, tail, end, pending, pending_after, before, make, behind, frames = known
+        head, begin, tail, end, pending, pending_after, before, make, after, frames = known
         if not (buffer.startswith(head) and buffer.endswith(tail)):
             return False
-        if pending != self._open:
+        if pending != self._pending_ids:
             return False
-        self._open = pending_after
+        self._pending_ids = pending_after
         events += before
         if make is not None:
             events.append(make(buffer[begin:end]))
-            events += behind
+            events += after
         framer.start = size
         self.counters.frames_received += frames
         return True
@@ -657,69 +669,72 @@ class Machine:
     def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it is a result like an earlier one.
 
-        It has the same application and as many bytes, and comes right before a known status, or
-        at the end: before another message it may begin a burst.
+        It must have the same application and size, and be before a known status or at the end of
+        the bytes: before another message it may begin a burst.
         """
         data = start + self._result_head
-        known = self._results.get(buffer[start:data])
+        known = self._known_results.get(buffer[start:data])
         if known is None:
             return None
         length, make = known
         end = start + length
-        if end != len(buffer) and buffer[end : end + self._status_size] not in self._statuses:
+        if end != len(buffer) and buffer[end : end + self._status_size] not in self._known_statuses:
             return None
-        if self._result_id in self._open:
-            self._close(self._result_id)
+        if self._result_id in self._pending_ids:
+            self._remove_pending(self._result_id)
         return make(buffer[data:end]), end
 
     def _find_datagram(self, datagram: bytes) -> Message | None:
-        """Return the message of a datagram that is a status, or a result, like an earlier one."""
-        message, message_id = self._statuses.get(datagram), self._status_id
+        """Return the message of a datagram that is a known status, or a result like a known one."""
+        message, message_id = self._known_statuses.get(datagram), self._status_id
         if message is None:
-            known, message_id = self._results.get(datagram[: self._result_head]), self._result_id
+            known, message_id = (
+                self._known_results.get(datagram[: self._result_head]),
+                self._result_id,
+            )
             if known is None or known[0] != len(datagram):
                 return None
             message = known[1](datagram[self._result_head :])
-        if message_id in self._open:
-            self._close(message_id)
+        if message_id in self._pending_ids:
+            self._remove_pending(message_id)
         return message
 
     def _find_answer(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
-        """Return the next message and its end if it is a pending answer that was seen before."""
-        for message_id in self._open:
-            frames = self._familiar.get(message_id)
+        """Return the next message and its end if it is a pending answer with a known frame."""
+        for message_id in self._pending_ids:
+            frames = self._known_messages.get(message_id)
             if frames:
                 end = start + self._header_size + self._decoders[message_id].size
                 message = frames.get(buffer[start:end])
                 if message is not None:
-                    self._close(message_id)
+                    self._remove_pending(message_id)
                     return message, end
         return None
 
-    def _is_overdue(self, now: float) -> bool:
-        """Return True if the unfinished frame will never be complete; reject that frame."""
-        framer, begun = self._framer, self._unfinished
-        age = begun.age(self._begun, self._begun_at, now)
+    def _reject_overdue(self, now: float) -> bool:
+        """Reject the unfinished frame if it will never be complete; return whether it was."""
+        framer, unfinished = self._framer, self._unfinished_age
+        age = unfinished.age(self._unfinished_number, self._unfinished_since, now)
         if age < frame_age.HINT_TIME:
             return False
         header = self.dialect.header
         message_id, size = framer.unfinished() or (None, header.size)
         which = "a header" if message_id is None else f"a frame of message {message_id:#04x}"
         progress = f"{framer.buffered} of {size} bytes are there after {age:.1f} s"
-        other = framer.header_within(begun.searched)
+        other = framer.header_within(unfinished.searched)
         if other is not None:
             text = f"{which} holds another header at byte {other}; {progress}"
         elif age > frame_age.FRAME_TIME + size / frame_age.FRAME_RATE:
             text = f"{which} does not become whole: {progress}"
         else:
-            begun.searched = max(framer.buffered - header.size + 1, 0)
+            unfinished.searched = max(framer.buffered - header.size + 1, 0)
             return False
         self._reject(FrameError(text, offset=other or 0, data=framer.pending[: header.size]))
         return True
 
     def _receive_datagram(self) -> None:
         framer = self._framer
-        if self._plain and isinstance(framer.buffer, bytes):
+        if self._recognizes and isinstance(framer.buffer, bytes):
             message = self._find_datagram(framer.buffer)
             if message is not None:
                 self.counters.frames_received += 1
@@ -740,23 +755,26 @@ class Machine:
         framer.clear()
 
     def _receive_frame(self, message_id: int, begin: int, end: int) -> Message | None:
-        """Make a message of a frame whose payload is at a place of the framer; None: dropped."""
+        """Make a message of a frame, report it and return it; return None if it is dropped.
+
+        ``begin`` and ``end`` are the offsets of its payload in the framer's buffer.
+        """
         counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
-        if self._narrows and len(self.kin) > 1:
-            self._narrow(message_id, size)
+        if self._is_connecting and len(self.kin) > 1:
+            self._narrow_kin(message_id, size)
         if self._trace is not None:
-            self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
+            self._trace(self._peer_sender, Frame(message_id, framer.take(begin, end)))
         codec = self._decoders.get(message_id)
         message: Message
         try:
             if codec is not None and (size == codec.size or (codec.has_data and size > codec.size)):
                 message, surplus = codec.decode(framer.buffer, begin, end), 0
             else:
-                message, surplus = self._read_odd(codec, message_id, begin, end)
+                message, surplus = self._decode_unusual(codec, message_id, begin, end)
             kind = type(message)
-            following = self._may_come.get(kind)
-            if following is None:
+            next_state = self._receivable.get(kind)
+            if next_state is None:
                 raise MessageError(
                     f"{type(message).__name__} ({message_id:#04x}) came in state "
                     f"{self._state.value}, where it is not expected",
@@ -767,22 +785,22 @@ class Machine:
             return None
         if surplus > 0:
             counters.long_bodies += 1
-        if following is not self._state:
-            self.state = following
-        elif self._plain and codec is not None and surplus == 0:
-            self._note_familiar(codec, message, begin, end)
+        if next_state is not self._state:
+            self.state = next_state
+        elif self._recognizes and codec is not None and surplus == 0:
+            self._store_known_frame(codec, message, begin, end)
         if kind in _BY_ITSELF:
-            if message_id in self._open:  # answers a request, perhaps a raw one
-                self._close(message_id)
-        elif self._asks and not self._wanted(message_id, known=codec is not None):
+            if message_id in self._pending_ids:  # answers a request, perhaps a raw one
+                self._remove_pending(message_id)
+        elif self._is_client and not self._accept_answer(message_id, known=codec is not None):
             return None
         self._events.append(message)
         return message
 
-    def _read_odd(
+    def _decode_unusual(
         self, codec: Codec | None, message_id: int, begin: int, end: int
     ) -> tuple[Message, int]:
-        """Return the message of a frame without a name, or of another length than documented.
+        """Return the message of a frame with an unknown id or another length than documented.
 
         Also return the number of surplus bytes, if the policy accepts them.
 
@@ -792,7 +810,7 @@ class Machine:
         payload = self._framer.take(begin, end)
         if codec is None:
             return m.UnknownMessage(message_id=message_id, payload=payload), 0
-        if self._policy.tells:
+        if self._policy.reports_malformed:
             return m.MalformedMessage(message_id=message_id, payload=payload), 0
         surplus = len(payload) - codec.size
         if surplus > 0 and self._policy.exact_length:
@@ -801,43 +819,50 @@ class Machine:
             )
         return codec.decode(payload, 0, len(payload)), surplus
 
-    def _note_familiar(self, codec: Codec, message: Message, begin: int, end: int) -> None:
-        """Store a message by its frame, for this state only; ``begin``: place of its payload."""
+    def _store_known_frame(self, codec: Codec, message: Message, begin: int, end: int) -> None:
+        """Store a message by its frame, for this state only; ``begin``: offset of its payload."""
         frame = begin - self._header_size
         if type(message) is m.ResultContainer:
-            if self._takes_bursts and len(self._results) < MAX_FAMILIAR:
+            if self._makes_bursts and len(self._known_results) < MAX_KNOWN_MESSAGES:
                 head = self._framer.take(frame, begin + codec.size)
-                if head not in self._results:
-                    self._results[head] = end - frame, codec.like(message)
+                if head not in self._known_results:
+                    self._known_results[head] = end - frame, codec.make_copier(message)
         elif not codec.has_data and end - begin == codec.size:
-            frames = self._familiar.setdefault(codec.message_id, {})
-            if len(frames) < MAX_FAMILIAR:
+            frames = self._known_messages.setdefault(codec.message_id, {})
+            if len(frames) < MAX_KNOWN_MESSAGES:
                 frames[self._framer.take(frame, end)] = message
 
-    def _forget_familiar(self) -> None:
-        """Read each message anew from now on, since it may have another meaning or none."""
-        known = self._statuses or self._results or self._chunks or self._volley
-        if known or len(self._familiar) > 1 or self._unknown_deliveries < MAX_KNOWN_DELIVERIES:
-            self._statuses, self._results, self._chunks, self._deliveries = {}, {}, {}, {}
-            self._unknown_deliveries, self._volley = MAX_KNOWN_DELIVERIES, None
-            self._familiar = {self._status_id: self._statuses}
+    def _forget_known(self) -> None:
+        """Forget known frames, since in another state a message may have another meaning."""
+        known = (
+            self._known_statuses or self._known_results or self._known_chunks or self._sent_together
+        )
+        if known or len(self._known_messages) > 1 or self._deliveries_left < MAX_KNOWN_DELIVERIES:
+            (
+                self._known_statuses,
+                self._known_results,
+                self._known_chunks,
+                self._known_deliveries,
+            ) = {}, {}, {}, {}
+            self._deliveries_left, self._sent_together = MAX_KNOWN_DELIVERIES, None
+            self._known_messages = {self._status_id: self._known_statuses}
 
-    def _narrow(self, message_id: int, size: int) -> None:
-        """Leave out the kin without such a message, or with another length of it."""
-        decoders = [dialect.decoders(self._sender).get(message_id) for dialect in self.kin]
-        fitting = tuple(
+    def _narrow_kin(self, message_id: int, size: int) -> None:
+        """Remove the dialects of ``kin`` that have no such message, or another length for it."""
+        decoders = [dialect.decoders(self._peer_sender).get(message_id) for dialect in self.kin]
+        fitting_dialects = tuple(
             dialect
             for dialect, codec in zip(self.kin, decoders, strict=True)
             if codec is not None and codec.fits(size)
         )
-        if fitting and fitting != self.kin:
-            self.kin = fitting
-            self._take_up(fitting[0])
+        if fitting_dialects and fitting_dialects != self.kin:
+            self.kin = fitting_dialects
+            self._use_dialect(fitting_dialects[0])
 
     def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
         """Read the next result containers, as long as they are of the same application.
 
-        ``begin``: place of the payload of the first, which is the last event.
+        ``first`` is the last event so far; ``begin`` is the offset of its payload.
         """
         framer, head = self._framer, self._header_size + self._burst_size
         start = framer.start
@@ -846,31 +871,34 @@ class Machine:
             return
         self.counters.frames_received += len(more)
         if self._trace is not None:
-            front = framer.take(begin, begin + self._burst_size)
+            head_bytes = framer.take(begin, begin + self._burst_size)
             for data in more:
-                self._trace(self._sender, Frame(self._result_id, front + data))
+                self._trace(self._peer_sender, Frame(self._result_id, head_bytes + data))
         size = len(first.data) + framer.start - start - len(more) * head
         more.insert(0, first.data)
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
-    def _wanted(self, message_id: int, *, known: bool) -> bool:
-        """Return True if the client gets a message; an answer to no request is only counted."""
+    def _accept_answer(self, message_id: int, *, known: bool) -> bool:
+        """Note that a pending answer has come; return False for an answer to no request.
+
+        A message with an unknown id is accepted in any case.
+        """
         self.counters.unknown_ids += not known
-        if message_id in self._open:
-            self._close(message_id)
+        if message_id in self._pending_ids:
+            self._remove_pending(message_id)
             return True
         self.counters.unexpected_messages += known
         return not known
 
-    def _close(self, message_id: int) -> None:
+    def _remove_pending(self, message_id: int) -> None:
         """Note that a pending answer has come."""
-        at = self._open.index(message_id)
-        self._open = self._open[:at] + self._open[at + 1 :]
+        at = self._pending_ids.index(message_id)
+        self._pending_ids = self._pending_ids[:at] + self._pending_ids[at + 1 :]
 
     def _reject(self, error: RemoteProtocolError) -> bool:
-        """Fail the link (return True), or drop and count the input, as the policy says."""
+        """Fail the link and return True, or drop and count the input, as the policy says."""
         if self._trace is not None:
-            self._trace(self._sender, error)
+            self._trace(self._peer_sender, error)
         if not isinstance(error, self._policy.fatal):
             self.counters.ignored_frames += 1
             return False

@@ -46,9 +46,9 @@ class CommandAnswer(NamedTuple):
 
 
 class AnswerReader(LineReader):
-    """Cuts answers from a stream; the command sets the form of its answer.
+    """Cuts answers from a stream; the form of each depends on its command.
 
-    The machine that feeds it reads until nothing is left, so at most one line waits.
+    The machine that feeds it reads until nothing is left, so at most one line is kept.
 
     Args:
         max_length: longest text of an answer that gives its length, bytes.
@@ -69,7 +69,7 @@ class AnswerReader(LineReader):
         self._reading = self._read(form)
 
     def next_answer(self) -> CommandAnswer | None:
-        """Return the expected answer, None if it is not all there yet.
+        """Return the expected answer, None if it is not complete yet.
 
         Raises FrameError: the bytes are no such answer; the stream cannot be read on.
         """
@@ -100,81 +100,81 @@ class AnswerReader(LineReader):
     # ------------------------------------------------------------------ forms
 
     def _read(self, form: AnswerForm) -> Generator[None, None, CommandAnswer]:
-        first = yield from self._line()
+        first_line = yield from self._read_line()
         if form is AnswerForm.BARE:
-            return CommandAnswer(StatusCode.DONE, first)
-        code = _number(first, "a status code")
+            return CommandAnswer(StatusCode.DONE, first_line)
+        code = _number(first_line, "a status code")
         if code != StatusCode.DONE or form is AnswerForm.CODE:
             return CommandAnswer(code)
         if form is AnswerForm.HEX:
-            return CommandAnswer(code, data=(yield from self._image()))
+            return CommandAnswer(code, data=(yield from self._read_image()))
         if form is AnswerForm.SIZED:
-            return CommandAnswer(code, (yield from self._sized()))
+            return CommandAnswer(code, (yield from self._read_sized()))
         lines: list[str] = []
         for _ in range(INFO_LINES if form is AnswerForm.INFO else 1):
-            line = yield from self._line()
+            line = yield from self._read_line()
             lines.append(line)
         return CommandAnswer(code, "\n".join(lines))
 
-    def _line(self) -> Generator[None, None, str]:
+    def _read_line(self) -> Generator[None, None, str]:
         while (line := self.next_line()) is None:
             yield
         return line
 
-    def _sized(self) -> Generator[None, None, str]:
-        size = _number((yield from self._line()), "a length")
+    def _read_sized(self) -> Generator[None, None, str]:
+        size = _number((yield from self._read_line()), "a length")
         if not 0 <= size <= self._max_length:
             raise FrameError(f"a text of {size} bytes comes; 0 to {self._max_length} are accepted")
         while (data := self.take(size)) is None:
             yield
         self._on_pieces((data,), False)
-        if end := (yield from self._line()):
+        if end := (yield from self._read_line()):
             raise FrameError(f"{end[:64]!r} came after a text of {size} bytes, its end was due")
         return data.decode(ENCODING)
 
-    def _image(self) -> Generator[None, None, bytes]:
-        """Read a bitmap. Its own header has its length; the size before it may count digits."""
-        _number((yield from self._line()), "an image's size")
+    def _read_image(self) -> Generator[None, None, bytes]:
+        """Read a bitmap. Its header has its size; the number before it may count digits instead."""
+        _number((yield from self._read_line()), "an image's size")
         data = bytearray()
-        size, check, regular = 0, "", True
+        size, crc, is_regular = 0, "", True
         while not size or len(data) < size:
-            more: bytes | None = b""
-            if size and regular:
-                more = self._take_hex(2 * (size - len(data)))
-                regular = more is not None
-            if not more:
-                more = yield from self._hex_line()
-            data += more
-            check = checksum(binascii.hexlify(more).upper(), check)
+            chunk: bytes | None = b""
+            if size and is_regular:
+                chunk = self._take_hex_lines(2 * (size - len(data)))
+                is_regular = chunk is not None
+            if not chunk:
+                chunk = yield from self._read_hex_line()
+            data += chunk
+            crc = checksum(binascii.hexlify(chunk).upper(), crc)
             if not size and len(data) >= _BMP_SIZE_AT.stop:
                 size = _bitmap_size(data)
         if len(data) > size:
             raise FrameError(f"{len(data)} bytes of a bitmap of {size} bytes came")
-        sent = yield from self._line()
-        if sent.strip().upper() != check:
-            raise FrameError(f"the image's checksum is {sent[:16]!r}, {check} was expected")
+        crc_text = yield from self._read_line()
+        if crc_text.strip().upper() != crc:
+            raise FrameError(f"the image's checksum is {crc_text[:16]!r}, {crc} was expected")
         return bytes(data)
 
-    def _hex_line(self) -> Generator[None, None, bytes]:
+    def _read_hex_line(self) -> Generator[None, None, bytes]:
         """Read one line of an image."""
-        line = yield from self._line()
+        line = yield from self._read_line()
         data = _from_hex(line.encode(ENCODING))
         if not data:
             raise FrameError(f"{line[:64]!r} came, hexadecimal digits of an image were due")
         return data
 
-    def _take_hex(self, most: int) -> bytes | None:
-        """Return all whole lines of an image that are there, up to ``most`` digits, as bytes.
+    def _take_hex_lines(self, max_digits: int) -> bytes | None:
+        """Remove all whole lines of an image, up to ``max_digits`` digits, and return their bytes.
 
-        There are thousands of lines. Nothing if no whole line is there. None if a line is broken:
-        then all are left to be read one by one, which finds the broken line.
+        An image has thousands of lines, so they are read together. If a line is broken, remove
+        nothing and return None: then the caller reads the lines one by one, and finds it.
         """
         end = self._buffer.rfind(LINE_END)
         if end < 0:
             return b""
         lines = bytes(memoryview(self._buffer)[:end]).split(LINE_END)
-        if end - (len(lines) - 1) * len(LINE_END) > most:
-            del lines[bisect_right(list(accumulate(map(len, lines))), most) :]
+        if end - (len(lines) - 1) * len(LINE_END) > max_digits:
+            del lines[bisect_right(list(accumulate(map(len, lines))), max_digits) :]
         digits = b"".join(lines)
         if any(not 0 < size <= MAX_LINE_BYTES or size % 2 for size in set(map(len, lines))):
             return None

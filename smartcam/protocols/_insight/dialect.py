@@ -27,7 +27,13 @@ from smartcam.protocols._base import (
     Transport,
     Verdict,
 )
-from smartcam.protocols._insight.machine import Command, InSightMachine, Piece, Reply, unsendable
+from smartcam.protocols._insight.machine import (
+    Command,
+    InSightMachine,
+    Piece,
+    Reply,
+    unsendable_reason,
+)
 from smartcam.protocols._insight.words import (
     COMMANDS,
     DEFAULT_PORT,
@@ -107,7 +113,7 @@ class InSightDialect(Dialect):
         Raises ConfigurationError: a cell is not valid, or a text cannot be sent.
         """
         for key in ("user", "password"):
-            problem = unsendable(parameters.get(key, ""), MAX_LOGIN_CHARACTERS)
+            problem = unsendable_reason(parameters.get(key, ""), MAX_LOGIN_CHARACTERS)
             if problem is not None:
                 raise ConfigurationError(f"{key}: {problem}")
         counter = _cell_names(parameters.get("counter", ""))

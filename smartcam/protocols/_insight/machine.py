@@ -1,7 +1,7 @@
 """One connection to an In-Sight camera, as a link sees it: the client's side of native mode.
 
-Commands have no numbers and answers do not name them, so a command is sent when the one before it
-is answered. A request of the library is a script (:class:`InSightMachine`): it sends its commands
+Answers do not name their command, so a command is sent when the command before it is answered. A
+request of the library is a script, a generator of :class:`InSightMachine`: it sends its commands
 one after the other, and makes messages of their answers.
 """
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     """Yields command lines and receives their answers, which become messages."""
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
-"""Status of a camera that is online and accepts event 8; the camera shows no other state."""
+"""Status of a camera that is online and accepts event 8; the camera reports no other bits."""
 
 MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
@@ -87,14 +87,14 @@ class Command(m.Request):
     line: str
 
     def __post_init__(self) -> None:
-        problem = unsendable(self.line, MAX_LINE_BYTES)
+        problem = unsendable_reason(self.line, MAX_LINE_BYTES)
         if problem is None and self.line[:2].upper() not in COMMANDS:
             problem = f"it begins with none of {', '.join(COMMANDS)}"
         if problem is not None:
             raise ConfigurationError(f"command {self.line[:64]!r}: {problem}")
 
 
-def unsendable(text: str, limit: int) -> str | None:
+def unsendable_reason(text: str, limit: int) -> str | None:
     """Return the reason why a text cannot be a line of ``limit`` bytes, None if it can."""
     if not all(ord(char) < 256 and char not in "\r\n\0" for char in text):
         return "only Latin-1 without line ends can be sent"
@@ -102,7 +102,7 @@ def unsendable(text: str, limit: int) -> str | None:
 
 
 class _PendingRequest(NamedTuple):
-    """A request that is running, or waits for its turn."""
+    """A request whose script runs, or that waits for its turn."""
 
     kind: type[m.Message]
     script: Script
@@ -151,10 +151,10 @@ class InSightMachine:
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._login: Iterator[None] = iter(())
-        self._waiting: collections.deque[_PendingRequest] = (
+        self._queued_requests: collections.deque[_PendingRequest] = (
             collections.deque()
         )  # at most one of a kind
-        self._job: _PendingRequest | None = None
+        self._running_request: _PendingRequest | None = None
         self._scripts: dict[type[m.Message], Callable[[Any], Script]] = {
             m.GetStatus: self._get_status,
             m.Query: self._query,
@@ -208,7 +208,7 @@ class InSightMachine:
         if self.state in {State.FAILED, State.CLOSED}:
             return
         self._events.append(LinkEnded(pending=self.buffered))
-        self._end(State.CLOSED)
+        self._end_link(State.CLOSED)
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; the caller owns the list."""
@@ -227,29 +227,29 @@ class InSightMachine:
             if self._trace is not None:
                 self._trace(m.Sender.CAMERA, error)
             self._events.append(LinkFailed(error=error))
-            self._end(State.FAILED)
+            self._end_link(State.FAILED)
 
     def _read_answers(self) -> None:
-        while self._job is not None:
+        while self._running_request is not None:
             answer = self._reader.next_answer()
             if answer is None:
                 return
-            self._go_on(self._job, answer)
+            self._advance_script(self._running_request, answer)
         line = self._reader.next_line()
         if line is not None:
             raise FrameError(f"{line[:64]!r} came, nothing was asked", data=line.encode(ENCODING))
 
-    def _end(self, state: State) -> None:
-        """Send and read nothing more."""
+    def _end_link(self, state: State) -> None:
+        """Stop sending and reading."""
         self.state = state
-        self._job = None
-        self._waiting.clear()
+        self._running_request = None
+        self._queued_requests.clear()
         self._reader = AnswerReader(max_length=0, on_pieces=self._on_pieces)
 
-    def _on_pieces(self, pieces: Sequence[bytes], ended: bool) -> None:
+    def _on_pieces(self, pieces: Sequence[bytes], has_line_end: bool) -> None:
         self.counters.frames_received += len(pieces)
         if self._trace is not None:
-            kind = Piece.LINE if ended else Piece.TEXT
+            kind = Piece.LINE if has_line_end else Piece.TEXT
             for piece in pieces:
                 self._trace(m.Sender.CAMERA, Frame(kind, piece))
 
@@ -260,9 +260,9 @@ class InSightMachine:
     ) -> None:
         """Queue a request; write :meth:`data_to_send` next.
 
-        A Get status that is queued already is not repeated: its answer will be new enough; that of
-        one already sent may not be. Disconnect sends nothing: the connection ends, and waiting
-        requests are dropped.
+        A Get status is not queued twice, since the answer to the queued one will be new enough. If
+        one was already sent, its answer may be older, so another is queued. Disconnect sends
+        nothing: the connection ends, and waiting requests are dropped.
 
         Raises:
             LocalProtocolError: there is no session, or an answer of the same kind is pending.
@@ -275,19 +275,19 @@ class InSightMachine:
             self._connect()
         elif kind is m.Disconnect:
             if self.state in {State.CONNECTING, State.CONNECTED}:
-                self._end(State.DISCONNECTED)
+                self._end_link(State.DISCONNECTED)
         elif self.state is not State.CONNECTED or kind not in self._scripts:
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
         else:
-            queued = kind in {job.kind for job in self._waiting}
-            running = self._job is not None and self._job.kind is kind
-            if kind is not m.GetStatus and (queued or running):
+            is_queued = kind in {request.kind for request in self._queued_requests}
+            is_running = self._running_request is not None and self._running_request.kind is kind
+            if kind is not m.GetStatus and (is_queued or is_running):
                 raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
-            if not queued:
-                self._waiting.append(_PendingRequest(kind, self._scripts[kind](message)))
-                self._begin_next()
+            if not is_queued:
+                self._queued_requests.append(_PendingRequest(kind, self._scripts[kind](message)))
+                self._start_next_request()
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""
@@ -342,32 +342,32 @@ class InSightMachine:
 
     # ------------------------------------------------------------------ scripts
 
-    def _begin_next(self) -> None:
-        while self._job is None and self._waiting:
-            self._job = self._waiting.popleft()
-            self._go_on(self._job, None)
+    def _start_next_request(self) -> None:
+        while self._running_request is None and self._queued_requests:
+            self._running_request = self._queued_requests.popleft()
+            self._advance_script(self._running_request, None)
 
-    def _go_on(self, job: _PendingRequest, answer: CommandAnswer | None) -> None:
-        """Pass an answer to a script; write its next line, or begin the next script."""
+    def _advance_script(self, request: _PendingRequest, answer: CommandAnswer | None) -> None:
+        """Pass an answer to a script, and write its next line or start the next request."""
         try:
-            line = next(job.script) if answer is None else job.script.send(answer)
+            line = next(request.script) if answer is None else request.script.send(answer)
         except StopIteration:
-            self._job = None
-            self._begin_next()
+            self._running_request = None
+            self._start_next_request()
             return
         self._reader.expect(COMMANDS[line[:2].upper()].form)
         self._write(line)
 
     def _report(self, message: m.Message) -> None:
-        self._events.append(message)  # the list may be a new one after a yield
+        self._events.append(message)  # after a yield, the list may be another object
 
     def _get_status(self, _message: m.Message | None = None) -> Script:
-        online = (yield "GO").text.strip()
-        if online not in {"0", "1"}:
-            raise unexpected_line_error(online, "0 (offline) or 1 (online)")
-        self._report(m.StatusReport(status=ONLINE if online == "1" else Status(0)))
+        answer_text = (yield "GO").text.strip()
+        if answer_text not in {"0", "1"}:
+            raise unexpected_line_error(answer_text, "0 (offline) or 1 (online)")
+        self._report(m.StatusReport(status=ONLINE if answer_text == "1" else Status(0)))
 
-    def _name_job(self) -> Generator[str, CommandAnswer, int]:
+    def _read_job_id(self) -> Generator[str, CommandAnswer, int]:
         """Return the active job's id.
 
         A job without a number in its name has no id, nor does a job without a name.
@@ -381,7 +381,7 @@ class InSightMachine:
         return int(number)
 
     def _query(self, _message: m.Message) -> Script:
-        job = yield from self._name_job()
+        job = yield from self._read_job_id()
         self._report(m.QueryAnswer(code=StatusCode.DONE, application=job))
 
     def _load_id(self, message: m.SwitchApplication) -> Script:
@@ -392,7 +392,7 @@ class InSightMachine:
 
     def _load(self, command: Command) -> Script:
         code = (yield command.line).code
-        job = yield from self._name_job()
+        job = yield from self._read_job_id()
         self._report(m.SwitchAnswer(code=code, application=job))
 
     def _start(self, _message: m.Message) -> Script:
@@ -412,18 +412,18 @@ class InSightMachine:
         self._report(m.TriggerAnswer(code=code))
         if code != StatusCode.DONE:
             return
-        job = yield from self._name_job()
+        job = yield from self._read_job_id()
         counter = self.dialect.counter
-        before = (yield from self._value(counter)) if counter else None
+        before = (yield from self._read_value(counter)) if counter else None
         values: dict[str, str | None] = {}
         for cell in self.dialect.cells:
-            values[cell] = yield from self._value(cell)
-        after = (yield from self._value(counter)) if counter else None
+            values[cell] = yield from self._read_value(cell)
+        after = (yield from self._read_value(counter)) if counter else None
         cells = [
             m.CellValue(cell, None if values[cell] == ERROR_VALUE else values[cell])
             for cell in self.dialect.cells
         ]
-        fault, now = None, (yield from self._name_job()) if cells else job
+        fault, now = None, (yield from self._read_job_id()) if cells else job
         if now != job:
             fault = f"job {now} was loaded while the cells of job {job} were read"
         elif before != after:
@@ -433,11 +433,14 @@ class InSightMachine:
             )
         self._report(
             m.ResultContainer(
-                application=job, data=json.dumps(values).encode(), cells=tuple(cells), fault=fault
+                application=job,
+                data=json.dumps(values).encode(),
+                cells=tuple(cells),
+                fault=fault,
             )
         )
 
-    def _value(self, cell: str) -> Generator[str, CommandAnswer, str | None]:
+    def _read_value(self, cell: str) -> Generator[str, CommandAnswer, str | None]:
         """Return a cell's text, None for one that is empty or does not exist."""
         answer = yield f"GV{cell}"
         return answer.text if answer.code == StatusCode.DONE else None

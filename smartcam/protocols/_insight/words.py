@@ -1,4 +1,4 @@
-"""Words of Cognex In-Sight native mode, for both ends: lines, commands, status codes, cell names.
+"""Lines, commands, status codes and cell names of Cognex In-Sight native mode, for both ends.
 
 Native mode is text over telnet (TCP port 23). The client sends one command a line, the camera
 answers with a status code on a line of its own and, for some commands, data after it. Nothing in
@@ -57,7 +57,7 @@ LAST_ROW = 399
 
 MAX_CELLS = 1024
 """Largest number of cells that a range, or a result, may have. Ranges are an addition of this
-library: each cell is read by a command of its own, which takes a round trip."""
+library: each cell is read by a separate command, which takes a round trip."""
 
 LAST_JOB_ID = 999
 """The largest id of a job; the first one is 0 (manual, published)."""
@@ -94,7 +94,7 @@ class AnswerForm(enum.Enum):
     CODE = "code"
     """The code, nothing else."""
     BARE = "bare"
-    """Form of an answer: one line with the value, without a code before it."""
+    """One line with the value, without a code before it."""
     LINE = "line"
     """The code, then one line."""
     INFO = "info"
@@ -421,8 +421,8 @@ ENDS = re.compile(rb"\r\n")
 """The end of a line from the camera."""
 
 COMMAND_ENDS = re.compile(rb"\r\n|\r?\x00")
-r"""The end of a line from a client: a byte NUL does as CR LF does (manual, published); a CR right
-before it is dropped, since ``\r\0`` is telnet's bare CR."""
+r"""The end of a line from a client: CR LF, or a byte NUL (manual, published). A CR directly before
+a NUL is dropped, since ``\r\0`` is telnet's form of a single CR."""
 
 
 def command_reader() -> LineReader:

@@ -346,7 +346,7 @@ class ReplayedCamera(EmulatedCamera):
         messages: list[m.Message] = [
             m.ResultContainer(application=number, data=data) for data in containers
         ]
-        self._send_all(messages, provoke=True)
+        self._send_all(messages, fire_faults=True)
 
     # ------------------------------------------------------------------ by itself
 

@@ -311,7 +311,7 @@ class Client:
 
     def hear(self, status: Status) -> None:
         """A status comes."""
-        previous = self.state.report(m.StatusReport(status=status), NO_STATUSES)
+        previous = self.state.note_status(m.StatusReport(status=status), NO_STATUSES)
         self.results.on_status(previous, self.state.bits, NOW)
 
     def result(self, container: Container) -> None:
@@ -370,11 +370,11 @@ class Client:
                 *(pending.ended, ended, tuple(one.raw for one in pending.results)),
             )
         waiting = tuple((one.data, fate, number) for one, fate, number, *_ in self.waiting)
-        owed = tuple((one.fate, one.number, one.missing, of(one.evidence)) for one in at.owed)
+        owed = tuple((one.fate, one.number, one.missing_count, of(one.evidence)) for one in at.owed)
         last = of(at._last)
         evidence = tuple(
             (
-                *(min(one.began, 2), one.reached, one.proven, one.doubtful),
+                *(min(one.begin_count, 2), one.reached, one.proven, one.doubtful),
                 *(getattr(one, name) for name in type(one).__slots__ if name.startswith("_")),
             )
             for one in known
@@ -385,9 +385,9 @@ class Client:
             at.doubted,
             at.satisfied,
             at._last_number,
-            at._turn,
-            at._given_number,
+            at._last_own_number,
+            at._user_number,
         )
-        given_up = tuple(at._given_up.items())
+        given_up = tuple(at._given_up_fates.items())
         numbered = self.results._numbering is not None
         return self.state._last_status, numbered, call, waiting, owed, memory, given_up

@@ -209,7 +209,7 @@ class World:
                 self.phase = "prepare"
                 if given:
                     self.words.append(("number", given[0]))
-                    self.client.correlation.give_number(given[0])
+                    self.client.correlation.set_next_number(given[0])
             case ("give up",):
                 self.phase = "idle"
             case ("time out",):
@@ -400,10 +400,10 @@ class World:
                 self.words.append(("start",))
                 self.phase = "starting"
             case "settled":
-                at.settled()
+                at.forget_owed()
                 self.phase = "ready"
             case "starting" if WAITING in status:
-                at.settled()
+                at.forget_owed()
                 self.phase = "ready"
             case "ready" if WAITING in status and OVERTRIGGERED not in status:
                 self.send()

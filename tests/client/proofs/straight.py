@@ -2,10 +2,10 @@
 
 Two clients get the same random triggers, questions, subscribers, ends and bytes. One takes what
 came before as a whole (:meth:`Machine.filled`, :meth:`Machine.send_all`) and the usual answers to a
-trigger in one step (``Dispatch._take_round``); the other one, which judges, reads each frame by
-itself and hands on one event after the other. After each step everything that either knows has to
-be the same: the bytes written, the events, what is owed, the camera's state, the evidence, every
-account, every outcome, every subscriber's items.
+trigger in one step (``Dispatch._handle_usual_round``); the other one, which judges, reads each
+frame by itself and hands on one event after the other. After each step everything that either knows
+has to be the same: the bytes written, the events, what is owed, the camera's state, the evidence,
+every account, every outcome, every subscriber's items.
 
 Long form: ``python -m tests.client.proofs.straight --events 1000000 --seed 1``. It prints how many
 deliveries took the short way, and ends with 1 at the first difference.
@@ -81,7 +81,7 @@ _QUERY = m.Query()
 class JudgingDispatch(Dispatch):
     """Hands on each event by itself."""
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
         return False
 
 
@@ -90,8 +90,8 @@ class ShortDispatch(Dispatch):
 
     taken = 0
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        taken = super()._take_round(events, now, at)
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._handle_usual_round(events, now, at)
         ShortDispatch.taken += taken
         return taken
 
@@ -190,7 +190,7 @@ class Client:
         answer = request.answer
         if self.machine.state is State.CONNECTED and answer and not self.waits.is_pending(answer):
             self.machine.send(request)
-            owed = self.waits.next_answer(answer, LOOP, LOOP.time(), behind=self.deliveries)
+            owed = self.waits.next_answer(answer, LOOP, LOOP.time(), after_delivery=self.deliveries)
             self.awaited.append(owed)
             self.written += b"".join(self.machine.data_to_send())
 
@@ -198,7 +198,7 @@ class Client:
         """Wait for a status."""
         outcome: Any = LOOP.create_future()
         self.awaited.append(outcome)
-        self.waits.statuses[StatusWaiter(lambda status: bool(status & mask), outcome)] = None
+        self.waits.status_waiters[StatusWaiter(lambda status: bool(status & mask), outcome)] = None
 
     def subscribe(self, what: str) -> None:
         """Subscribe to results, statuses or events."""
@@ -248,18 +248,24 @@ class Client:
         self.written = self.written[-128:]
         yield self.written
         yield machine.counters, machine.state, machine.buffered, machine.room().nbytes
-        yield machine._open, self.frames, self.deliveries
+        yield machine._pending_ids, self.frames, self.deliveries
         yield _parts(self.state, "_listeners")
-        yield [*waits.answers], waits._behind, waits.fences_open, len(waits.statuses)
+        yield (
+            [*waits.pending_answers],
+            waits._last_delivery_before,
+            waits.fences_open,
+            len(waits.status_waiters),
+        )
         correlation = results.correlation
         yield _parts(correlation, "pending", "_last", "owed")
         yield _slots(correlation._last)
         yield [
-            (one.fate, one.number, one.missing, _slots(one.evidence)) for one in correlation.owed
+            (one.fate, one.number, one.missing_count, _slots(one.evidence))
+            for one in correlation.owed
         ]
         pending = results._pending
         if pending is not None:
-            yield pending.received, pending.early, pending.given_up, pending.ended
+            yield pending.received, pending.early_count, pending.given_up, pending.ended
             yield len(pending.unproven), [*map(_told, pending.results)], _slots(pending.evidence)
             yield _outcome(pending.outcome)
         yield results.input_in_doubt, results._warned_extra, results._warned_others
@@ -279,8 +285,8 @@ def _parts(one: object, *without: str) -> dict[str, object]:
 def _slots(evidence: Any) -> object:
     if evidence is None:
         return None
-    answers = getattr(evidence, "_answers", None)
-    return evidence.began, evidence.reached, evidence.proven, evidence.doubtful, answers
+    answers = getattr(evidence, "_answer_count", None)
+    return evidence.begin_count, evidence.reached, evidence.proven, evidence.doubtful, answers
 
 
 def _told(one: object) -> object:
@@ -422,7 +428,7 @@ def steps_of(chance: Chance) -> Iterator[Step]:
         yield "hear the clock", lambda client: client.hear(clock, 0.0)
     if dice.random() < 0.1:
         yield "unsubscribe", Client.unsubscribe
-        yield "forget those who wait", lambda client: client.waits.statuses.clear()
+        yield "forget those who wait", lambda client: client.waits.status_waiters.clear()
 
 
 def _beside(chance: Chance) -> Step:

@@ -23,9 +23,9 @@ def test_short_way_gives_what_the_long_one_gives(caplog: pytest.LogCaptureFixtur
 class ForgetsStatuses(ShortDispatch):
     """Does not count the statuses around a result."""
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
         heard = self._state.statuses_received
-        taken = super()._take_round(events, now, at)
+        taken = super()._handle_usual_round(events, now, at)
         if taken:
             self._state.statuses_received = heard
         return taken
@@ -34,8 +34,8 @@ class ForgetsStatuses(ShortDispatch):
 class KeepsFences(ShortDispatch):
     """Still waits for the answers that it has taken."""
 
-    def _take_round(self, events: list[Any], now: float, at: datetime) -> bool:
-        taken = super()._take_round(events, now, at)
+    def _handle_usual_round(self, events: list[Any], now: float, at: datetime) -> bool:
+        taken = super()._handle_usual_round(events, now, at)
         if taken:
             self._waits.expect_fences(2)
         return taken
@@ -44,19 +44,19 @@ class KeepsFences(ShortDispatch):
 class LooksAtSizes(ShortMachine):
     """Takes any delivery of a known size for the known one."""
 
-    def _note_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
-        super()._note_delivery(buffer, owed)
-        for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
+    def _store_delivery(self, buffer: bytes, owed: tuple[int, ...]) -> None:
+        super()._store_delivery(buffer, owed)
+        for size, known in self._known_deliveries.items():
+            self._known_deliveries[size] = known._replace(head=b"", begin=0, tail=b"", end=size)
 
 
 class IsOwedAnything(ShortMachine):
     """Does not see that another answer is owed."""
 
-    def _receive_known(self) -> bool:
-        for size, known in self._deliveries.items():
-            self._deliveries[size] = known._replace(pending=self._open)
-        return super()._receive_known()
+    def _receive_known_delivery(self) -> bool:
+        for size, known in self._known_deliveries.items():
+            self._known_deliveries[size] = known._replace(pending=self._pending_ids)
+        return super()._receive_known_delivery()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from smartcam.emulator._insight.image import bitmap, check_image, grey_pattern
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames._inside import read_bitmap
 from smartcam.protocols._inside import StatusCode, words
-from tests.emulator.inside import Control, InSightCommands, InSightDevice, make_job, shown
+from tests.emulator.inside import Control, InSightCommands, InSightDevice, cell_text, make_job
 
 SECOND = 1_000_000_000
 
@@ -75,12 +75,12 @@ def test_job_that_is_wrong_says_where(fields: dict[str, Any], error: str) -> Non
     ],
 )
 def test_shown_writes_numbers_with_three_decimals(value: object, text: str) -> None:
-    assert shown(value) == text
+    assert cell_text(value) == text
 
 
 def test_cell_whose_function_fails_is_in_error(caplog: pytest.LogCaptureFixture) -> None:
     job = Job(file="a", cells={"A1": lambda run: 1 / (run - 1), "B1": lambda _run: object()})
-    cells = job.fresh_cells()
+    cells = job.loaded_cells()
     with caplog.at_level(logging.WARNING, "smartcam.emulator"):
         job.update_cells(cells, 1)
     assert cells == {"A001": "#ERR", "B001": "#ERR"}
@@ -159,10 +159,10 @@ def test_things_happen_in_order_each_at_its_own_time() -> None:
     told: list[tuple[int, StatusCode]] = []
     device.request_event(8, lambda code: told.append((device.now, code)), at_image=False)
     device.after(0.5, lambda: told.append((device.now, StatusCode.UNRECOGNIZED)))
-    assert device.due == SECOND // 4
+    assert device.next_event_at == SECOND // 4
     device.advance_to(10 * SECOND)
     assert told == [(SECOND // 2, 0), (3 * SECOND // 4, 1)]
-    assert device.due is None
+    assert device.next_event_at is None
     device.advance_to(SECOND)
     assert device.now == 10 * SECOND
 
