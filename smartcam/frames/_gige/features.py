@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeVar
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFeatureError, FrameSourceError, MessageError
-from smartcam.frames._features import Feature, spelled
+from smartcam.frames._features import Feature, spelling_key
 from smartcam.frames._gige.expressions import evaluate
 from smartcam.frames._gige.gvcp import text
 
@@ -93,7 +93,7 @@ class GenicamFeatures:
         self._steps = self._work = 0
         self._writing: Callable[[], None] | None = None
         self._lock = asyncio.Lock()  # guards the caches of a call
-        self._spellings = {spelled(name): name for name in nodes}
+        self._spellings = {spelling_key(name): name for name in nodes}
         self._selectors: dict[str, tuple[str, ...]] | None = None
 
     def share(self, other: GenicamFeatures) -> None:
@@ -117,7 +117,7 @@ class GenicamFeatures:
 
     def find(self, name: str) -> str:
         """Return the description's spelling of a name; an unknown name is returned unchanged."""
-        return name if name in self._nodes else self._spellings.get(spelled(name), name)
+        return name if name in self._nodes else self._spellings.get(spelling_key(name), name)
 
     async def get(self, name: str) -> FeatureValue:
         """Return a feature's value; for an enumeration, the entry's name.

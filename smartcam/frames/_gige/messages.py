@@ -13,7 +13,7 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._codecs.threads import at_once
+from smartcam.frames._codecs.threads import run_without_waiting
 from smartcam.frames._gige.block import picture_bytes
 from smartcam.frames._gige.features import GenicamFeatures
 
@@ -124,7 +124,7 @@ class MessageFeatures(GenicamFeatures):
             names = [name for number in parts for name in self._by_number.get(number, ())]
             for name in names[:MAX_MESSAGE_FEATURES]:
                 try:
-                    values[name] = at_once(self._as_user_value(self._named(name)))
+                    values[name] = run_without_waiting(self._as_user_value(self._named(name)))
                 except (MessageError, RuntimeError) as exc:
                     problems.append(f"{name}: {exc}")
         finally:

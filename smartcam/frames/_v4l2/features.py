@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFeatureError
-from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, spelled
+from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, spelling_key
 from smartcam.frames._v4l2 import abi
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class ControlFeature:
     @property
     def spellings(self) -> set[str]:
         """Letters and digits of all names of the feature."""
-        return {spelled(self.name), spelled(self.control.name)}
+        return {spelling_key(self.name), spelling_key(self.control.name)}
 
     def value(self, number: int | None) -> FeatureValue | None:
         """Return the feature's value for a number of the control."""
@@ -108,9 +108,9 @@ class ControlFeature:
     def number(self, value: FeatureValue) -> int | None:
         """Return the control's number for a value; None: the device has no such value."""
         if self._entries:
-            wanted = spelled(str(value))
+            wanted = spelling_key(str(value))
             names = self._entries.items()
-            return next((number for number, name in names if spelled(name) == wanted), None)
+            return next((number for number, name in names if spelling_key(name) == wanted), None)
         if isinstance(value, float) and self._sfnc.factor == 1:
             return self.control.number_of(int(value)) if value.is_integer() else None
         if not isinstance(value, float) and self._sfnc.factor == 1:
@@ -206,7 +206,7 @@ class V4L2Features(DeviceFeatures):
 
     async def _feature_named(self, name: str) -> ControlFeature:
         features = await self._all()
-        wanted = spelled(name)
+        wanted = spelling_key(name)
         for feature in features:
             if wanted in feature.spellings:
                 return feature
