@@ -129,7 +129,7 @@ async def test_gige_packets_count_of_the_camera_alone() -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as stranger:
         stranger.bind(("127.0.0.2", 0))
         stranger.sendto(bytes(size - 28), ("127.0.0.1", where.port))
-        assert not await where.test_packet(size, 0.1)
+        assert not await where.receives_test_packet(size, 0.1)
     where.close()
 
 
