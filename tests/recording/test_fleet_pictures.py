@@ -280,8 +280,9 @@ def test_results_that_are_alike_have_pictures_only_in_one_order(tmp_path: Path) 
         pictures = ReplayedPictures(found, "left", applications, 1.0)
         numbers: list[int | None] = []
         for data in given:
-            pictures.given(5, data)
-            numbers.append(None if pictures.shown is None else pictures.shown.sequence)
+            pictures.show_picture_of(5, data)
+            picture = pictures.current_picture
+            numbers.append(None if picture is None else picture.sequence)
         return numbers
 
     one = [(True, b"a"), (True, b"b"), (True, b"a")]
