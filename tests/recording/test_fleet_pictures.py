@@ -212,7 +212,8 @@ def _matched(*pictures: RecordedPicture, max_bytes: int = 1 << 20) -> list[int |
         matcher.add_picture(picture)
     matcher.results.append(result(1, 1.55, 1.05))
     return [
-        None if one.picture is None else one.picture.sequence for one in matcher.settled(over=True)
+        None if one.picture is None else one.picture.sequence
+        for one in matcher.take_matched(at_end=True)
     ]
 
 
