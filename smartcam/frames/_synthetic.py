@@ -45,17 +45,17 @@ class SyntheticDriver(TaskDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        given = address.parameters(["size", "fps", "name", "format"])
-        self._size = address.size(given.get("size", "640x480"))
+        parameters = address.parameters(["size", "fps", "name", "format"])
+        self._size = address.size(parameters.get("size", "640x480"))
         if self._size[0] < MIN_SIZE_PX[0] or self._size[1] < MIN_SIZE_PX[1]:
             raise address.wrong(
                 "size",
                 f"{MIN_SIZE_PX[0]}x{MIN_SIZE_PX[1]} or more, room for the stamp",
-                given["size"],
+                parameters["size"],
             )
-        self._format = _format(address, given.get("format", "Mono8"))
-        self._rate = address.number("fps", given.get("fps", "30"), 0.01, 10_000)
-        self._name = given.get("name", "synthetic")
+        self._format = _format(address, parameters.get("format", "Mono8"))
+        self._rate = address.number("fps", parameters.get("fps", "30"), 0.01, 10_000)
+        self._name = parameters.get("name", "synthetic")
         self._sequence = 0
 
     @property

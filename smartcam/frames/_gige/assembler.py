@@ -261,12 +261,12 @@ class Assembler:
             if not self._starts_at_one or header.block > MAX_OPEN_BLOCKS:
                 self._newest_number = self._closed_number = header.block - 1
         number = self._number_of(header.block, extended)
-        ahead = number - self._newest_number
+        advance = number - self._newest_number
         if header.kind == PacketKind.LEADER and self._shows_restart(
             number, bytes(data[header.size : size])
         ):
             number = self._restart_ids(header.block)
-        elif ahead > MAX_OPEN_BLOCKS + MAX_FRAME_RATE * min(now - self._accepted_at, 1e6):
+        elif advance > MAX_OPEN_BLOCKS + MAX_FRAME_RATE * min(now - self._accepted_at, 1e6):
             if header.kind != PacketKind.LEADER:
                 self.counts.late += 1
                 return None
@@ -290,10 +290,10 @@ class Assembler:
         """Return the number of a block: its id with wraps and restarts counted."""
         if extended:
             return block_id + self._number_offset
-        ahead = (block_id + self._number_offset - self._newest_number) % MAX_SHORT_ID
-        if ahead > MAX_SHORT_ID // 2:
-            ahead -= MAX_SHORT_ID
-        return self._newest_number + ahead
+        advance = (block_id + self._number_offset - self._newest_number) % MAX_SHORT_ID
+        if advance > MAX_SHORT_ID // 2:
+            advance -= MAX_SHORT_ID
+        return self._newest_number + advance
 
     def _shows_restart(self, number: int, leader: bytes) -> bool:
         """Return True if a leader shows that the camera restarted its block ids."""

@@ -154,7 +154,7 @@ def _camera_with_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamer
 
 
 async def _send_request(
-    payload: bytes, places: Sequence[Network], port: int, camera: AnsweringCamera
+    payload: bytes, interfaces: Sequence[Network], port: int, camera: AnsweringCamera
 ) -> None:
     """Broadcast the request in all networks until it is answered.
 
@@ -167,7 +167,7 @@ async def _send_request(
     transports: list[tuple[asyncio.DatagramTransport, Network]] = []
     datagram = encode(GvcpCommand.FORCEIP, _REQUEST_ID, payload, flags=ACK_REQUIRED)
     try:
-        for interface in places:
+        for interface in interfaces:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, _ = await loop.create_datagram_endpoint(
                     functools.partial(_ForceAnswers, status_future),
@@ -196,12 +196,12 @@ async def _send_request(
 
 
 async def _wait_for_camera(
-    mac: str, address: str, places: Sequence[Network], port: int
+    mac: str, address: str, interfaces: Sequence[Network], port: int
 ) -> FoundSource:
     loop = asyncio.get_running_loop()
     end = loop.time() + APPEAR_TIMEOUT
     while True:
-        for camera in await find(places, port=port):
+        for camera in await find(interfaces, port=port):
             if camera.info.mac == mac and camera.info.address == address:
                 return as_source(camera._replace(address=address))
         if loop.time() >= end:

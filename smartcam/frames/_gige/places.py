@@ -37,25 +37,25 @@ def wanted(address: FrameAddress) -> WantedStream:
     features = [
         name for name in names if name.startswith(FEATURE_PREFIX) and name != FEATURE_PREFIX
     ]
-    given = address.parameters([*_PARAMETERS, *features])
+    parameters = address.parameters([*_PARAMETERS, *features])
     if address.path not in ("", "/"):
         raise address.wrong("path", "gige://HOST", address.path)
-    if "serial" in given and address.host:
-        raise address.wrong("serial", "none beside an address", given["serial"])
-    resend = given.get("resend", "on")
+    if "serial" in parameters and address.host:
+        raise address.wrong("serial", "none together with an address", parameters["serial"])
+    resend = parameters.get("resend", "on")
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
-    packet_size = given.get("packet_size", "auto")
+    packet_size = parameters.get("packet_size", "auto")
     size = 0.0
     if packet_size != "auto":
         size = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
-        given,
-        address.size(given["size"]) if "size" in given else None,
-        address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
+        parameters,
+        address.size(parameters["size"]) if "size" in parameters else None,
+        address.number("fps", parameters["fps"], 0.001, 100_000) if "fps" in parameters else None,
         int(size) & ~3,
         resend == "on",
-        given.get("trigger"),
+        parameters.get("trigger"),
     )
 
 

@@ -100,18 +100,18 @@ class VideoDriver(FrameDriver):
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         self._path, fragment = _split_fragment(address)
-        given = address.parameters(_PARAMETERS[address.scheme], fragment)
+        parameters = address.parameters(_PARAMETERS[address.scheme], fragment)
         number = address.number
-        self._name = given.get("name") or _name(address, self._path)
-        self._timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
-        self._delay = number("delay", given.get("delay", "1"), 0, 600)
-        self._fps = number("fps", given["fps"], 0.01, 10_000) if "fps" in given else None
-        self._keeps_pace = one_of(address, "pace", given, ("real", "none")) == "real"
-        self._format = wanted_format(address, given.get("format"))
-        self._options = _options(address, given)
-        self._allows_mixed = one_of(address, "mixed", given, ("no", "yes")) == "yes"
-        self._allows_elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
-        self._tls = tls_context(address, given)
+        self._name = parameters.get("name") or _name(address, self._path)
+        self._timeout = number("timeout", parameters.get("timeout", "5"), 0.1, 600)
+        self._delay = number("delay", parameters.get("delay", "1"), 0, 600)
+        self._fps = number("fps", parameters["fps"], 0.01, 10_000) if "fps" in parameters else None
+        self._keeps_pace = one_of(address, "pace", parameters, ("real", "none")) == "real"
+        self._format = wanted_format(address, parameters.get("format"))
+        self._options = _options(address, parameters)
+        self._allows_mixed = one_of(address, "mixed", parameters, ("no", "yes")) == "yes"
+        self._allows_elsewhere = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
+        self._tls = tls_context(address, parameters)
         self._thread: _ReadingThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
@@ -343,60 +343,62 @@ def _name(address: FrameAddress, path: str) -> str:
     return address.shown.partition("#")[0].partition("?")[0]
 
 
-def wanted_format(address: FrameAddress, given: str | None) -> PixelFormat | None:
+def wanted_format(address: FrameAddress, name: str | None) -> PixelFormat | None:
     """Return the format that a parameter names; None without the parameter."""
-    known = [*CONVERTIBLE, "MJPEG", "H264"]
-    if given is None:
+    choices = [*CONVERTIBLE, "MJPEG", "H264"]
+    if name is None:
         return None
     try:
-        pixel_format = find_format(given)
+        pixel_format = find_format(name)
     except FrameFormatError:
         pixel_format = None
-    if pixel_format is None or pixel_format.name not in known:
-        raise address.wrong("format", f"one of {', '.join(known)}", given)
+    if pixel_format is None or pixel_format.name not in choices:
+        raise address.wrong("format", f"one of {', '.join(choices)}", name)
     return pixel_format
 
 
-def one_of(address: FrameAddress, name: str, given: dict[str, str], known: tuple[str, ...]) -> str:
-    """Return a parameter's value, by default the first of the known values."""
-    value = given.get(name, known[0])
-    if value not in known:
-        raise address.wrong(name, " or ".join(known), value)
+def one_of(
+    address: FrameAddress, name: str, parameters: dict[str, str], choices: tuple[str, ...]
+) -> str:
+    """Return a parameter's value, by default the first of the choices."""
+    value = parameters.get(name, choices[0])
+    if value not in choices:
+        raise address.wrong(name, " or ".join(choices), value)
     return value
 
 
-def _options(address: FrameAddress, given: dict[str, str]) -> dict[str, str]:
+def _options(address: FrameAddress, parameters: dict[str, str]) -> dict[str, str]:
     """Return FFmpeg's options."""
     options: dict[str, str] = {}
     if address.scheme.startswith("rtsp"):
         options |= LIVE_OPTIONS | {
-            "rtsp_transport": one_of(address, "transport", given, ("tcp", "udp"))
+            "rtsp_transport": one_of(address, "transport", parameters, ("tcp", "udp"))
         }
     if address.scheme in ("https", "rtsps"):
-        verifies = one_of(address, "verify", given, ("yes", "no")) == "yes"
+        verifies = one_of(address, "verify", parameters, ("yes", "no")) == "yes"
         options |= (
-            {"tls_verify": "1", "ca_file": _trusted_certificates(given)}
+            {"tls_verify": "1", "ca_file": _trusted_certificates(parameters)}
             if verifies
             else {"tls_verify": "0"}
         )
     return options
 
 
-def _trusted_certificates(given: dict[str, str]) -> str:
+def _trusted_certificates(parameters: dict[str, str]) -> str:
     """Return the file of trusted certificates."""
     paths = ssl.get_default_verify_paths()
-    return given.get("ca") or paths.cafile or paths.openssl_cafile
+    return parameters.get("ca") or paths.cafile or paths.openssl_cafile
 
 
-def tls_context(address: FrameAddress, given: dict[str, str]) -> ssl.SSLContext | None:
+def tls_context(address: FrameAddress, parameters: dict[str, str]) -> ssl.SSLContext | None:
     """Return the TLS context of a URL's settings; None without TLS."""
     if address.scheme not in ("https", "rtsps"):
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    if one_of(address, "verify", given, ("yes", "no")) == "no":
+    if one_of(address, "verify", parameters, ("yes", "no")) == "no":
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
-    elif trusted := _trusted_certificates(given):
+    elif trusted := _trusted_certificates(parameters):
         with contextlib.suppress(OSError, ssl.SSLError):  # connecting reports the error
             context.load_verify_locations(trusted)
     return context

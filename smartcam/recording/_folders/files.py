@@ -76,23 +76,23 @@ class FolderFiles:
         Raises:
             OSError: the remaining records could not be written.
         """
-        done = written = 0
+        done_count = written = 0
         try:
             for index, entry in enumerate(entries):
-                if track.file is None or (not index % ITEMS_PER_CHECK and self._is_full(track)):
+                if track.file is None or (not index % ITEMS_PER_CHECK and self._must_end(track)):
                     self._flush(track, written)
-                    done, written = index, 0
+                    done_count, written = index, 0
                     self._begin_file(track, entry)
                 written += self._add(track, entry)
             self._flush(track, written)
-            done = len(entries)
+            done_count = len(entries)
         except BaseException:
             self._cut_file(track)
             raise
         finally:
-            del entries[:done]
+            del entries[:done_count]
 
-    def _is_full(self, track: CameraTrack) -> bool:
+    def _must_end(self, track: CameraTrack) -> bool:
         aged = self._clock() - track.begun_at >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
@@ -204,7 +204,7 @@ class FolderFiles:
     def end_old(self, tracks: Iterable[CameraTrack]) -> None:
         """End files that are old enough, also of silent cameras."""
         for track in tracks:
-            if self._is_full(track) and self._clock() - track.begun_at >= self._limits.age:
+            if self._must_end(track) and self._clock() - track.begun_at >= self._limits.age:
                 self.finish(track)
 
     # ------------------------------------------------------------------ the bound on the disk

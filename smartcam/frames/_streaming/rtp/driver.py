@@ -49,17 +49,17 @@ class RtpDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        given = address.parameters(PARAMETERS)
+        parameters = address.parameters(PARAMETERS)
         number = address.number
-        self._size = address.size(given["size"]) if "size" in given else None
+        self._size = address.size(parameters["size"]) if "size" in parameters else None
         self._plan = _RtpPlan(
-            given.get("name") or address.shown.partition("?")[0],
-            int(number("payload", given.get("payload", "96"), 0, 127)),
-            number("repair", given.get("repair", "0.1"), 0, 1),
-            number("timeout", given.get("timeout", "5"), 0.1, 600),
-            number("delay", given.get("delay", "1"), 0, 600),
+            parameters.get("name") or address.shown.partition("?")[0],
+            int(number("payload", parameters.get("payload", "96"), 0, 127)),
+            number("repair", parameters.get("repair", "0.1"), 0, 1),
+            number("timeout", parameters.get("timeout", "5"), 0.1, 600),
+            number("delay", parameters.get("delay", "1"), 0, 600),
         )
-        self._sender_host = given.get("from", "")
+        self._sender_host = parameters.get("from", "")
         if not address.host or not 1 <= (address.port or 5004) < 65535:
             raise address.wrong("address", "HOST:PORT with a port below 65535", address.shown)
         self._host_and_port = (address.host, address.port or 5004)

@@ -68,20 +68,20 @@ class RtspDriver(FrameDriver):
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         secure = address.scheme == "rtsps"
-        given = address.parameters(
+        parameters = address.parameters(
             sorted((*PARAMETERS, "ca", "verify")) if secure else PARAMETERS, address.fragment
         )
         number = address.number
-        self._name = given.get("name") or address.shown.partition("#")[0].partition("?")[0]
-        self._delay = number("delay", given.get("delay", "1"), 0, 600)
-        wanted = wanted_format(address, given.get("format"))
+        self._name = parameters.get("name") or address.shown.partition("#")[0].partition("?")[0]
+        self._delay = number("delay", parameters.get("delay", "1"), 0, 600)
+        wanted = wanted_format(address, parameters.get("format"))
         self._format = "" if wanted is None else wanted.name
-        transport = one_of(address, "transport", given, ("tcp", "udp"))
-        transports = (transport,) if "transport" in given else ("tcp", "udp")
-        follows_elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
-        timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
+        transport = one_of(address, "transport", parameters, ("tcp", "udp"))
+        transports = (transport,) if "transport" in parameters else ("tcp", "udp")
+        follows_elsewhere = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
+        timeout = number("timeout", parameters.get("timeout", "5"), 0.1, 600)
         url = address.url.partition("#")[0]
-        tls = tls_context(address, given)
+        tls = tls_context(address, parameters)
         if not address.host:
             raise address.wrong("address", "rtsp://HOST/PATH", address.shown)
         self._plan = ConversationPlan(self._name, url, timeout, transports, follows_elsewhere, tls)
