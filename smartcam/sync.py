@@ -556,14 +556,14 @@ class SyncFrameReader(SyncFrameReaderBase):
         return self._do(self._reader.statistics)
 
     def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame if it is not older than ``max_age``.
+        """Return the newest frame that is not older than ``max_age``.
 
         As :meth:`smartcam.frames.FrameReader.newest`.
         """
         return self._wait(self._reader.newest, max_age=max_age, timeout=timeout)
 
     def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame, from the waiting one on, whose exposure began after a moment.
+        """Return the first frame whose exposure began after a moment.
 
         As :meth:`smartcam.frames.FrameReader.after`.
         """

@@ -132,7 +132,7 @@ from smartcam.recording import Recorder
 
 with tempfile.TemporaryDirectory() as folder:
     recorder = Recorder(folder + "/a.mcap").open()
-    held(recorder._more)
+    held(recorder._condition)
 
     def child():
         recorder.on_error("camera", smartcam.ConnectionLostError("gone"), None)

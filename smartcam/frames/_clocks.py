@@ -10,13 +10,14 @@ MAX_INTERVALS: Final = 40
 """Largest number of intervals that are kept."""
 
 INTERVAL_DURATION: Final = 0.5
-"""Seconds of one interval, of which only the frame with the shortest delay is kept."""
+"""Seconds of one interval; only the frame with the shortest delay in it is kept."""
 
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
-"""Seconds by which a frame comes too early for its clock after a jump of the clock."""
+"""A frame that comes earlier by this number of seconds than its clock allows shows that the clock
+jumped."""
 
-MIN_SURE_INTERVALS: Final = 4
-"""Number of intervals after which such a jump is certain: earlier, all frames may be late."""
+MIN_INTERVALS_FOR_JUMP: Final = 4
+"""Number of intervals after which an early frame proves a jump: before, all frames may be late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
 """Least duration of frames, seconds, to measure a drift."""
@@ -42,100 +43,103 @@ class DeviceClock:
     """The offset of a device's clock from the host's, estimated from the arrival of its frames.
 
     A frame arrives with a varying delay. So arrival minus device time has a lower edge: the offset
-    between the clocks plus the shortest delay; its slope is the drift. The estimated time is late
-    by the shortest delay only.
+    between the clocks plus the shortest delay. The slope of this edge is the drift. The estimated
+    time is late by the shortest delay only.
 
     The offset rises no faster than a clock can drift, so a queue that delays all frames does not
-    change it. A clock that was set back by less than the time between two frames looks like a
-    queue; its frames count as too old until the offset has adapted.
+    change it. If a clock is set back by less than the time between two frames, this looks like a
+    queue: the frames' times are too early until the offset has adapted.
 
     Attributes:
         jumps: number of times that the clock was reset.
     """
 
     def __init__(self) -> None:
-        self._lowest = collections.deque[tuple[float, float]](maxlen=MAX_INTERVALS)
+        self._interval_minima = collections.deque[tuple[float, float]](maxlen=MAX_INTERVALS)
         self._drift: float | None = None
-        self._edge = (0.0, 0.0)  # point on the lower edge
-        self._last: float | None = None
-        self._piece_began = 0.0
+        self._edge_point = (0.0, 0.0)  # point on the lower edge
+        self._last_device_time: float | None = None
+        self._interval_start = 0.0
         self._last_offset: float | None = None  # offset at the last frame
-        self._before_queue: float | None = None  # offset before frames were delayed
+        self._offset_before_queue: float | None = None  # offset before frames were delayed
         self.jumps = 0
 
     def statistics(self) -> ClockStatistics:
         """Return the drift and the jumps of the device's clock known so far."""
-        # device = (arrival - offset) / (1 + slope): a slope above 0 is a clock that is too slow
+        # device time = (arrival - offset) / (1 + slope): with a slope above 0 the clock is too slow
         drift = None if self._drift is None else -self._drift / (1 + self._drift)
         return ClockStatistics(drift, self.jumps)
 
-    def captured(self, device: float, arrival: float) -> float:
+    def host_time(self, device_time: float, arrival: float) -> float:
         """Return a device's time on the host's clock, never later than ``arrival``.
 
         Args:
-            device: time of the device's clock, seconds.
+            device_time: time of the device's clock, seconds.
             arrival: time of arrival, seconds of ``time.monotonic()``.
         """
-        if self._jumped(device, arrival):
+        if self._has_jumped(device_time, arrival):
             self.jumps += 1
-            self._lowest.clear()
-            self._drift = self._last_offset = self._before_queue = None
-        self._remember(device, arrival - device)
-        offset = self._offset(device)
-        if self._last_offset is not None and self._last is not None:
-            highest = self._last_offset + MAX_DRIFT * (device - self._last)
+            self._interval_minima.clear()
+            self._drift = self._last_offset = self._offset_before_queue = None
+        self._add_point(device_time, arrival - device_time)
+        offset = self._offset(device_time)
+        if self._last_offset is not None and self._last_device_time is not None:
+            highest = self._last_offset + MAX_DRIFT * (device_time - self._last_device_time)
             if offset <= highest:
-                self._before_queue = None
-            elif self._before_queue is None:
-                self._before_queue = self._last_offset
+                self._offset_before_queue = None
+            elif self._offset_before_queue is None:
+                self._offset_before_queue = self._last_offset
             offset = min(offset, highest)
-        self._last_offset, self._last = offset, device
-        return min(arrival, device + offset)
+        self._last_offset, self._last_device_time = offset, device_time
+        return min(arrival, device_time + offset)
 
-    def _jumped(self, device: float, arrival: float) -> bool:
-        if self._last is None:
+    def _has_jumped(self, device_time: float, arrival: float) -> bool:
+        if self._last_device_time is None:
             return False
-        if device < self._last:
+        if device_time < self._last_device_time:
             return True
-        late = arrival - device - self._offset(device)
-        if self._before_queue is not None:  # the delay has ended
-            late = max(late, arrival - device - self._before_queue)
-        return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= MIN_SURE_INTERVALS
+        lateness = arrival - device_time - self._offset(device_time)
+        if self._offset_before_queue is not None:  # the delay has ended
+            lateness = max(lateness, arrival - device_time - self._offset_before_queue)
+        return (
+            lateness < -MIN_EARLY_JUMP_SECONDS
+            and len(self._interval_minima) >= MIN_INTERVALS_FOR_JUMP
+        )
 
-    def _remember(self, device: float, offset: float) -> None:
-        if not self._lowest or device - self._piece_began >= INTERVAL_DURATION:
-            self._piece_began = device
-            self._lowest.append((device, offset))
-        elif offset < self._lowest[-1][1]:
-            self._lowest[-1] = (device, offset)
+    def _add_point(self, device_time: float, offset: float) -> None:
+        if not self._interval_minima or device_time - self._interval_start >= INTERVAL_DURATION:
+            self._interval_start = device_time
+            self._interval_minima.append((device_time, offset))
+        elif offset < self._interval_minima[-1][1]:
+            self._interval_minima[-1] = (device_time, offset)
         else:
             return
         self._drift = self._slope()
-        self._edge = _lowest(list(self._lowest), self._drift or 0.0)
+        self._edge_point = _lowest_point(list(self._interval_minima), self._drift or 0.0)
 
     def _slope(self) -> float | None:
         """Return the slope of the lower edge; None if too little is known."""
-        points = list(self._lowest)
+        points = list(self._interval_minima)
         if points[-1][0] - points[0][0] < MIN_DRIFT_DURATION:
             return None
         half = len(points) // 2
-        first, second = _lowest(points[:half], 0.0), _lowest(points[half:], 0.0)
+        first, second = _lowest_point(points[:half], 0.0), _lowest_point(points[half:], 0.0)
         for _ in range(3):  # iterate with the slope subtracted
             slope = _slope(first, second)
-            first = _lowest(points[:half], slope)
-            second = _lowest(points[half:], slope)
+            first = _lowest_point(points[:half], slope)
+            second = _lowest_point(points[half:], slope)
         slope = _slope(first, second)
         return slope if abs(slope) <= MAX_DRIFT else None
 
-    def _offset(self, device: float) -> float:
-        at, offset = self._edge
-        return offset + (self._drift or 0.0) * (device - at)
+    def _offset(self, device_time: float) -> float:
+        edge_time, offset = self._edge_point
+        return offset + (self._drift or 0.0) * (device_time - edge_time)
 
 
 def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:
     return (second[1] - first[1]) / (second[0] - first[0])
 
 
-def _lowest(points: list[tuple[float, float]], slope: float) -> tuple[float, float]:
+def _lowest_point(points: list[tuple[float, float]], slope: float) -> tuple[float, float]:
     """Return the lowest point relative to a line of the given slope."""
     return min(points, key=lambda point: point[1] - slope * point[0])

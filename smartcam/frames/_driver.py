@@ -71,17 +71,17 @@ class FrameSink(ABC):
         """Count lost frames; the next frame does not count them again."""
 
     def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
-        """Note that frames were replaced by newer ones at the far end of a link."""
+        """Count frames that the far end of a link replaced by newer ones."""
 
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
-        """Note that no more frames come; readers get ``error``, which is None at a file's end."""
+        """End the stream: readers get ``error``, which is None at the end of a file."""
 
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
-        """Note that the picture of the pending trigger will not come."""
+        """Report that the picture of the pending trigger will not come."""
 
     async def wait_taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
-        """Return once every reader has taken the last frame, for a recording that must lose none.
+        """Wait until every reader has taken the last frame, for a source that must lose none.
 
         Cancellation: safe.
         """
@@ -104,8 +104,8 @@ class FrameDriver(ABC):
         lists_features: whether its device can list its features.
         form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
         waits_for: condition that the device awaits before each picture, for error texts, such as
-            ``TriggerSource is Line1``; ``""``: the device streams freely. A waiting device is never
-            considered stuck.
+            ``TriggerSource is Line1``; ``""``: the device streams freely. A device that awaits a
+            condition is never considered stuck.
     """
 
     times_frames: ClassVar[bool] = False
@@ -163,8 +163,8 @@ class FrameDriver(ABC):
         """Trigger one picture, and return when the device has accepted the trigger.
 
         The frame that the trigger causes goes into the sink with ``pending.number`` in its
-        ``trigger``; ``sink.trigger_failed`` reports a picture that will not come. It is called
-        while the device streams, and again only after :meth:`disarm`.
+        ``trigger``; ``sink.trigger_failed`` reports a picture that will not come. The source calls
+        this method while the device streams, and again only after :meth:`disarm`.
 
         Args:
             pending: the trigger; ``pending.fire_begins()`` is called right before it is sent, and
@@ -182,14 +182,14 @@ class FrameDriver(ABC):
         )
 
     async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
-        """Trigger the device by the process that owns it, and return the picture.
+        """Let the process that owns the device trigger it, and return the picture.
 
         Args:
             timeout: seconds for the whole call.
             refuse: whether to raise if another trigger is pending.
 
         Returns:
-            None for a local device, which :meth:`trigger` triggers.
+            The picture; None for a local device, which :meth:`trigger` triggers.
 
         Raises:
             SmartCamError: as for :meth:`FrameSource.trigger`.

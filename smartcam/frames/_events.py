@@ -1,4 +1,4 @@
-"""Read the events that a device reports beside its pictures."""
+"""Read the events that a device reports in addition to its pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_EVENTS = 100_000
 
 MAX_EVENT_NAMES = 64
-"""Largest number of kinds of events of one reader."""
+"""Largest number of event names that one reader may read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class FrameEvent:
         device_time: seconds of the device's own clock; None: the device has none.
         arrived: time of arrival, seconds of ``time.monotonic()``.
         data: values that came with the event, by the name of their feature.
-        lost: number of events that this reader lost right before, since it was too slow.
+        lost: number of events dropped right before this one, since the reader was too slow.
         remark: reason why a value could not be read; mostly empty.
     """
 
@@ -79,9 +79,10 @@ class FrameEvents:
         self._queue: collections.deque[FrameEvent] = collections.deque()
         self._size = size
         self._lost = 0
-        self._arrived = asyncio.Event()
-        self._end: Callable[[], Coroutine[Any, Any, None]] | None = None
-        self._over: tuple[FrameSourceError | None] | None = None
+        self._changed = asyncio.Event()
+        self._stop_reports: Callable[[], Coroutine[Any, Any, None]] | None = None
+        # error with which the events ended, or None, in a tuple; None: they have not ended
+        self._end_cause: tuple[FrameSourceError | None] | None = None
 
     async def __aenter__(self) -> Self:
         """Start reports of the device's events.
@@ -92,18 +93,20 @@ class FrameEvents:
 
         Cancellation: the events are switched off again.
         """
-        if self._end is not None:
+        if self._stop_reports is not None:
             raise LocalProtocolError(f"{self._source.name}: these events are read already")
-        self._over = None
-        self._end = await self._source.watch_events(self._names, self._take, self._ended)
+        self._end_cause = None
+        self._stop_reports = await self._source.watch_events(
+            self._names, self._add_event, self._finish
+        )
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Switch the events off, unless another reader uses them."""
-        end, self._end = self._end, None
-        self._ended(None)
-        if end is not None:
-            await finish(end)
+        stop_reports, self._stop_reports = self._stop_reports, None
+        self._finish(None)
+        if stop_reports is not None:
+            await finish(stop_reports)
 
     def __aiter__(self) -> Self:
         return self
@@ -120,10 +123,10 @@ class FrameEvents:
         try:
             async with asyncio.timeout(self._timeout):
                 while not self._queue:
-                    if self._over is not None:
-                        raise self._over[0] or StopAsyncIteration
-                    self._arrived.clear()
-                    await self._arrived.wait()
+                    if self._end_cause is not None:
+                        raise self._end_cause[0] or StopAsyncIteration
+                    self._changed.clear()
+                    await self._changed.wait()
         except FrameSourceError:
             raise
         except TimeoutError as exc:
@@ -136,13 +139,13 @@ class FrameEvents:
         event = self._queue.popleft()
         return replace(event, lost=lost) if lost else event
 
-    def _take(self, event: FrameEvent) -> None:
+    def _add_event(self, event: FrameEvent) -> None:
         if len(self._queue) >= self._size:
             self._queue.popleft()
             self._lost += 1
         self._queue.append(event)
-        self._arrived.set()
+        self._changed.set()
 
-    def _ended(self, error: FrameSourceError | None) -> None:
-        self._over = self._over or (error,)
-        self._arrived.set()
+    def _finish(self, error: FrameSourceError | None) -> None:
+        self._end_cause = self._end_cause or (error,)
+        self._changed.set()

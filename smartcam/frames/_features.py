@@ -48,7 +48,8 @@ class Feature:
         step: difference between two neighbouring values; None: no number, or no steps.
         unit: unit of the value, such as ``us``; ``""``: no unit.
         entries: names of the values that an enumeration can have now.
-        selectors: features that select the instance of this one, such as ``TriggerSelector``.
+        selectors: features that select which instance of this feature is meant, such as
+            ``TriggerSelector``.
         description: text by the device's maker.
         problem: reason why value or range could not be read; ``""``: no problem.
     """
@@ -75,20 +76,20 @@ class Feature:
             return ", ".join(self.entries)
         if self.minimum is None and self.maximum is None:
             return {"command": "a command", "string": "text"}.get(self.kind, "any number")
-        ends = f"{_number(self.minimum)} to {_number(self.maximum)}"
-        step = f" in steps of {_number(self.step)}" if self.step not in (None, 0, 1) else ""
-        return f"{ends}{f' {self.unit}' if self.unit else ''}{step}"
+        limits = f"{_number_text(self.minimum)} to {_number_text(self.maximum)}"
+        step = f" in steps of {_number_text(self.step)}" if self.step not in (None, 0, 1) else ""
+        return f"{limits}{f' {self.unit}' if self.unit else ''}{step}"
 
     def __str__(self) -> str:
         """Return the feature as a line of a list."""
-        now = "" if self.value is None else f" = {as_text(self.value)}"
-        now += f" {self.unit}" if self.value is not None and self.unit else ""
+        value = "" if self.value is None else f" = {as_text(self.value)}"
+        value += f" {self.unit}" if self.value is not None and self.unit else ""
         access = {"rw": "", "": "; not available now"}.get(self.access, f"; {self.access}")
         problem = f"; {self.problem}" if self.problem else ""
-        return f"{self.name}{now} ({self.range}{access}{problem})"
+        return f"{self.name}{value} ({self.range}{access}{problem})"
 
 
-def _number(value: float | None) -> str:
+def _number_text(value: float | None) -> str:
     if value is None:
         return "any"
     return str(value) if isinstance(value, int) else f"{value:g}"
@@ -131,8 +132,8 @@ class DeviceFeatures(ABC):
         """Execute a command, and wait until it is done."""
 
 
-def spelled(name: str) -> str:
-    """Return a name's letters and digits, which are equal for all spellings of the name."""
+def spelling_key(name: str) -> str:
+    """Return a name's letters and digits in lower case, which all spellings of a name share."""
     return "".join(character for character in name.lower() if character.isalnum())
 
 
@@ -140,15 +141,15 @@ class FrameFeatures:
     """The features of a source's device, by name: ``await source.features["Gain"].set(6.0)``.
 
     Args:
-        device: function that returns the driver's features, or raises the error that explains why
-            there are none now.
-        changed: function that is called after each change of a feature.
+        get_features: function that returns the driver's features, or raises the error that explains
+            why there are none now.
+        on_change: function that is called after each change of a feature.
     """
 
     def __init__(
-        self, device: Callable[[], DeviceFeatures], changed: Callable[[], Awaitable[None]]
+        self, get_features: Callable[[], DeviceFeatures], on_change: Callable[[], Awaitable[None]]
     ) -> None:
-        self._device, self._changed = device, changed
+        self._get_features, self._on_change = get_features, on_change
 
     def __getitem__(self, name: str) -> FrameFeature:
         """Return the feature of a name, which the device checks only when it is used.
@@ -156,8 +157,8 @@ class FrameFeatures:
         Raises:
             ConfigurationError: the name is no text.
         """
-        given = check_text(name, "name", "features", most=MAX_VALUE_LENGTH)
-        return FrameFeature(given, self._device, self._changed)
+        checked = check_text(name, "name", "features", most=MAX_VALUE_LENGTH)
+        return FrameFeature(checked, self._get_features, self._on_change)
 
     async def names(self, *, timeout: float = FEATURE_TIMEOUT) -> list[str]:
         """Return the names of all features.
@@ -168,8 +169,8 @@ class FrameFeatures:
 
         Cancellation: safe.
         """
-        async with _within(timeout, "the list of features"):
-            return await self._device().names()
+        async with _time_limit(timeout, "the list of features"):
+            return await self._get_features().names()
 
     async def describe(self, *, timeout: float = 6 * FEATURE_TIMEOUT) -> dict[str, Feature]:
         """Return all features with their present values and ranges, by name; there may be hundreds.
@@ -180,8 +181,8 @@ class FrameFeatures:
 
         Cancellation: safe.
         """
-        async with _within(timeout, "all features"):
-            return await self._device().describe_all()
+        async with _time_limit(timeout, "all features"):
+            return await self._get_features().describe_all()
 
     async def load(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
         """Load the device's features from a user set, such as ``UserSet1``.
@@ -195,7 +196,7 @@ class FrameFeatures:
 
         Cancellation: the device may have loaded it.
         """
-        await self._with_set(user_set, "UserSetLoad", timeout)
+        await self._execute_with_set(user_set, "UserSetLoad", timeout)
 
     async def save(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
         """Save the device's present features in a user set.
@@ -209,7 +210,7 @@ class FrameFeatures:
 
         Cancellation: the device may have saved it.
         """
-        await self._with_set(user_set, "UserSetSave", timeout)
+        await self._execute_with_set(user_set, "UserSetSave", timeout)
 
     async def start_with(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
         """Set the user set that the device loads when it is switched on (``UserSetDefault``).
@@ -217,18 +218,18 @@ class FrameFeatures:
         Raises:
             FrameFeatureError: there is no such set, or the device has no default set.
 
-        Cancellation: the device may have executed it.
+        Cancellation: the device may have set it.
         """
-        given = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
-        features = {spelled(name): name for name in await self.names(timeout=timeout)}
+        checked = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
+        features = {spelling_key(name): name for name in await self.names(timeout=timeout)}
         name = features.get(
             "usersetdefault", features.get("usersetdefaultselector", "UserSetDefault")
         )
-        await self[name].set(given, timeout=timeout)
+        await self[name].set(checked, timeout=timeout)
 
-    async def _with_set(self, user_set: str, command: str, timeout: float) -> None:
-        given = check_text(user_set, "user_set", "features", most=MAX_VALUE_LENGTH)
-        await self["UserSetSelector"].set(given, timeout=timeout)
+    async def _execute_with_set(self, user_set: str, command: str, timeout: float) -> None:
+        checked = check_text(user_set, "user_set", "features", most=MAX_VALUE_LENGTH)
+        await self["UserSetSelector"].set(checked, timeout=timeout)
         await self[command].execute(timeout=timeout)
 
 
@@ -242,11 +243,11 @@ class FrameFeature:
     def __init__(
         self,
         name: str,
-        device: Callable[[], DeviceFeatures],
-        changed: Callable[[], Awaitable[None]],
+        get_features: Callable[[], DeviceFeatures],
+        on_change: Callable[[], Awaitable[None]],
     ) -> None:
         self.name: str = name
-        self._device, self._changed = device, changed
+        self._get_features, self._on_change = get_features, on_change
 
     async def get(self, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
         """Return the value.
@@ -258,8 +259,8 @@ class FrameFeature:
 
         Cancellation: safe.
         """
-        async with _within(timeout, f"feature {self.name}"):
-            return await self._device().get(self.name)
+        async with _time_limit(timeout, f"feature {self.name}"):
+            return await self._get_features().get(self.name)
 
     async def describe(self, *, timeout: float = FEATURE_TIMEOUT) -> Feature:
         """Return the feature with its present value, range, unit, entries and access.
@@ -271,8 +272,8 @@ class FrameFeature:
 
         Cancellation: safe.
         """
-        async with _within(timeout, f"feature {self.name}"):
-            return await self._device().describe(self.name)
+        async with _time_limit(timeout, f"feature {self.name}"):
+            return await self._get_features().describe(self.name)
 
     async def set(self, value: FeatureValue, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
         """Set the feature; return the device's new value, perhaps rounded.
@@ -290,11 +291,11 @@ class FrameFeature:
 
         Cancellation: the device may have set the value.
         """
-        given = checked_value(value)
-        async with _within(timeout, f"feature {self.name} to be set"):
-            has = await self._device().set(self.name, given)
-            await self._changed()
-            return has
+        checked = checked_value(value)
+        async with _time_limit(timeout, f"feature {self.name} to be set"):
+            new_value = await self._get_features().set(self.name, checked)
+            await self._on_change()
+            return new_value
 
     async def execute(self, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
         """Execute the command, and wait until it is done.
@@ -306,9 +307,9 @@ class FrameFeature:
 
         Cancellation: the device may have executed it.
         """
-        async with _within(timeout, f"command {self.name} to be done"):
-            await self._device().execute(self.name)
-            await self._changed()
+        async with _time_limit(timeout, f"command {self.name} to be done"):
+            await self._get_features().execute(self.name)
+            await self._on_change()
 
 
 def checked_value(value: object) -> FeatureValue:
@@ -317,17 +318,17 @@ def checked_value(value: object) -> FeatureValue:
     Raises:
         ConfigurationError: the value is not valid.
     """
-    given = plain(value)
-    if isinstance(given, str):
-        return check_text(given, "value", "set", most=MAX_VALUE_LENGTH)
-    if isinstance(given, (bool, int)) or (isinstance(given, float) and math.isfinite(given)):
-        return given
+    checked = plain(value)
+    if isinstance(checked, str):
+        return check_text(checked, "value", "set", most=MAX_VALUE_LENGTH)
+    if isinstance(checked, (bool, int)) or (isinstance(checked, float) and math.isfinite(checked)):
+        return checked
     raise wrong_argument("value", "a finite number, True or False, or a text", value, "set")
 
 
 @contextlib.asynccontextmanager
-async def _within(timeout: object, awaited: str) -> AsyncIterator[None]:
-    """Limit the time of a block; raise FrameTimeoutError that names ``awaited``."""
+async def _time_limit(timeout: object, expected: str) -> AsyncIterator[None]:
+    """Limit the time of a block; raise FrameTimeoutError that names what was expected."""
     seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
     try:
         async with asyncio.timeout(seconds):
@@ -335,4 +336,4 @@ async def _within(timeout: object, awaited: str) -> AsyncIterator[None]:
     except FrameSourceError:
         raise
     except TimeoutError as exc:
-        raise FrameTimeoutError(f"expected {awaited} within {seconds:g} s, got no answer") from exc
+        raise FrameTimeoutError(f"expected {expected} within {seconds:g} s, got no answer") from exc

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from smartcam.frames._pixels.apart import JoinedOnUse
+from smartcam.frames._pixels.apart import JoinedPlanes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,7 +41,7 @@ class FrameTrigger:
     Attributes:
         number: number of the trigger, counted by its source.
         fired: time right before it was sent, seconds of ``time.monotonic()``.
-        evidence: sentences why this trigger caused the frame.
+        evidence: sentences that say why this trigger must have caused the frame.
     """
 
     number: int
@@ -69,7 +69,7 @@ class Frame:
             time. A driver with a device time gives the arrival as ``captured``; the source replaces
             it by the device time, converted to the host's clock.
         sequence: the camera's number of the frame, which also counts lost frames.
-        lost: number of frames lost, on the way or in the camera, since the frame before.
+        lost: number of frames lost, on the way or in the camera, since the previous frame.
         source: name of the camera.
         camera_info: lens of the camera; None: not given.
         remark: decoder's warning about a picture that is usable nevertheless (such as surplus
@@ -141,7 +141,7 @@ class Frame:
             FrameFormatError: the format has no brightness, or its bytes are wrong.
             MissingExtraError: the codec of a compressed format is not installed.
         """
-        return self.format.grey(_data.held(self), self.width, self.height, self.stride)
+        return self.format.grey(_data.stored_value(self), self.width, self.height, self.stride)
 
     def rgb(self) -> NDArray[Any]:
         """Return the colours, (H, W, 3), red first; Bayer patterns are demosaiced.
@@ -157,12 +157,12 @@ class Frame:
         return self.format.rgb(self.data, self.width, self.height, self.stride)
 
 
-_data: Final = JoinedOnUse(vars(Frame)["data"])
+_data: Final = JoinedPlanes(vars(Frame)["data"])
 setattr(Frame, "data", _data)  # noqa: B010 - type checkers use the field
 _NAMES: Final = tuple(attribute.name for attribute in fields(Frame))
-_OTHERS: Final = tuple(name for name in _NAMES if name != "data")
-_values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_OTHERS)
-_setters: Final = tuple(getattr(Frame, name).__set__ for name in _OTHERS)
+_NAMES_WITHOUT_DATA: Final = tuple(name for name in _NAMES if name != "data")
+_values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_NAMES_WITHOUT_DATA)
+_setters: Final = tuple(getattr(Frame, name).__set__ for name in _NAMES_WITHOUT_DATA)
 
 
 def amend(frame: Frame, **changes: object) -> Frame:
@@ -181,8 +181,8 @@ def changed(frame: Frame, **changes: object) -> Frame:
     """
     if type(frame) is not Frame:
         return dataclasses.replace(frame, **cast("Any", changes))
-    made = object.__new__(Frame)
-    _data.__set__(made, _data.held(frame))
-    for put, value in zip(_setters, _values_of(frame), strict=True):
-        put(made, value)
-    return amend(made, **changes)
+    copy = object.__new__(Frame)
+    _data.__set__(copy, _data.stored_value(frame))
+    for set_value, value in zip(_setters, _values_of(frame), strict=True):
+        set_value(copy, value)
+    return amend(copy, **changes)

@@ -62,7 +62,7 @@ class GroupStatistics:
         delivered: number of sets that a reader took.
         skipped: number of sets that were replaced by a newer one.
         waiting: 1 if a set waits for a reader, else 0.
-        alone: number of each camera's frames that are in no set.
+        alone: number of each camera's frames that are in no set, by the camera's name.
         skew: largest skew of any set, seconds.
     """
 
@@ -112,14 +112,15 @@ class FrameGroup:
         self._timeout = check_seconds_or_none(timeout, "timeout", above=True)
         self._sources = dict(sources)
         self._readers: dict[str, _GroupReader] = {}
-        self._open = False
+        self._is_open = False
         self._queues: dict[str, collections.deque[Frame]] = {
             name: collections.deque() for name in sources
         }
         self._alone = dict.fromkeys(sources, 0)
-        self._next: FrameSet | None = None
-        self._over: tuple[FrameSourceError | None] | None = None
-        self._arrived = asyncio.Event()
+        self._next_set: FrameSet | None = None
+        # error with which the group ended, or None, in a tuple; None: it has not ended
+        self._end_cause: tuple[FrameSourceError | None] | None = None
+        self._changed = asyncio.Event()
         self._offered = self._delivered = self._skipped = 0
         self._skew = 0.0
 
@@ -147,7 +148,7 @@ class FrameGroup:
             self._offered,
             self._delivered,
             self._skipped,
-            int(self._next is not None),
+            int(self._next_set is not None),
             dict(self._alone),
             self._skew,
         )
@@ -158,7 +159,7 @@ class FrameGroup:
         Raises:
             FrameSourceError: a camera cannot be opened; all are closed again.
         """
-        if self._open:
+        if self._is_open:
             raise LocalProtocolError("the group of frame sources is open already")
         opening = [asyncio.ensure_future(source.__aenter__()) for source in self._sources.values()]
         try:
@@ -169,7 +170,7 @@ class FrameGroup:
             await asyncio.wait(opening)
             await self._close_all()
             raise
-        self._open = True
+        self._is_open = True
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -177,12 +178,12 @@ class FrameGroup:
 
     async def close(self) -> None:
         """Stop and close all cameras. Idempotent."""
-        self._open = False
+        self._is_open = False
         for reader in self._readers.values():
             reader.close()
         self._readers.clear()
-        if self._next is not None:
-            self._next = None
+        if self._next_set is not None:
+            self._next_set = None
             self._skipped += 1
         self._end(None)
         await self._close_all()
@@ -206,29 +207,29 @@ class FrameGroup:
         self._start()
         try:
             async with asyncio.timeout(self._timeout):
-                while self._next is None and self._over is None:
-                    self._arrived.clear()
-                    await self._arrived.wait()
+                while self._next_set is None and self._end_cause is None:
+                    self._changed.clear()
+                    await self._changed.wait()
         except TimeoutError:
-            raise FrameTimeoutError(self._silence(), source=", ".join(self._sources)) from None
-        if self._next is not None:
-            taken, self._next = self._next, None
+            raise FrameTimeoutError(self._timeout_text(), source=", ".join(self._sources)) from None
+        if self._next_set is not None:
+            frame_set, self._next_set = self._next_set, None
             self._delivered += 1
-            return taken
-        if self._over is not None and self._over[0] is not None:
-            raise self._over[0]
+            return frame_set
+        if self._end_cause is not None and self._end_cause[0] is not None:
+            raise self._end_cause[0]
         raise StopAsyncIteration
 
     def _start(self) -> None:
-        if not self._open:
+        if not self._is_open:
             raise LocalProtocolError("the group of frame sources is not open: use `async with`")
-        if not self._readers and self._over is None:
-            # all in one step of the loop, so that all start together
+        if not self._readers and self._end_cause is None:
+            # made in one step of the loop, so that all cameras start together
             self._readers = {
                 name: _GroupReader(source, self, name) for name, source in self._sources.items()
             }
 
-    def _silence(self) -> str:
+    def _timeout_text(self) -> str:
         counts = ", ".join(
             f"{name} {reader.statistics().offered}" for name, reader in self._readers.items()
         )
@@ -238,20 +239,20 @@ class FrameGroup:
             f"that came in all: {counts}"
         )
 
-    def _take(self, name: str, frame: Frame) -> None:
-        """Add a camera's frame, and deliver a set if it is complete."""
+    def _add_frame(self, name: str, frame: Frame) -> None:
+        """Add a camera's frame; if it completes a set, store the set for the next iteration."""
         queue = self._queues[name]
         queue.append(frame)
         if len(queue) > MAX_WAITING_FRAMES:
             queue.popleft()
             self._alone[name] += 1
         frames = {name: frame}
-        for other, waiting in self._queues.items():
+        for other, candidates in self._queues.items():
             if other != name:
-                if not waiting:
+                if not candidates:
                     return
                 frames[other] = min(
-                    waiting, key=lambda candidate: abs(candidate.captured - frame.captured)
+                    candidates, key=lambda candidate: abs(candidate.captured - frame.captured)
                 )
         moments = [member.captured for member in frames.values()]
         skew = max(moments) - min(moments)
@@ -261,21 +262,21 @@ class FrameGroup:
             self._drop_until(other, member)
         self._offered += 1
         self._skew = max(self._skew, skew)
-        if self._next is not None:
+        if self._next_set is not None:
             self._skipped += 1
-        self._next = FrameSet({key: frames[key] for key in self._sources}, skew)
-        self._arrived.set()
+        self._next_set = FrameSet({key: frames[key] for key in self._sources}, skew)
+        self._changed.set()
 
     def _drop_until(self, name: str, frame: Frame) -> None:
-        """Drop a frame that is in a set, and earlier frames, which cannot be in a set any more."""
+        """Drop a frame that is in a set, and all earlier frames, which cannot be in a later set."""
         queue = self._queues[name]
         while queue.popleft() is not frame:
             self._alone[name] += 1
 
     def _end(self, error: FrameSourceError | None) -> None:
-        if self._over is None:
-            self._over = (error,)
-        self._arrived.set()
+        if self._end_cause is None:
+            self._end_cause = (error,)
+        self._changed.set()
 
 
 class _GroupReader(FrameReader):
@@ -289,7 +290,7 @@ class _GroupReader(FrameReader):
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         self._delivered += 1
-        self._group._take(self._member, frame)  # noqa: SLF001 - same module
+        self._group._add_frame(self._member, frame)  # noqa: SLF001 - same module
 
     def _end(self, error: FrameSourceError | None) -> None:
         super()._end(error)

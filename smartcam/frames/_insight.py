@@ -41,7 +41,7 @@ class InSightDriver(FrameDriver):
     The camera does not report when a picture was taken, or whether it is new. A picture with the
     same bytes as the last is not returned again: if the camera may not be triggered for long, use
     ``stall=None``. ``captured`` is the arrival of a frame, and ``duration`` the time since the
-    request before; for the first frame it is infinite.
+    previous request; the first frame's duration is infinite.
     """
 
     def __init__(self, address: FrameAddress) -> None:
@@ -61,7 +61,7 @@ class InSightDriver(FrameDriver):
         self._name = own_parameters.get("name") or self._settings.name
         self._camera: SmartCamera[Any] | None = None
         self._task: asyncio.Task[None] | None = None
-        self._number = 0
+        self._sequence = 0
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ class InSightDriver(FrameDriver):
         """
         try:
             await self._connect()
-            pixels = self._pixels(await self._read())
+            pixels = self._read_pixels(await self._read_picture())
         finally:
             await self.stop()
         height, width = pixels.shape[:2]
@@ -121,7 +121,7 @@ class InSightDriver(FrameDriver):
                 f"{self.name}: this camera cannot be asked for a picture", source=self.name
             )
 
-    async def _read(self) -> bytes:
+    async def _read_picture(self) -> bytes:
         if self._camera is None:
             raise FrameSourceError(f"{self.name}: stopped", source=self.name)
         try:
@@ -133,7 +133,7 @@ class InSightDriver(FrameDriver):
         text = str(exc).removeprefix(f"{self.name}: ")
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 
-    def _pixels(self, data: bytes) -> NDArray[np.uint8]:
+    def _read_pixels(self, data: bytes) -> NDArray[np.uint8]:
         try:
             return read_bitmap(data)
         except FrameFormatError as exc:
@@ -141,24 +141,24 @@ class InSightDriver(FrameDriver):
 
     async def _poll(self, sink: FrameSink) -> None:
         loop = asyncio.get_running_loop()
-        due, asked_before, last = loop.time(), -math.inf, b""
+        due, last_requested_at, last_data = loop.time(), -math.inf, b""
         try:
             while True:
-                asked_at = time.monotonic()
-                data = await self._read()
-                if data != last:
-                    pixels = await asyncio.to_thread(self._pixels, data)
-                    sink.frame(self._frame(pixels, asked_before))
-                    last = data
-                asked_before = asked_at
+                requested_at = time.monotonic()
+                data = await self._read_picture()
+                if data != last_data:
+                    pixels = await asyncio.to_thread(self._read_pixels, data)
+                    sink.frame(self._new_frame(pixels, last_requested_at))
+                    last_data = data
+                last_requested_at = requested_at
                 due = max(due + 1 / self._rate, loop.time())
                 await asyncio.sleep(due - loop.time())
         except FrameSourceError as error:
             sink.ended(error)
 
-    def _frame(self, pixels: NDArray[np.uint8], asked_before: float) -> Frame:
+    def _new_frame(self, pixels: NDArray[np.uint8], last_requested_at: float) -> Frame:
         now = time.monotonic()
-        self._number += 1
+        self._sequence += 1
         height, width = pixels.shape[:2]
         return Frame(
             data=pixels.data.toreadonly().cast("B"),
@@ -169,8 +169,8 @@ class InSightDriver(FrameDriver):
             captured=now,
             utc=time.time(),
             moment=Moment.ARRIVAL,
-            duration=now - asked_before,
-            sequence=self._number,
+            duration=now - last_requested_at,
+            sequence=self._sequence,
             source=self.name,
         )
 

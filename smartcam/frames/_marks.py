@@ -22,10 +22,12 @@ class Drawing:
     """A mark that shows people what a tool saw.
 
     Attributes:
-        kind: points each by itself, a line through them, a closed polygon, or a text at the first.
-        points: places in the picture's pixels; the centre of the upper left one is (0, 0).
-        role: meaning of the mark: ``found``, what is ``wrong``, the ``region``, or a ``hint``.
-        text: the text, or a word beside the first point.
+        kind: separate ``points``, a ``line`` through the points, a closed ``polygon``, or a
+            ``text`` at the first point.
+        points: positions in the picture, pixels; the centre of the upper left pixel is (0, 0).
+        role: meaning of the mark: something ``found``, something ``wrong``, the searched
+            ``region``, or a ``hint``.
+        text: the text, or a word next to the first point.
     """
 
     kind: Kind

@@ -66,8 +66,8 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
         schemes = [info.name for info in FRAMES.available()]
     else:
         schemes = [check_text(scheme, "scheme", "discover", most=100)]
-    kinds = dict.fromkeys(_driver(name, name) for name in schemes)
-    return [source for kind in kinds for source in await kind.discover()]
+    drivers = dict.fromkeys(_driver(name, name) for name in schemes)
+    return [source for driver in drivers for source in await driver.discover()]
 
 
 def _is_recording(address: FrameAddress) -> bool:

@@ -45,7 +45,7 @@ class ReaderStatistics:
 class FrameReader:
     """A reader of a source: an iterator that returns the newest frame and skips older ones.
 
-    The device streams while there is a referenced reader that is not closed.
+    The device streams while there is a reader that is referenced and not closed.
     """
 
     def __init__(self, source: FrameSource, timeout: float | None) -> None:
@@ -53,7 +53,7 @@ class FrameReader:
         self._timeout = timeout
         self._next: Frame | None = None
         self._last: Frame | None = None  # last returned frame
-        self._ended = False
+        self._has_ended = False
         self._error: FrameSourceError | None = None
         self._waiters: list[asyncio.Future[bool]] = []
         self._offered = self._delivered = self._skipped = self._lost = 0
@@ -76,7 +76,7 @@ class FrameReader:
         self._last = None
         self._end(None)
         if self._source is not None:
-            self._source._forget(self)  # noqa: SLF001 - the two are one
+            self._source._remove_reader(self)  # noqa: SLF001 - its own source
             self._source = None
 
     async def __aenter__(self) -> Self:
@@ -97,13 +97,13 @@ class FrameReader:
 
         Cancellation: safe; the next call returns the frame.
         """
-        frame = await self._take(self._deadline(self._timeout), "the next frame")
+        frame = await self._take_next(self._deadline(self._timeout), "the next frame")
         if frame is None:
             raise StopAsyncIteration
         return frame
 
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame if it is not older than ``max_age``; else wait for one.
+        """Return the newest frame that is not older than ``max_age``; wait if there is none.
 
         Args:
             max_age: largest age since the capture, seconds; ``inf``: any.
@@ -119,13 +119,15 @@ class FrameReader:
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")
         expected = f"a frame of the last {max_age:g} s"
-        held = self._next or self._last
-        if held is not None and held.age <= max_age:
-            return self._taken(held)
-        return await self._first(expected, timeout, lambda frame: frame.age <= max_age)
+        candidate = self._next or self._last
+        if candidate is not None and candidate.age <= max_age:
+            return self._mark_taken(candidate)
+        return await self._first_matching(expected, timeout, lambda frame: frame.age <= max_age)
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the first frame, from the waiting one on, whose exposure began after a moment.
+        """Return the first frame whose exposure began after a moment.
+
+        A frame that already waits is considered, too.
 
         If the start of the exposure is not known exactly, the frame is the first that certainly
         began later: see :attr:`Frame.began`.
@@ -143,11 +145,11 @@ class FrameReader:
         """
         moment = check_moment(moment, "moment")
         timeout = check_seconds_or_none(timeout, "timeout")
-        for held in (self._last, self._next):
-            if held is not None and held.began >= moment:
-                return self._taken(held)
+        for candidate in (self._last, self._next):
+            if candidate is not None and candidate.began >= moment:
+                return self._mark_taken(candidate)
         expected = "a frame exposed after the given moment"
-        return await self._first(expected, timeout, lambda frame: frame.began >= moment)
+        return await self._first_matching(expected, timeout, lambda frame: frame.began >= moment)
 
     async def fresh(self, since: float, until: float) -> None:
         """Wait until the next frame is newer than a moment, or until a deadline.
@@ -162,15 +164,15 @@ class FrameReader:
         check_moment(since, "since")
         check_moment(until, "until")
         loop = asyncio.get_running_loop()
-        while not self._ended and loop.time() < until:
+        while not self._has_ended and loop.time() < until:
             if self._next is not None and self.last_arrival >= since:
                 return
-            await self._woken(until)
+            await self._wait_for_change(until)
 
     @property
     def last_arrival(self) -> float:
         """Time of the newest frame's arrival on the loop's clock; 0.0 before the first."""
-        return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
+        return 0.0 if self._source is None else self._source._last_arrival  # noqa: SLF001
 
     def check_not_ended(self) -> None:
         """Raise the source's error if it has ended.
@@ -178,22 +180,22 @@ class FrameReader:
         Raises:
             FrameSourceError: the source ended.
         """
-        if self._ended:
-            ended = FrameSourceError(f"{self._name}: it ended", source=self._name)
-            raise self._error or ended
+        if self._has_ended:
+            default = FrameSourceError(f"{self._name}: it ended", source=self._name)
+            raise self._error or default
 
-    def _waits(self) -> str:
-        """Return the trigger that the device awaits, for an error's text, or ""."""
-        waits = "" if self._source is None else self._source.driver.waits_for
-        return f": {waits}, and nothing triggered it" if waits else ""
+    def _trigger_hint(self) -> str:
+        """Return the condition that the device awaits, for an error's text; "": none."""
+        condition = "" if self._source is None else self._source.driver.waits_for
+        return f": {condition}, and nothing triggered it" if condition else ""
 
-    async def _first(
-        self, expected: str, timeout: float | None, wanted: Callable[[Frame], bool]
+    async def _first_matching(
+        self, expected: str, timeout: float | None, matches: Callable[[Frame], bool]
     ) -> Frame:
-        """Return the first wanted frame."""
-        end = self._deadline(timeout)
-        while (frame := await self._take(end, expected)) is not None:
-            if wanted(frame):
+        """Return the first matching frame."""
+        deadline = self._deadline(timeout)
+        while (frame := await self._take_next(deadline, expected)) is not None:
+            if matches(frame):
                 return frame
         text = f"{self._name}: expected {expected}, the source ended"
         raise FrameSourceError(text, source=self._name)
@@ -208,28 +210,28 @@ class FrameReader:
             return None
         return asyncio.get_running_loop().time() + timeout
 
-    async def _take(self, end: float | None, expected: str) -> Frame | None:
+    async def _take_next(self, deadline: float | None, expected: str) -> Frame | None:
         """Return the next frame; None at the end of the source."""
-        while self._next is None and not self._ended:
-            if not await self._woken(end):
+        while self._next is None and not self._has_ended:
+            if not await self._wait_for_change(deadline):
                 raise FrameTimeoutError(
-                    f"{self._name}: expected {expected}, got none in time{self._waits()}",
+                    f"{self._name}: expected {expected}, got none in time{self._trigger_hint()}",
                     source=self._name,
                 )
         if self._next is not None:
-            return self._taken(self._next)
+            return self._mark_taken(self._next)
         if self._error is not None:
             raise self._error
         return None
 
-    async def _woken(self, end: float | None) -> bool:
-        """Wait for a frame or the end; return False at the time limit.
+    async def _wait_for_change(self, deadline: float | None) -> bool:
+        """Wait for a frame or the end of the source; return False at the deadline.
 
-        This uses a future and a timer; asyncio's own functions take twice as long per frame.
+        The method uses a future and a timer; asyncio's own functions take twice as long per frame.
         """
         loop = asyncio.get_running_loop()
         waiter: asyncio.Future[bool] = loop.create_future()
-        timer = None if end is None else loop.call_at(end, _settle, waiter, False)
+        timer = None if deadline is None else loop.call_at(deadline, _set_result, waiter, False)
         self._waiters.append(waiter)
         try:
             return await waiter or self._next is not None
@@ -240,7 +242,7 @@ class FrameReader:
 
     def _wake(self) -> None:
         for waiter in self._waiters:
-            _settle(waiter, True)
+            _set_result(waiter, True)
 
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
@@ -257,16 +259,16 @@ class FrameReader:
         self._skipped += count
 
     def _end(self, error: FrameSourceError | None) -> None:
-        if not self._ended:
-            self._ended, self._error = True, error
+        if not self._has_ended:
+            self._has_ended, self._error = True, error
         self._wake()
 
-    def _taken(self, frame: Frame) -> Frame:
+    def _mark_taken(self, frame: Frame) -> Frame:
         if frame is self._next:
             self._next = None
             self._delivered += 1
             if self._source is not None:
-                self._source._took.set()  # noqa: SLF001 - the two are one
+                self._source._reader_advanced.set()  # noqa: SLF001 - its own source
         self._last = frame
         return frame
 
@@ -274,8 +276,8 @@ class FrameReader:
 class FrameTap(FrameReader):
     """A reader that passes on every frame as it comes.
 
-    While ``busy`` returns True, the last frame is held back, and a source that can wait, such as a
-    file, waits. The next frame releases the held-back one.
+    While ``busy`` returns True, the last frame is held back. A source that can wait, such as a
+    file, waits then; another source's next frame releases the frame that was held back.
 
     Args:
         source: open source; the device streams from now on.
@@ -292,7 +294,7 @@ class FrameTap(FrameReader):
         source.attach(self)
 
     async def ended(self) -> None:
-        """Wait until the source has ended, and pass on all frames.
+        """Pass on all frames until the source has ended.
 
         Raises:
             FrameSourceError: the source ended with this error.
@@ -300,43 +302,43 @@ class FrameTap(FrameReader):
         Cancellation: safe.
         """
         loop = asyncio.get_running_loop()
-        while not self._ended:
-            await self._woken(loop.time() + RELEASE_INTERVAL)
+        while not self._has_ended:
+            await self._wait_for_change(loop.time() + RELEASE_INTERVAL)
             if self._next is not None and not self._busy():
-                self._hand_on(self._next)
+                self._pass_on(self._next)
         if self._error is not None:
             raise self._error
 
     def close(self) -> None:
         """Stop reading, and pass on a held-back frame. Idempotent."""
         if self._next is not None:
-            self._hand_on(self._next)
+            self._pass_on(self._next)
         super().close()
 
     def _offer(self, frame: Frame) -> None:
         self._offered += 1
         if self._next is not None:
-            self._hand_on(self._next)
+            self._pass_on(self._next)
         if self._busy():
             self._next = frame
         else:
-            self._hand_on(frame)
+            self._pass_on(frame)
 
-    def _hand_on(self, frame: Frame) -> None:
+    def _pass_on(self, frame: Frame) -> None:
         self._next = None
         if self._take_frame(frame):
             self._delivered += 1
         else:
             self._skipped += 1
         if self._source is not None:
-            self._source._took.set()  # noqa: SLF001 - the two are one
+            self._source._reader_advanced.set()  # noqa: SLF001 - its own source
 
     def _end(self, error: FrameSourceError | None) -> None:
         if self._next is not None:
-            self._hand_on(self._next)
+            self._pass_on(self._next)
         super()._end(error)
 
 
-def _settle(waiter: asyncio.Future[bool], received: bool) -> None:
+def _set_result(waiter: asyncio.Future[bool], received: bool) -> None:
     if not waiter.done():
         waiter.set_result(received)

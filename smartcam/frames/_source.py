@@ -66,7 +66,7 @@ class SourceStatistics:
         started: number of starts of the device's stream.
         frames: number of received frames, with or without a reader.
         lost: number of frames lost in the camera or on the way.
-        ahead: number of frames with a time after their arrival, for which the arrival was used.
+        ahead: number of frames whose time was later than their arrival, which was used instead.
         clock: drift and jumps of the camera's own clock; None: no clock.
     """
 
@@ -114,18 +114,18 @@ class FrameSource(FrameSink):
         self._format: StreamFormat | None = None
         self._loop: asyncio.AbstractEventLoop | None = None  # while the source is open
         self._task: asyncio.Task[None] | None = None  # while it streams or lingers
-        self._changed = asyncio.Event()  # set when readers change, or the driver ends
-        self._took = asyncio.Event()  # set when a reader takes a frame or is closed
-        self._held_up = False  # whether the driver waits for readers
-        self._streaming = False
-        # error with which the driver ended, in a tuple
-        self._over: tuple[FrameSourceError | None] | None = None
+        self._state_changed = asyncio.Event()  # set when readers change, or the driver ends
+        self._reader_advanced = asyncio.Event()  # set when a reader takes a frame or is closed
+        self._waits_for_readers = False  # whether the driver waits for readers
+        self._is_streaming = False
+        # error with which the driver ended, or None, in a tuple; None: it has not ended
+        self._end_cause: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
-        self._newest: Frame | None = None
-        self._again = False  # whether to restart the stream
+        self._newest_frame: Frame | None = None
+        self._must_restart = False  # whether to restart the stream
         self._triggers = TriggerQueue(self)
-        self._last_came = self._idle_since = 0.0  # on the loop's clock
+        self._last_arrival = self._idle_since = 0.0  # on the loop's clock
 
     @property
     def name(self) -> str:
@@ -190,7 +190,7 @@ class FrameSource(FrameSink):
         """Update the stream's format after a feature was set."""
         if self._loop is not None and self._driver.form is not None:
             self._format = self._driver.form
-        self._changed.set()
+        self._state_changed.set()
 
     @property
     def format(self) -> StreamFormat:
@@ -206,7 +206,7 @@ class FrameSource(FrameSink):
     def statistics(self) -> SourceStatistics:
         """Return the counts of the source since it was opened."""
         return SourceStatistics(
-            self._streaming,
+            self._is_streaming,
             len(self._readers),
             self._started,
             self._frames,
@@ -226,19 +226,19 @@ class FrameSource(FrameSink):
         if self._loop is not None:
             raise LocalProtocolError(f"{self.name} is open already")
         try:
-            self._format = self._checked(await self._driver.open())
+            self._format = self._checked_format(await self._driver.open())
         except BaseException:
             await self._driver.close()
             raise
         self._loop = asyncio.get_running_loop()
         return self
 
-    def _begin(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _start_task(self, loop: asyncio.AbstractEventLoop) -> None:
         """Start the task that streams for readers."""
-        self._task = loop.create_task(self._run(), name=f"frames of {self.name}")
-        self._task.add_done_callback(self._stopped)
+        self._task = loop.create_task(self._stream_for_readers(), name=f"frames of {self.name}")
+        self._task.add_done_callback(self._on_task_done)
 
-    def _stopped(self, task: asyncio.Task[None]) -> None:
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
         """Restart for new readers; end the readers of a cancelled task."""
         if task is not self._task or self._loop is None:
             return
@@ -248,9 +248,9 @@ class FrameSource(FrameSink):
                 FrameSourceError(f"{self.name}: its task was cancelled", source=self.name)
             )
         elif self._readers:
-            self._begin(self._loop)
+            self._start_task(self._loop)
 
-    def _checked(self, form: StreamFormat) -> StreamFormat:
+    def _checked_format(self, form: StreamFormat) -> StreamFormat:
         size = (form.width, form.height)
         if self._camera_info is not None and tuple(self._camera_info.size) != size:
             raise FrameFormatError(
@@ -271,15 +271,15 @@ class FrameSource(FrameSink):
         """
         loop, self._loop = self._loop, None
         task, self._task, self._format = self._task, None, None
-        for reader in self._alive():
+        for reader in self._live_readers():
             reader.close()
         if loop is None:
             return
         if task is not None:
             task.cancel()
-        await finish(partial(self._give_back, task))
+        await finish(partial(self._release_device, task))
 
-    async def _give_back(self, task: asyncio.Task[None] | None) -> None:
+    async def _release_device(self, task: asyncio.Task[None] | None) -> None:
         """Close the device after the task, even if the task never began."""
         if task is not None:
             await asyncio.wait({task})
@@ -319,25 +319,25 @@ class FrameSource(FrameSink):
 
     def attach(self, reader: FrameReader) -> None:
         """Pass frames to a reader from now on."""
-        self._readers.add(weakref.ref(reader, self._dropped))
-        self._changed.set()
+        self._readers.add(weakref.ref(reader, self._on_reader_gone))
+        self._state_changed.set()
         if self._task is None and self._loop is not None:
-            self._begin(self._loop)
+            self._start_task(self._loop)
 
     def __aiter__(self) -> FrameReader:
         return self.reader()
 
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
-        """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
+        """Return the newest frame, as :meth:`FrameReader.newest` does.
 
         For frequent calls, keep a reader, or open the source with ``linger``: otherwise the device
-        starts its stream for each frame.
+        starts its stream for each call.
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")
         async with self.reader() as reader:
-            if self._newest is not None and self._newest.age <= max_age:
-                return self._newest
+            if self._newest_frame is not None and self._newest_frame.age <= max_age:
+                return self._newest_frame
             return await reader.newest(max_age=max_age, timeout=timeout)
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
@@ -345,8 +345,8 @@ class FrameSource(FrameSink):
         moment = check_moment(moment, "moment")
         timeout = check_seconds_or_none(timeout, "timeout")
         async with self.reader() as reader:
-            if self._newest is not None and self._newest.began >= moment:
-                return self._newest
+            if self._newest_frame is not None and self._newest_frame.began >= moment:
+                return self._newest_frame
             return await reader.after(moment, timeout=timeout)
 
     async def trigger(
@@ -402,41 +402,41 @@ class FrameSource(FrameSink):
         Raises:
             FrameSourceError: the device does not begin to stream.
         """
-        if anew and self._streaming:
-            self._again = True
-            self._changed.set()
-        while not self._streaming or self._again:
+        if anew and self._is_streaming:
+            self._must_restart = True
+            self._state_changed.set()
+        while not self._is_streaming or self._must_restart:
             reader.check_not_ended()
-            self._changed.clear()
-            await self._changed.wait()
+            self._state_changed.clear()
+            await self._state_changed.wait()
 
     # called by the driver
 
     def trigger_failed(self, error: SmartCamError) -> None:
         """Fail the pending trigger, whose picture will not come."""
-        self._triggers.failed(error)
+        self._triggers.fail_pending(error)
 
     def frame(self, frame: Frame) -> None:
         """Pass a frame of the driver to the readers."""
         if frame.lost:
             self.lost(frame.lost)
-        self._last_came = asyncio.get_running_loop().time()
-        frame = self._with_lens(self._timed(frame, time.monotonic()))
+        self._last_arrival = asyncio.get_running_loop().time()
+        frame = self._with_lens(self._with_host_time(frame, time.monotonic()))
         self._frames += 1
-        self._newest = frame
+        self._newest_frame = frame
         if frame.trigger is not None:
             self._triggers.on_frame(frame)
-        for reader in self._alive():
+        for reader in self._live_readers():
             reader._offer(frame)  # noqa: SLF001 - its own reader
 
-    def _timed(self, frame: Frame, now: float) -> Frame:
+    def _with_host_time(self, frame: Frame, now: float) -> Frame:
         """Return a frame with its time on the host's clock, not later than now."""
         captured = frame.captured
         if frame.device_time is not None and not self._driver.times_frames:
             if self._clock is None:
                 self._clock = DeviceClock()
             jumps = self._clock.jumps
-            captured = self._clock.captured(frame.device_time, captured)
+            captured = self._clock.host_time(frame.device_time, captured)
             if self._clock.jumps > jumps:
                 _log.warning(
                     "%s: the camera's clock was reset, at frame %d", self.name, frame.sequence
@@ -452,49 +452,49 @@ class FrameSource(FrameSink):
     def lost(self, count: int) -> None:
         """Count lost frames."""
         self._lost += count
-        for reader in self._alive():
+        for reader in self._live_readers():
             reader._miss(count)  # noqa: SLF001
 
     def skipped(self, count: int) -> None:
-        """Count frames that were skipped earlier on the way."""
+        """Count frames that the far end of a link replaced by newer ones."""
         self._frames += count
-        for reader in self._alive():
+        for reader in self._live_readers():
             reader._skip(count)  # noqa: SLF001
 
     def ended(self, error: FrameSourceError | None) -> None:
         """Record that there will be no more frames."""
-        self._over = (error,)
-        self._changed.set()
+        self._end_cause = (error,)
+        self._state_changed.set()
 
     async def wait_taken(self) -> None:
         """Wait until every reader has taken the last frame; this time does not count as a stall."""
-        self._held_up = True
+        self._waits_for_readers = True
         try:
-            while any(reader._next is not None for reader in self._alive()):  # noqa: SLF001
-                self._took.clear()
-                await self._took.wait()
+            while any(reader._next is not None for reader in self._live_readers()):  # noqa: SLF001
+                self._reader_advanced.clear()
+                await self._reader_advanced.wait()
         finally:
-            self._held_up = False
-            self._last_came = asyncio.get_running_loop().time()
+            self._waits_for_readers = False
+            self._last_arrival = asyncio.get_running_loop().time()
 
-    def _alive(self) -> list[FrameReader]:
+    def _live_readers(self) -> list[FrameReader]:
         return [reader for reference in self._readers if (reader := reference()) is not None]
 
-    def _dropped(self, reference: weakref.ref[FrameReader]) -> None:
+    def _on_reader_gone(self, reference: weakref.ref[FrameReader]) -> None:
         self._readers.discard(reference)
         if not self._readers and self._loop is not None:
             self._idle_since = self._loop.time()
-        self._changed.set()
-        self._took.set()
+        self._state_changed.set()
+        self._reader_advanced.set()
 
-    def _forget(self, reader: FrameReader) -> None:
-        self._dropped(weakref.ref(reader))
+    def _remove_reader(self, reader: FrameReader) -> None:
+        self._on_reader_gone(weakref.ref(reader))
 
-    async def _run(self) -> None:
+    async def _stream_for_readers(self) -> None:
         """Stream while there are readers."""
         while self._readers:
             try:
-                await self._stream()
+                await self._stream_once()
             except FrameSourceError as error:
                 self._end_readers(error)
             except asyncio.CancelledError:
@@ -505,75 +505,78 @@ class FrameSource(FrameSink):
                 _log.exception("%s: its driver failed", self.name)
                 self._end_readers(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
-    async def _stream(self) -> None:
+    async def _stream_once(self) -> None:
         """Stream until there are no readers, or the device ends."""
-        self._over = None
-        self._newest = None
-        self._again = False
+        self._end_cause = None
+        self._newest_frame = None
+        self._must_restart = False
         try:
             await self._driver.start(self)
-            self._triggers.settled = True
-            self._streaming = True
+            self._triggers.picture_may_come = False
+            self._is_streaming = True
             self._started += 1
             await self._feature_changed()
-            self._last_came = asyncio.get_running_loop().time()
-            await self._while_read()
+            self._last_arrival = asyncio.get_running_loop().time()
+            await self._wait_for_end()
         finally:
-            self._streaming = False
-            self._newest = None
-            ended = FrameSourceError(f"{self.name}: its stream ended", source=self.name)
-            self._triggers.failed((self._over and self._over[0]) or ended)
+            self._is_streaming = False
+            self._newest_frame = None
+            default = FrameSourceError(f"{self.name}: its stream ended", source=self.name)
+            self._triggers.fail_pending((self._end_cause and self._end_cause[0]) or default)
             await self._driver.stop()
-        over, self._over = self._over, None
-        if over is not None:
-            self._end_readers(over[0])
+        end_cause, self._end_cause = self._end_cause, None
+        if end_cause is not None:
+            self._end_readers(end_cause[0])
 
-    async def _while_read(self) -> None:
+    async def _wait_for_end(self) -> None:
         """Wait until the driver ends or is stuck, or the linger has passed."""
-        while self._over is None and not self._again:
+        while self._end_cause is None and not self._must_restart:
             if not self._readers:
-                left = self._idle_since + self._linger - asyncio.get_running_loop().time()
-                if not await self._within(left, lambda: bool(self._readers)) and left <= 0:
+                remaining = self._idle_since + self._linger - asyncio.get_running_loop().time()
+                if (
+                    not await self._reached_within(remaining, lambda: bool(self._readers))
+                    and remaining <= 0
+                ):
                     return
             elif self._stall is None or self._driver.waits_for:
-                await self._until_changed(partial(self._is_free_of, self._driver.waits_for))
-                self._last_came = asyncio.get_running_loop().time()
+                await self._wait_until(partial(self._must_check_again, self._driver.waits_for))
+                self._last_arrival = asyncio.get_running_loop().time()
             else:
-                left = self._last_came + self._stall - asyncio.get_running_loop().time()
-                if left <= 0 and self._held_up:
-                    left = self._stall
-                if left <= 0:
+                remaining = self._last_arrival + self._stall - asyncio.get_running_loop().time()
+                if remaining <= 0 and self._waits_for_readers:
+                    remaining = self._stall
+                if remaining <= 0:
                     raise FrameSourceError(
                         f"{self.name}: it streams, but gave no frame for {self._stall:g} s",
                         source=self.name,
                     )
-                await self._within(left, lambda: not self._readers)
+                await self._reached_within(remaining, lambda: not self._readers)
 
-    def _is_free_of(self, waits_for: str) -> bool:
-        """Return True if there are no readers, or the device no longer waits for ``waits_for``."""
+    def _must_check_again(self, waits_for: str) -> bool:
+        """Return True if the readers are gone, or the device no longer awaits this condition."""
         return not self._readers or self._driver.waits_for != waits_for
 
-    async def _within(self, seconds: float, reached: Callable[[], bool]) -> bool:
+    async def _reached_within(self, seconds: float, condition: Callable[[], bool]) -> bool:
         """Wait for a condition; return whether it was reached in time."""
         try:
             async with asyncio.timeout(seconds):
-                await self._until_changed(reached)
+                await self._wait_until(condition)
         except TimeoutError:
             return False
         return True
 
-    async def _until_changed(self, reached: Callable[[], bool]) -> None:
-        while not (reached() or self._over is not None or self._again):
-            self._changed.clear()
-            await self._changed.wait()
+    async def _wait_until(self, condition: Callable[[], bool]) -> None:
+        while not (condition() or self._end_cause is not None or self._must_restart):
+            self._state_changed.clear()
+            await self._state_changed.wait()
 
     def _end_readers(self, error: FrameSourceError | None) -> None:
         """End all readers; a later reader starts the device again."""
         if error is not None:
-            self._triggers.failed(error)
-        for reader in self._alive():
+            self._triggers.fail_pending(error)
+        for reader in self._live_readers():
             reader._end(error)  # noqa: SLF001
-            self._forget(reader)
+            self._remove_reader(reader)
 
 
 _closing: set[asyncio.Task[None]] = set()

@@ -38,19 +38,21 @@ class Undistorter:
             raise ConfigurationError(f"undistort: alpha: expected 0 to 1, got {alpha!r}")
         cv2 = load("cv2")
         self._size = tuple(camera.size)
-        lens, turn = (camera.matrix, camera.distortion), np.eye(3)
+        lens, no_rotation = (camera.matrix, camera.distortion), np.eye(3)
         if camera.distortion_model == "equidistant":
-            straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-                *lens, camera.size, turn, balance=alpha
+            new_matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                *lens, camera.size, no_rotation, balance=alpha
             )
             maps = cv2.fisheye.initUndistortRectifyMap(
-                *lens, turn, straight, camera.size, cv2.CV_16SC2
+                *lens, no_rotation, new_matrix, camera.size, cv2.CV_16SC2
             )
         else:
-            straight = cv2.getOptimalNewCameraMatrix(*lens, camera.size, alpha)[0]
-            maps = cv2.initUndistortRectifyMap(*lens, turn, straight, camera.size, cv2.CV_16SC2)
+            new_matrix = cv2.getOptimalNewCameraMatrix(*lens, camera.size, alpha)[0]
+            maps = cv2.initUndistortRectifyMap(
+                *lens, no_rotation, new_matrix, camera.size, cv2.CV_16SC2
+            )
         self._maps = maps
-        self.camera: CameraModel = CameraModel(size=camera.size, matrix=straight)
+        self.camera: CameraModel = CameraModel(size=camera.size, matrix=new_matrix)
 
     def __call__(self, frame: Frame, *, colour: bool = False) -> NDArray[Any]:
         """Return a frame's picture without distortion; pixels without a source are 0.

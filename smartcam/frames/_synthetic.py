@@ -38,24 +38,25 @@ class SyntheticDriver(TaskDriver):
 
     Formats are Mono8, YUYV, RGB8, Z16 (distances in millimetres) and MJPEG.
 
-    The stamp is two rows of squares in the upper left corner: the frame's number, and
-    ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads it, also after a lossy codec.
+    The stamp is squares in the upper left corner, one for each bit of two numbers: the frame's
+    number, and ``time.monotonic_ns()`` at its capture. :func:`read_stamp` reads the stamp, also
+    after a lossy codec.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        given = address.parameters(["size", "fps", "name", "format"])
-        self._size = address.size(given.get("size", "640x480"))
+        parameters = address.parameters(["size", "fps", "name", "format"])
+        self._size = address.size(parameters.get("size", "640x480"))
         if self._size[0] < MIN_SIZE_PX[0] or self._size[1] < MIN_SIZE_PX[1]:
             raise address.wrong(
                 "size",
                 f"{MIN_SIZE_PX[0]}x{MIN_SIZE_PX[1]} or more, room for the stamp",
-                given["size"],
+                parameters["size"],
             )
-        self._format = _format(address, given.get("format", "Mono8"))
-        self._rate = address.number("fps", given.get("fps", "30"), 0.01, 10_000)
-        self._name = given.get("name", "synthetic")
-        self._number = 0
+        self._format = _format(address, parameters.get("format", "Mono8"))
+        self._rate = address.number("fps", parameters.get("fps", "30"), 0.01, 10_000)
+        self._name = parameters.get("name", "synthetic")
+        self._sequence = 0
 
     @property
     def name(self) -> str:
@@ -75,23 +76,23 @@ class SyntheticDriver(TaskDriver):
         """Draw pictures."""
         width, height = self._size
         picture = stripes(width, height)
-        coded = _FORMATS[self._format.name]
+        encode = _FORMATS[self._format.name]
         loop = asyncio.get_running_loop()
-        began, drawn = loop.time(), 0
+        started_at, count = loop.time(), 0
         while True:
-            drawn += 1
-            await asyncio.sleep(began + drawn / self._rate - loop.time())
-            self._number += 1
-            late = int((loop.time() - began) * self._rate) - drawn  # not drawn in time
-            if late > 0:
-                drawn += late
-                self._number += late
+            count += 1
+            await asyncio.sleep(started_at + count / self._rate - loop.time())
+            self._sequence += 1
+            missed = int((loop.time() - started_at) * self._rate) - count  # not drawn in time
+            if missed > 0:
+                count += missed
+                self._sequence += missed
             now = time.monotonic_ns()
-            shown = np.roll(picture, self._number % width, axis=1)
-            write_stamp(shown, self._number, now)
+            stamped = np.roll(picture, self._sequence % width, axis=1)
+            write_stamp(stamped, self._sequence, now)
             sink.frame(
                 Frame(
-                    data=coded(shown),
+                    data=encode(stamped),
                     format=self._format,
                     width=width,
                     height=height,
@@ -99,29 +100,29 @@ class SyntheticDriver(TaskDriver):
                     captured=now / 1e9,
                     utc=time.time() - (time.monotonic_ns() - now) / 1e9,
                     moment=Moment.EXPOSURE_START,
-                    sequence=self._number,
-                    lost=max(0, late),
+                    sequence=self._sequence,
+                    lost=max(0, missed),
                     source=self.name,
                 )
             )
 
 
-def _pairs(picture: NDArray[np.uint8]) -> bytes:
+def _to_yuyv(picture: NDArray[np.uint8]) -> bytes:
     even = np.pad(picture, ((0, 0), (0, picture.shape[1] % 2)))
     return np.stack((even, np.full_like(even, 128)), axis=-1).tobytes()
 
 
-def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+def _to_jpeg(picture: NDArray[np.uint8]) -> bytes:
     data: bytes = load("simplejpeg").encode_jpeg(picture[..., None], 85, "GRAY", "Gray")
     return data
 
 
 _FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes | memoryview]]] = {
     "Mono8": lambda picture: picture.data.toreadonly().cast("B"),
-    "YUV422_8": _pairs,
+    "YUV422_8": _to_yuyv,
     "RGB8": lambda picture: np.repeat(picture[..., None], 3, axis=2).tobytes(),
     "Coord3D_C16": lambda picture: (picture.astype("<u2") * 16).tobytes(),
-    "MJPEG": _jpeg,
+    "MJPEG": _to_jpeg,
 }
 """Functions that convert a grey picture to a format's bytes."""
 
@@ -137,15 +138,15 @@ def stripes(width: int, height: int) -> NDArray[np.uint8]:
     """Return a picture of soft stripes, (height, width)."""
     row = 128 + 80 * np.sin(np.arange(width) * (2 * np.pi * 8 / width))
     fade = np.linspace(1.0, 0.4, height)[:, None]
-    shown: NDArray[np.uint8] = (row * fade).astype(np.uint8)
-    return shown
+    picture: NDArray[np.uint8] = (row * fade).astype(np.uint8)
+    return picture
 
 
 def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> None:
     """Draw a stamp into the upper left corner of (H, W) or (H, W, C)."""
     for row, value in enumerate((number, nanoseconds)):
-        for half, shown in enumerate((value, ~value)):  # the complement reveals a torn stamp
-            bits = (shown >> np.arange(STAMP_BITS, dtype=object)) & 1
+        for half, encoded in enumerate((value, ~value)):  # the complement reveals a torn stamp
+            bits = (encoded >> np.arange(STAMP_BITS, dtype=object)) & 1
             cells = np.repeat(np.array(bits, np.uint8) * 219 + 16, BIT_SIDE_PX)
             top = (2 * row + half) * BIT_SIDE_PX
             band = picture[top : top + BIT_SIDE_PX, : STAMP_BITS * BIT_SIDE_PX]
@@ -171,7 +172,7 @@ def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
     bits = means > (means.min() + means.max()) / 2
     if (bits[0::2] == bits[1::2]).any():
         return None
-    weights = [1 << place for place in range(STAMP_BITS)]
+    weights = [1 << bit for bit in range(STAMP_BITS)]
     number, nanoseconds = (
         sum(weight for weight, square in zip(weights, row, strict=True) if square)
         for row in bits[0::2]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 MAX_NOTES = 5
-"""Largest number of notes on the wait in an error's text."""
+"""Largest number of a trigger's notes in an error's text."""
 
 
 class AwaitedTrigger:
@@ -31,7 +31,7 @@ class AwaitedTrigger:
         number: number of the trigger, counted by its source.
         fired: time right before it was sent, seconds of ``time.monotonic()``; None: not sent yet.
         outcome: the frame, or the error.
-        notes: notes on the wait, for the error's text.
+        notes: remarks on what happened during the wait, for the error's text.
     """
 
     def __init__(self, number: int) -> None:
@@ -41,11 +41,11 @@ class AwaitedTrigger:
         self.notes: list[str] = []
 
     def fire_begins(self) -> None:
-        """Note that the trigger is being sent."""
+        """Record the time right before the trigger is sent."""
         self.fired = time.monotonic()
 
     def refused(self) -> None:
-        """Note that the device did not accept the trigger, so no picture will come."""
+        """Record that the device did not accept the trigger, so no picture will come."""
         self.fired = None
 
 
@@ -56,15 +56,15 @@ class TriggerQueue:
         source: source that is triggered.
 
     Attributes:
-        settled: whether all pictures of earlier triggers have come or are dropped.
+        picture_may_come: whether the picture of an earlier trigger may still come.
     """
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
         self._lock = asyncio.Lock()
         self._pending: AwaitedTrigger | None = None
-        self._number = 0
-        self.settled = True
+        self._trigger_count = 0
+        self.picture_may_come = False
 
     async def trigger(
         self, seconds: float, refuse: bool, fire: Callable[[], Awaitable[object]] | None
@@ -76,25 +76,25 @@ class TriggerQueue:
             return frame
         if refuse and self._lock.locked():
             raise CameraBusyError(f"{name}: another trigger is pending, and when_busy is 'refuse'")
-        doing = ["waiting for the triggers before it"]
+        steps = ["waiting for the triggers before it"]
         pending = AwaitedTrigger(0)
         try:
             async with asyncio.timeout(seconds), self._lock:
-                doing.append("starting the stream")
+                steps.append("starting the stream")
                 async with self._source.reader(timeout=None) as reader:
-                    await self._source.wait_until_streaming(reader, anew=not self.settled)
-                    self._number += 1
-                    pending.number = self._number
-                    doing.append("triggering")
+                    await self._source.wait_until_streaming(reader, anew=self.picture_may_come)
+                    self._trigger_count += 1
+                    pending.number = self._trigger_count
+                    steps.append("triggering")
                     return await self._trigger_once(pending, fire)
         except FrameSourceError:
             raise
         except TimeoutError as exc:
             notes = "".join(f"; {note}" for note in pending.notes[:MAX_NOTES])
-            waits = self._source.driver.waits_for
+            condition = self._source.driver.waits_for
             raise TriggerTimeoutError(
                 f"{name}: no picture of the trigger within {seconds:g} s, which ran out while "
-                f"{doing[-1]}{notes}{f'; {waits}' if waits else ''}",
+                f"{steps[-1]}{notes}{f'; {condition}' if condition else ''}",
                 waited=seconds,
             ) from exc
 
@@ -113,7 +113,7 @@ class TriggerQueue:
         finally:
             self._pending = None
             driver.disarm()
-            self.settled = self.settled and (pending.fired is None or _has_arrived(pending))
+            self.picture_may_come |= pending.fired is not None and not _has_arrived(pending)
             if not pending.outcome.cancel() and not pending.outcome.cancelled():
                 pending.outcome.exception()  # mark the error as retrieved
 
@@ -128,7 +128,7 @@ class TriggerQueue:
         ):
             pending.outcome.set_result(frame)
 
-    def failed(self, error: SmartCamError) -> None:
+    def fail_pending(self, error: SmartCamError) -> None:
         """Pass an error to the caller of the pending trigger."""
         if self._pending is not None and not self._pending.outcome.done():
             self._pending.outcome.set_exception(error)

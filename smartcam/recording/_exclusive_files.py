@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+def open_exclusively(path: Path, *, overwrite: bool) -> IO[bytes]:
     """Open a file for a single recorder; truncate it only after it is locked.
 
     Raises:
@@ -21,7 +21,7 @@ def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
         FileExistsError: the file exists already.
         OSError: the file cannot be created.
     """
-    stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
+    stream = open(path, "wb" if overwrite else "xb", opener=_open_without_truncating)  # noqa: SIM115
     try:
         if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
             if try_lock(stream.fileno()) is False:
@@ -33,5 +33,5 @@ def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
     return stream
 
 
-def _open_whole(path: str, flags: int) -> int:
+def _open_without_truncating(path: str, flags: int) -> int:
     return os.open(path, flags & ~os.O_TRUNC, 0o666)

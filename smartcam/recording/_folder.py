@@ -1,7 +1,7 @@
 """A folder of consecutive recordings: names, cameras and sizes of its files.
 
-A file's name has its camera's, with ``.`` for ``/``, and the time of its first record, UTC:
-``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name a camera's files are in order.
+A file's name consists of the camera's name, with ``.`` for ``/``, and the time of the first record,
+UTC: ``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name, a camera's files are in order.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from smartcam.recording._mcap.records import MAGIC
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ENDING = ".mcap"
+SUFFIX = ".mcap"
 
 _NAME = re.compile(
     r"(?P<camera>[a-z0-9_-]+(?:\.[a-z0-9_-]+){0,3})_(?P<at>\d{8}T\d{6}\.\d{3})Z\.mcap", re.ASCII
 )
-_AT = "%Y%m%dT%H%M%S.%f"
+_TIME_FORMAT = "%Y%m%dT%H%M%S.%f"
 
 _HEAD = MAGIC + b"\x01"
-_PROFILE_AT = len(_HEAD) + 8
+_PROFILE_OFFSET = len(_HEAD) + 8
 """Offset in the file, in bytes, of the length of the header's profile."""
 
 LOCK = ".smartcam.lock"
@@ -50,19 +50,19 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return the parts of a name; None if it is not a recorder's."""
+        """Return the parts of a name; None if no recorder gives such names."""
         match = _NAME.fullmatch(name)
         if match is None:
             return None
         try:
-            at = datetime.strptime(match["at"], _AT).replace(tzinfo=UTC)
+            at = datetime.strptime(match["at"], _TIME_FORMAT).replace(tzinfo=UTC)
         except ValueError:
             return None
         return cls(match["camera"].replace(".", "/"), at)
 
     def __str__(self) -> str:
         at = self.at.strftime("%Y%m%dT%H%M%S.") + f"{self.at.microsecond // 1000:03d}"
-        return f"{self.camera.replace('/', '.')}_{at}Z{ENDING}"
+        return f"{self.camera.replace('/', '.')}_{at}Z{SUFFIX}"
 
 
 @dataclass(order=True)
@@ -80,18 +80,18 @@ class KnownFile:
     size: int = field(compare=False)
 
 
-def is_ours(path: Path) -> bool:
+def is_smartcam_recording(path: Path) -> bool:
     """Return True if a file begins like a recording of smartcam; False for an empty file."""
     try:
         with path.open("rb") as stream:
-            head = stream.read(_PROFILE_AT + 4 + len(PROFILE))
+            head = stream.read(_PROFILE_OFFSET + 4 + len(PROFILE))
     except OSError:
         return False
-    length = int.from_bytes(head[_PROFILE_AT : _PROFILE_AT + 4], "little")
+    length = int.from_bytes(head[_PROFILE_OFFSET : _PROFILE_OFFSET + 4], "little")
     return (
         head.startswith(_HEAD)
         and length == len(PROFILE)
-        and head[_PROFILE_AT + 4 :] == PROFILE.encode()
+        and head[_PROFILE_OFFSET + 4 :] == PROFILE.encode()
     )
 
 
@@ -122,24 +122,24 @@ class RecordingFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files: dict[str, KnownFile] = {}
-        # whether each examined file belongs to this recorder
-        self._ours: dict[str, bool] = {}
+        # for each examined file, by name: whether it is a recording of smartcam
+        self._is_own: dict[str, bool] = {}
         self._lock: int | None = None
-        self._made = False  # whether the folder existed earlier: it is not created again
-        self._last: dict[str, datetime] = {}  # time at which the last file of each camera was begun
+        self._existed = False  # whether the folder existed earlier: it is not created again
+        self._last: dict[str, datetime] = {}  # start of the last file of each camera
 
     def enter(self) -> None:
         """Create the folder if it never existed, lock it and list its files.
 
         A folder that existed and is missing is not created again: it may have been a mount, and the
-        disk at its place may be small.
+        disk that is there instead may be small.
 
         Raises:
             ConfigurationError: another recorder writes in it.
             OSError: the folder cannot be created, or read.
         """
         self.leave()
-        if not self._made:
+        if not self._existed:
             self.path.mkdir(exist_ok=True)
         flags = getattr(os, "O_DIRECTORY", None)
         if flags is None:
@@ -149,8 +149,8 @@ class RecordingFolder:
         if try_lock(lock) is False:
             os.close(lock)
             raise ConfigurationError(f"recordings {self.path}: another recorder writes in it")
-        self._lock, self._made = lock, True
-        self.look()
+        self._lock, self._existed = lock, True
+        self.list_files()
 
     def leave(self) -> None:
         """Unlock the folder. Idempotent."""
@@ -158,25 +158,27 @@ class RecordingFolder:
         if lock is not None:
             os.close(lock)
 
-    def look(self) -> None:
+    def list_files(self) -> None:
         """List the files again.
 
         Raises:
             OSError: the folder cannot be read.
         """
         known_files: dict[str, KnownFile] = {}
-        ours: dict[str, bool] = {}
+        is_own: dict[str, bool] = {}
         for name, entry in files_of(self.path):
-            known = self._ours.get(entry.name)
-            ours[entry.name] = known = is_ours(Path(entry.path)) if known is None else known
+            known = self._is_own.get(entry.name)
+            is_own[entry.name] = known = (
+                is_smartcam_recording(Path(entry.path)) if known is None else known
+            )
             if known:
                 with contextlib.suppress(FileNotFoundError):
                     size = entry.stat(follow_symlinks=False).st_size
                     known_files[entry.name] = KnownFile(name.at, entry.name, size)
-            self._note(name)
-        self.files, self._ours = known_files, ours
+            self._update_last(name)
+        self.files, self._is_own = known_files, is_own
 
-    def _note(self, name: FileName) -> None:
+    def _update_last(self, name: FileName) -> None:
         self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
 
     def next_path(self, camera: str, at: datetime) -> Path:
@@ -191,34 +193,34 @@ class RecordingFolder:
         if last is not None:
             rounded = max(rounded, last + timedelta(milliseconds=1))
         name = FileName(camera, rounded)
-        self._note(name)
+        self._update_last(name)
         return self.path / str(name)
 
     def add(self, path: Path) -> None:
         """Count a file that was just made."""
         name = FileName.parse(path.name)
         if name is not None:
-            self._ours[path.name] = True
+            self._is_own[path.name] = True
             self.files[path.name] = KnownFile(name.at, path.name, 0)
 
-    def grown(self, path: Path, size: int) -> None:
-        """Note the present size of a file, bytes."""
+    def set_size(self, path: Path, size: int) -> None:
+        """Record the present size of a file, bytes."""
         if path.name in self.files:
             self.files[path.name].size = size
 
     @property
-    def bytes(self) -> int:
-        """Bytes of the recorder's files together."""
+    def total_bytes(self) -> int:
+        """Number of bytes of all files of the recorder."""
         return sum(file.size for file in self.files.values())
 
     def delete(self, name: str) -> None:
-        """Delete a file of the recorder; keep one that another program has replaced.
+        """Delete a file of the recorder; keep the file if another program has replaced it.
 
         Raises:
             OSError: the file cannot be deleted.
         """
         path = self.path / name
-        if is_ours(path):
+        if is_smartcam_recording(path):
             path.unlink(missing_ok=True)
         self.files.pop(name, None)
-        self._ours.pop(name, None)
+        self._is_own.pop(name, None)

@@ -11,6 +11,7 @@ from smartcam.recording._mcap.form import RecordedPicture
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+    from datetime import datetime
 
     from smartcam.frames import Frame
     from smartcam.recording._mcap.form import Item
@@ -33,8 +34,8 @@ class JudgedResult(NamedTuple):
         result: result of the camera.
         picture: picture of the result; None if it is unknown.
         linked: True if the picture was recorded with the result's number, as after
-            ``read_image()``; False if it was found by its time. That needs a trigger of this
-            client: without one, the picture is None.
+            ``read_image()``; False if it was found by its time. A picture is found by its time only
+            if this client sent the trigger; otherwise ``picture`` is None.
     """
 
     result: Result[Any]
@@ -42,8 +43,8 @@ class JudgedResult(NamedTuple):
     linked: bool
 
 
-def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
-    """Yield each result with its picture once no later picture can belong to the result."""
+def match_pictures(items: Iterable[Item]) -> Iterator[JudgedResult]:
+    """Yield each result with its picture, as soon as no later picture can belong to the result."""
     matchers: dict[str, PictureMatcher] = {}
     for item in items:
         if isinstance(item, (RecordedPicture, Result)):
@@ -54,9 +55,9 @@ def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
                 matcher.add_picture(item)
             else:
                 matcher.results.append(item)
-            yield from matcher.settled()
+            yield from matcher.take_matched()
     for matcher in matchers.values():
-        yield from matcher.settled(over=True)
+        yield from matcher.take_matched(at_end=True)
 
 
 class PictureMatcher:
@@ -75,70 +76,85 @@ class PictureMatcher:
         self._max_bytes = max_bytes
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
-        self._dropped = -math.inf  # exposure start of the last dropped picture
-        self._latest = 0.0  # capture of the last picture without a result's number, seconds
+        self._dropped_exposure_start = -math.inf  # exposure start of the last dropped picture
+        self._latest_capture = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
         self._pictures.append(picture)
         self._bytes += _size(picture)
         if picture.result_number is None:
-            self._latest = max(self._latest, picture.frame.utc)
+            self._latest_capture = max(self._latest_capture, picture.frame.utc)
         too_many = len(self._pictures) > MAX_PICTURES
         while too_many or (self._bytes > self._max_bytes and len(self._pictures) > 1):
             dropped = self._pictures.popleft()
             self._bytes -= _size(dropped)
             if dropped.result_number is None:
-                self._dropped = max(self._dropped, dropped.frame.utc - dropped.frame.duration)
+                self._dropped_exposure_start = max(
+                    self._dropped_exposure_start, dropped.frame.utc - dropped.frame.duration
+                )
             too_many = False
 
-    def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
-        """Yield the results whose picture is known, or can no longer arrive."""
+    def take_matched(self, *, at_end: bool = False) -> Iterator[JudgedResult]:
+        """Remove and yield the results whose picture is known, or can no longer come.
+
+        Args:
+            at_end: whether no more pictures come.
+        """
         while self.results:
             result = self.results[0]
-            recorded = self._reported_picture(result)
-            reported = recorded is not None
-            if not (reported or over or self._is_late(result)):
+            recorded = self._linked_picture(result)
+            linked = recorded is not None
+            if not (linked or at_end or self._must_not_wait(result)):
                 return
             self.results.popleft()
-            picture = self._by_time(result) if recorded is None else recorded.frame
-            yield JudgedResult(result, picture, reported)
+            picture = self._picture_by_time(result) if recorded is None else recorded.frame
+            yield JudgedResult(result, picture, linked)
 
-    def settled_by_time(self) -> Iterator[JudgedResult]:
-        """Yield the results as soon as their picture is found by its time."""
+    def take_matched_by_time(self) -> Iterator[JudgedResult]:
+        """Remove and yield the results whose picture is found by its time or can no longer come."""
         while self.results:
             result = self.results[0]
-            picture = self._by_time(result)
-            findable = result.triggered_at is not None
-            if picture is None and findable and not self._is_late(result):
+            picture = self._picture_by_time(result)
+            can_be_found = result.triggered_at is not None
+            if picture is None and can_be_found and not self._must_not_wait(result):
                 return
             self.results.popleft()
             yield JudgedResult(result, picture, False)
 
-    def _is_late(self, result: Result[Any]) -> bool:
+    def _must_not_wait(self, result: Result[Any]) -> bool:
         """Return True if a result should not wait for a picture any more."""
-        return self._latest > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
+        return (
+            self._latest_capture > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
+        )
 
-    def _reported_picture(self, result: Result[Any]) -> RecordedPicture | None:
+    def _linked_picture(self, result: Result[Any]) -> RecordedPicture | None:
         key = result.number, result.received_at
         pictures = reversed(self._pictures)
         return next(
-            (seen for seen in pictures if (seen.result_number, seen.result_received_at) == key),
+            (picture for picture in pictures if _result_key(picture) == key),
             None,
         )
 
-    def _by_time(self, result: Result[Any]) -> Frame | None:
+    def _picture_by_time(self, result: Result[Any]) -> Frame | None:
         if result.triggered_at is None:  # the duration of the inspection is unknown
             return None
         triggered, received = result.triggered_at.timestamp(), result.received_at.timestamp()
-        if self._dropped >= triggered:
+        if self._dropped_exposure_start >= triggered:
             return None
         for picture in self._pictures:
             frame = picture.frame
-            began = frame.utc - frame.duration
-            if picture.result_number is None and triggered <= began <= frame.utc <= received:
+            exposure_start = frame.utc - frame.duration
+            if (
+                picture.result_number is None
+                and triggered <= exposure_start <= frame.utc <= received
+            ):
                 missing = picture.left_out or frame.lost  # perhaps the result's picture
                 return None if missing else frame
         return None
+
+
+def _result_key(picture: RecordedPicture) -> tuple[int | None, datetime | None]:
+    return picture.result_number, picture.result_received_at
 
 
 def _size(picture: RecordedPicture) -> int:

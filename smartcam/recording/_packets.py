@@ -75,8 +75,10 @@ def tcp_packet(
     size = _TCP_HEADER.size + len(options)
     acknowledged = receiver.sequence & 0xFFFFFFFF if flags & ACK else 0
     header = sender.port, receiver.port, sender.sequence & 0xFFFFFFFF, acknowledged, size << 2
-    plain = _TCP_HEADER.pack(*header, flags, _WINDOW, 0, 0) + options + data
-    total = _checksum(_pseudo_header(sender, receiver, _TCP, len(plain)) + plain)
+    without_checksum = _TCP_HEADER.pack(*header, flags, _WINDOW, 0, 0) + options + data
+    total = _checksum(
+        _pseudo_header(sender, receiver, _TCP, len(without_checksum)) + without_checksum
+    )
     body = _TCP_HEADER.pack(*header, flags, _WINDOW, total, 0) + options + data
     return _ethernet(sender, receiver, _TCP, number, body)
 
@@ -84,22 +86,24 @@ def tcp_packet(
 def udp_packet(sender: Side, receiver: Side, number: int, data: bytes) -> bytes:
     """Return an Ethernet frame with a UDP datagram; ``number`` is the IP packet's, in IPv4."""
     header = sender.port, receiver.port, _UDP_HEADER.size + len(data)
-    plain = _UDP_HEADER.pack(*header, 0) + data
-    total = _checksum(_pseudo_header(sender, receiver, _UDP, len(plain)) + plain)
+    without_checksum = _UDP_HEADER.pack(*header, 0) + data
+    total = _checksum(
+        _pseudo_header(sender, receiver, _UDP, len(without_checksum)) + without_checksum
+    )
     body = _UDP_HEADER.pack(*header, total or 0xFFFF) + data  # 0 would mean no checksum
     return _ethernet(sender, receiver, _UDP, number, body)
 
 
 def _ethernet(sender: Side, receiver: Side, protocol: int, number: int, body: bytes) -> bytes:
-    kind = _TYPES[len(sender.ip)]
+    ethertype = _TYPES[len(sender.ip)]
     if len(sender.ip) == 4:
         size = _IPV4.size + len(body)
-        before = 0x45, 0, size, number, _DO_NOT_FRAGMENT, _HOPS, protocol
-        total = _checksum(_IPV4.pack(*before, 0, sender.ip, receiver.ip))
-        ip = _IPV4.pack(*before, total, sender.ip, receiver.ip)
+        fields_before = 0x45, 0, size, number, _DO_NOT_FRAGMENT, _HOPS, protocol
+        total = _checksum(_IPV4.pack(*fields_before, 0, sender.ip, receiver.ip))
+        ip = _IPV4.pack(*fields_before, total, sender.ip, receiver.ip)
     else:
         ip = _IPV6.pack(6 << 28, len(body), protocol, _HOPS, sender.ip, receiver.ip)
-    return receiver.mac + sender.mac + struct.pack(">H", kind) + ip + body
+    return receiver.mac + sender.mac + struct.pack(">H", ethertype) + ip + body
 
 
 def _pseudo_header(sender: Side, receiver: Side, protocol: int, size: int) -> bytes:

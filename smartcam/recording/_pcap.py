@@ -2,8 +2,8 @@
 
 A recording has frames and no packets, so packets are made: Ethernet, IP, and TCP with handshake,
 segments, acknowledgements and an end, or UDP with one datagram a frame. Times and payload are the
-recorded ones. Facts that were not recorded are invented: the client's address and port, the
-division into segments, and the end of a lost link.
+recorded ones. What was not recorded is invented: the client's address and port, the division into
+segments, and the end of a lost link.
 """
 
 from __future__ import annotations
@@ -90,11 +90,11 @@ def write_pcap(
     check_recording(recording, "pcap")
     path = check_path(path, "path", "pcap")
     overwrite = check_flag(overwrite, "overwrite", "pcap")
-    for known in [*recording.cameras.values()] if camera is None else [recording.camera(camera)]:
-        if is_fleet(known.url):
+    for recorded in [*recording.cameras.values()] if camera is None else [recording.camera(camera)]:
+        if is_fleet(recorded.url):
             raise UnsupportedError(
-                f"recording {recording.path}: camera {known.name!r} is a fleet's, so no frames of "
-                "it are recorded, which packets are made of"
+                f"recording {recording.path}: camera {recorded.name!r} is a fleet's, so no frames "
+                "of it are recorded, which packets are made of"
             )
     try:
         stream = path.open("wb" if overwrite else "xb")
@@ -120,75 +120,77 @@ def write_pcap(
 
 
 def _packets(recording: Recording, camera: str | None) -> Iterator[_Packet]:
-    wires: dict[str, _Capture] = {}
-    for index, known in enumerate(recording.cameras.values()):
-        if not is_fleet(known.url):
-            wires[known.name] = _Capture(known, index)
+    captures: dict[str, _Capture] = {}
+    for index, recorded in enumerate(recording.cameras.values()):
+        if not is_fleet(recorded.url):
+            captures[recorded.name] = _Capture(recorded, index)
     for item in recording.items(camera):
-        if item.camera in wires:
-            yield from wires[item.camera].packets(item)
-    for wire in wires.values():
-        yield from wire.end()
+        if item.camera in captures:
+            yield from captures[item.camera].packets(item)
+    for capture in captures.values():
+        yield from capture.finish()
 
 
 class _Capture:
     """The packets of one camera's links; ``index`` is the camera's index in the recording."""
 
     def __init__(self, camera: RecordedCamera, index: int) -> None:
-        host, port, self._tcp = _where(camera)
+        host, port, self._tcp = _address_and_transport(camera)
         address = _address(host, index)
         client = address
         if not address.is_loopback:
             client = ipaddress.ip_address(_ADDRESSES[address.version][0])
         self._camera = Side(_CAMERA_MAC, address.packed, port)
         self._client = Side(_CLIENT_MAC, client.packed, FIRST_PORT + 512 * index)
-        self._ids = 0
+        self._last_packet_id = 0
         self._mss = MSS[address.version]
-        self._open = False
-        self._before: TraceEntry | None = None  # a Disconnect that may begin a link
+        self._is_open = False
+        self._held_disconnect: TraceEntry | None = None  # a Disconnect that may begin a link
         self._now = 0
 
     def packets(self, item: Item) -> Iterator[_Packet]:
         """Yield the packets of an item."""
         if isinstance(item, Disconnected):
             self._now = max(self._now, nanoseconds(item.at))
-            yield from self._held()
-            yield from self._end(by_client=item.expected)
+            yield from self._release_held()
+            yield from self._close_link(by_client=item.expected)
         elif isinstance(item, TraceEntry):
-            yield from self._frame(item)
+            yield from self._packets_of_frame(item)
 
-    def end(self) -> Iterator[_Packet]:
+    def finish(self) -> Iterator[_Packet]:
         """Yield the packets that end a link which is still open."""
-        yield from self._held()
-        yield from self._end(by_client=True)
+        yield from self._release_held()
+        yield from self._close_link(by_client=True)
 
-    def _frame(self, entry: TraceEntry) -> Iterator[_Packet]:
-        # a link begins with Connect, or with Disconnect and Connect
-        outward = entry.direction == ">"
-        if outward and entry.message == "Disconnect":
-            yield from self._held()
-            self._before = entry
+    def _packets_of_frame(self, entry: TraceEntry) -> Iterator[_Packet]:
+        # a link starts with Connect, or with Disconnect and Connect
+        to_camera = entry.direction == ">"
+        if to_camera and entry.message == "Disconnect":
+            yield from self._release_held()
+            self._held_disconnect = entry
             return
-        if outward and entry.message == "Connect" and self._tcp:
-            yield from self._end(by_client=True)
-        yield from self._held()
+        if to_camera and entry.message == "Connect" and self._tcp:
+            yield from self._close_link(by_client=True)
+        yield from self._release_held()
         yield from self._packets_of_entry(entry)
 
-    def _held(self) -> Iterator[_Packet]:
-        held, self._before = self._before, None
-        if held is not None:
-            yield from self._packets_of_entry(held)
+    def _release_held(self) -> Iterator[_Packet]:
+        disconnect, self._held_disconnect = self._held_disconnect, None
+        if disconnect is not None:
+            yield from self._packets_of_entry(disconnect)
 
     def _packets_of_entry(self, entry: TraceEntry) -> Iterator[_Packet]:
         data = bytes.fromhex(entry.hex)
         if not data:
             return  # passwords are not recorded
         self._now = max(self._now, nanoseconds(entry.at), _HANDSHAKE)
-        if not self._open:
-            self._open = True
-            yield from self._begin()
-        outward = entry.direction == ">"
-        sender, receiver = (self._client, self._camera) if outward else (self._camera, self._client)
+        if not self._is_open:
+            self._is_open = True
+            yield from self._open_link()
+        to_camera = entry.direction == ">"
+        sender, receiver = (
+            (self._client, self._camera) if to_camera else (self._camera, self._client)
+        )
         if not self._tcp:
             if len(data) > MAX_DATAGRAM_BYTES:
                 raise RecordingError(
@@ -205,7 +207,7 @@ class _Capture:
 
     # ------------------------------------------------------------------ a link's begin and end
 
-    def _begin(self) -> Iterator[_Packet]:
+    def _open_link(self) -> Iterator[_Packet]:
         """Open a link on the client's next port: three packets right before the first frame."""
         client, camera = self._client, self._camera
         client.port = FIRST_PORT + (client.port + 1 - FIRST_PORT) % PORTS
@@ -222,10 +224,10 @@ class _Capture:
         yield self._segment(client, camera, ACK)
         self._now = now
 
-    def _end(self, *, by_client: bool) -> Iterator[_Packet]:
-        if not self._open:
+    def _close_link(self, *, by_client: bool) -> Iterator[_Packet]:
+        if not self._is_open:
             return
-        self._open = False
+        self._is_open = False
         if not self._tcp:
             return
         first, second = (self._client, self._camera) if by_client else (self._camera, self._client)
@@ -245,8 +247,8 @@ class _Capture:
         return self._packet(udp_packet(sender, receiver, self._next_number(), data))
 
     def _next_number(self) -> int:
-        self._ids = (self._ids + 1) & 0xFFFF
-        return self._ids
+        self._last_packet_id = (self._last_packet_id + 1) & 0xFFFF
+        return self._last_packet_id
 
     def _packet(self, data: bytes) -> _Packet:
         if self._now >= MAX_TIME_NS:
@@ -254,7 +256,7 @@ class _Capture:
         return _Packet(self._now, data)
 
 
-def _where(camera: RecordedCamera) -> tuple[str, int, bool]:
+def _address_and_transport(camera: RecordedCamera) -> tuple[str, int, bool]:
     """Return a camera's host and port, and whether the transport was TCP."""
     if not camera.url:
         bvs: Any = PROTOCOLS.load("bvs")

@@ -17,8 +17,8 @@ from smartcam.exceptions import (
 )
 from smartcam.models import CameraEvent, Result
 from smartcam.observers import TraceEntry
-from smartcam.recording._folder import ENDING, FileName, files_of
-from smartcam.recording._judged import judged
+from smartcam.recording._folder import SUFFIX, FileName, files_of
+from smartcam.recording._judged import match_pictures
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
     ANNOTATIONS_SCHEMA,
@@ -34,9 +34,9 @@ from smartcam.recording._mcap.form import (
     camera_name,
     count_values,
     message_fields,
-    optional,
+    optional_field,
 )
-from smartcam.recording._mcap.json import body_of
+from smartcam.recording._mcap.json import data_of
 from smartcam.recording._mcap.records import (
     Channel,
     CutOffError,
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
     from smartcam.frames._inside import Drawing
     from smartcam.recording._judged import JudgedResult
-    from smartcam.recording._mcap.form import Item, Kind
+    from smartcam.recording._mcap.form import Item, MessageKind
     from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
@@ -107,8 +107,8 @@ class Recording:
         counts: numbers of items of each kind.
         began: time of the first item, UTC; None if there is none.
         ended: time of the last item, UTC.
-        remark: "" for a whole file; otherwise the place after which it cannot be read, and the
-            reason. For a folder the remarks on its files, one a line.
+        remark: "" for a whole file; otherwise the position after which the file cannot be read, and
+            the reason. For a folder: the remarks on its files, one per line.
         files: the file itself; for a folder its files, camera by camera, each camera's in order.
         since: time before which items are left out, UTC; None without one.
         until: time after which items are left out, UTC; None without one.
@@ -157,7 +157,7 @@ class Recording:
         """Yield all items, of all cameras or of one."""
         for item in self.all_items(camera):
             if not isinstance(item, RecordedState) and (
-                self.since is None or _when(item) >= self.since
+                self.since is None or _time_of(item) >= self.since
             ):
                 yield item
 
@@ -169,10 +169,10 @@ class Recording:
         if camera is not None:
             camera = check_text(camera, "camera", f"recording {self.path}")
         for path in self._files_of(camera):
-            scan, last = _Scan(path), None
+            scan, last = _FileScan(path), None
             try:
                 for item in scan.items(states=True):
-                    at = _when(item)
+                    at = _time_of(item)
                     if self.until is not None and at > self.until:
                         continue
                     if camera is None or item.camera == camera:
@@ -194,26 +194,26 @@ class Recording:
 
     def frames(self, camera: str | None = None) -> Iterator[TraceEntry]:
         """Yield the frames."""
-        return self._of_type(TraceEntry, camera)
+        return self._items_of_type(TraceEntry, camera)
 
     def results(self, camera: str | None = None) -> Iterator[Result]:
         """Yield the results; ``value`` consists of JSON values: dicts, lists, texts and numbers."""
-        return self._of_type(Result, camera)
+        return self._items_of_type(Result, camera)
 
     def events(self, camera: str | None = None) -> Iterator[CameraEvent]:
         """Yield the events."""
-        return self._of_type(CameraEvent, camera)
+        return self._items_of_type(CameraEvent, camera)
 
     def errors(self, camera: str | None = None) -> Iterator[RecordedError]:
         """Yield the errors."""
-        return self._of_type(RecordedError, camera)
+        return self._items_of_type(RecordedError, camera)
 
     def pictures(self, camera: str | None = None) -> Iterator[Frame]:
         """Yield the pictures with the times, numbers and losses of their source.
 
         ``lost`` also counts pictures that the recorder left out before the picture.
         """
-        return (frame_of(item) for item in self._of_type(RecordedPicture, camera))
+        return (frame_of(item) for item in self._items_of_type(RecordedPicture, camera))
 
     def judged(self, camera: str | None = None) -> Iterator[JudgedResult]:
         """Yield each result with its picture, if the picture is known.
@@ -222,9 +222,9 @@ class Recording:
         camera that was certainly exposed after the trigger and before the result. A result without
         a trigger of the recording client has a picture only if it was recorded for the result.
         """
-        return judged(self.items(camera))
+        return match_pictures(self.items(camera))
 
-    def _of_type(self, kind: type[T], camera: str | None) -> Iterator[T]:
+    def _items_of_type(self, kind: type[T], camera: str | None) -> Iterator[T]:
         return (item for item in self.items(camera) if isinstance(item, kind))
 
 
@@ -260,66 +260,66 @@ def load_recording(
     path = check_path(path, "path", "recording")
     since = check_instant(since, "since", f"recording {path}")
     until = check_instant(until, "until", f"recording {path}")
-    look = _FolderLook(path, since, until)
+    found = _FolderScan(path, since, until)
     if not path.is_dir():
-        look.take(_Scan(path))
-        return look.recording((path,))
+        found.add_file(_FileScan(path))
+        return found.recording((path,))
     files = _files_in(path, since, until)
     for file in files:
         try:
-            look.take(_Scan(file))
+            found.add_file(_FileScan(file))
         except MissingExtraError:
             raise
         except SmartCamError as exc:
-            look.remarks.append(str(exc))
-    if not look.version:
-        raise ConfigurationError("\n".join(look.remarks))
-    return look.recording(tuple(files))
+            found.remarks.append(str(exc))
+    if not found.version:
+        raise ConfigurationError("\n".join(found.remarks))
+    return found.recording(tuple(files))
 
 
-def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
+def each_item(path: Path, on_unreadable: Callable[[str], None]) -> Iterator[Item]:
     """Yield each readable item of a file or of a folder, without a scan.
 
     Args:
         path: the file or folder.
-        note: function that is called with a text about each unreadable part.
+        on_unreadable: function that is called with a text about each unreadable part.
 
     Raises:
         ConfigurationError: a file cannot be read, or is no recording of smartcam.
         RecordingError: the recording exceeds a bound, or the disk fails.
     """
     for file in _files_in(path, None, None) if path.is_dir() else [path]:
-        scan = _Scan(file)
+        scan = _FileScan(file)
         yield from scan.items()
         if scan.remark:
-            note(f"{file}: {scan.remark}")
+            on_unreadable(f"{file}: {scan.remark}")
 
 
 def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> list[Path]:
-    """Return the files of a folder that may have items of a time, camera by camera."""
+    """Return the files of a folder that may have items between two times, camera by camera."""
     try:
         named = sorted((name, entry.path) for name, entry in files_of(folder))
     except OSError as exc:
         raise ConfigurationError(f"recording {folder}: {exc.strerror or exc}") from exc
     paths: list[Path] = []
-    begins: list[FileName | None] = [name for name, _ in named]
-    for (name, path), follows in zip(named, [*begins[1:], None], strict=False):
-        if follows is not None and follows.camera == name.camera and since is not None:
-            over = follows.at + timedelta(milliseconds=1) <= since
+    names: list[FileName | None] = [name for name, _ in named]
+    for (name, path), next_name in zip(named, [*names[1:], None], strict=False):
+        if next_name is not None and next_name.camera == name.camera and since is not None:
+            ends_before = next_name.at + timedelta(milliseconds=1) <= since
         else:
-            over = False
-        if not over and (until is None or name.at <= until):
+            ends_before = False
+        if not ends_before and (until is None or name.at <= until):
             paths.append(Path(path))
     if not paths:
         raise ConfigurationError(
             f"recording {folder}: no recordings of a fleet are in this folder"
-            f"{' at that time' if named else ''}; expected CAMERA_TIME{ENDING}"
+            f"{' at that time' if named else ''}; expected CAMERA_TIME{SUFFIX}"
         )
     return paths
 
 
 @dataclass(slots=True)
-class _FolderLook:
+class _FolderScan:
     """The findings of a scan of files."""
 
     path: Path
@@ -333,11 +333,11 @@ class _FolderLook:
     facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     remarks: list[str] = field(default_factory=list[str])
 
-    def take(self, scan: _Scan) -> None:
-        """Scan a file; raises as :meth:`_Scan.items`."""
+    def add_file(self, scan: _FileScan) -> None:
+        """Add what a file holds; raises as :meth:`_FileScan.items`."""
         try:
             for item in scan.items():
-                self._take_item(item)
+                self._add_item(item)
                 del item  # free it, since the next one may be large, too
         finally:
             for name, facts in scan.camera_facts.items():
@@ -348,15 +348,15 @@ class _FolderLook:
             remark = scan.remark if scan.path == self.path else f"{scan.path.name}: {scan.remark}"
             self.remarks.append(remark)
 
-    def _take_item(self, item: Item) -> None:
-        at = _when(item)
+    def _add_item(self, item: Item) -> None:
+        at = _time_of(item)
         if self.until is not None and at > self.until:
             return
         self.names[item.camera] = None
         _check_cameras(self.path, self.names)
         if self.since is not None and at < self.since:
             return
-        self.counts[_kind(item)] += 1
+        self.counts[_count_name(item)] += 1
         if isinstance(item, RecordedPicture):
             self.counts["left_out"] += item.left_out
         self.began = at if self.began is None else min(self.began, at)
@@ -378,7 +378,7 @@ class _FolderLook:
         )
 
 
-def _when(item: Item | RecordedState) -> datetime:
+def _time_of(item: Item | RecordedState) -> datetime:
     at = item.received_at if isinstance(item, Result) else item.at
     return EPOCH if at is None else at
 
@@ -390,7 +390,7 @@ def _check_cameras(path: Path, names: Sized) -> None:
         )
 
 
-def _kind(item: Item) -> str:
+def _count_name(item: Item) -> str:
     match item:
         case TraceEntry():
             return "frames"
@@ -417,11 +417,11 @@ def _camera(name: str, facts: dict[str, str]) -> RecordedCamera:
 
 
 @dataclass(slots=True)
-class _Scan:
+class _FileScan:
     """One pass through a file."""
 
     path: Path
-    # facts about the file; filled during the pass, like the next two
+    # facts about the file; this and the next two attributes are filled during the pass
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
     # facts about cameras, by their names
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
@@ -456,14 +456,14 @@ class _Scan:
             self._check_magic(stream.read(8))
             stream.seek(0)
             count = 0
-            kinds: dict[int, Kind | str] = {}
+            kinds: dict[int, MessageKind | str] = {}
             schemas: dict[int, str] = {}
             reader = RecordReader(stream, self.path)
             records = reader.records()
             while True:
                 try:
                     record = next(records)
-                    item = self._take(record, schemas, kinds, reader)
+                    item = self._read_record(record, schemas, kinds, reader)
                 except StopIteration:
                     break
                 except SmartCamError:
@@ -480,13 +480,13 @@ class _Scan:
                     count += 1
                     yield item
                     item = None  # free it, since the next one may be large, too
-            self._check_ours(schemas)
+            self._check_is_recording(schemas)
 
-    def _take(
+    def _read_record(
         self,
         record: Record,
         schemas: dict[int, str],
-        kinds: dict[int, Kind | str],
+        kinds: dict[int, MessageKind | str],
         reader: RecordReader,
     ) -> Item | RecordedState | None:
         match record:
@@ -500,15 +500,15 @@ class _Scan:
                 elif name in (ANNOTATIONS_SCHEMA, *PICTURE_SCHEMAS):
                     kinds[number] = name
             case McapMessage(channel, sequence, data) if channel in kinds:
-                reader_of = kinds[channel]
-                if isinstance(reader_of, str):
-                    return self._picture(reader_of, sequence, data, reader)
+                kind_or_schema = kinds[channel]
+                if isinstance(kind_or_schema, str):
+                    return self._picture(kind_or_schema, sequence, data, reader)
                 body = bytes(data)
-                self._count_values(count_values(body), reader.place)
+                self._count_values(count_values(body), reader.offset)
                 fields = message_fields(body)
-                self._find_raw(fields, reader)
-                item = reader_of.from_json(fields)
-                if isinstance(item, TraceEntry) and (hex_data := body_of(item)):
+                self._add_raw(fields, reader)
+                item = kind_or_schema.from_json(fields)
+                if isinstance(item, TraceEntry) and (hex_data := data_of(item)):
                     self.bodies.add((item.camera, sequence), hex_data, len(hex_data))
                 return item
             case Metadata(name, facts) if name == FILE_METADATA:
@@ -518,7 +518,7 @@ class _Scan:
                 self.camera_facts[facts.get("camera", "")] = facts
                 _check_cameras(self.path, self.camera_facts)
             case Metadata(name, facts) if name == STATE_METADATA:
-                return RecordedState.of(facts)
+                return RecordedState.from_facts(facts)
             case _:
                 pass
         return None
@@ -526,19 +526,19 @@ class _Scan:
     def _picture(
         self, schema: str, sequence: int, data: memoryview, reader: RecordReader
     ) -> RecordedPicture | None:
-        """Return a picture with the marks that stand right before it; None of marks."""
+        """Return a picture with the marks right before it; None for a message of marks."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import annotations, messages
         if schema == ANNOTATIONS_SCHEMA:
-            self._count_values(len(data) // MIN_POINT_BYTES, reader.place)
+            self._count_values(len(data) // MIN_POINT_BYTES, reader.offset)
             self.marks = sequence, annotations.drawings_of(data)
             return None
         marks, self.marks = self.marks, (0, ())
         return messages.picture_of(schema, data, *marks)
 
-    def _find_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
-        """Add a result's bytes, if they are in its frame."""
-        raw_from = optional(fields, "raw_from", int)
+    def _add_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
+        """Add a result's bytes to its fields, if they are only in its frame."""
+        raw_from = optional_field(fields, "raw_from", int)
         if raw_from is None:
             return
         raw = self.bodies.get((camera_name(fields), raw_from))
@@ -547,12 +547,13 @@ class _Scan:
         reader.count_unpacked(len(raw))
         fields["raw"] = raw
 
-    def _count_values(self, count: int, place: int) -> None:
+    def _count_values(self, count: int, offset: int) -> None:
         self.values += count
-        if self.values > max(MIN_VALUES, VALUES_PER_BYTE * place):
+        if self.values > max(MIN_VALUES, VALUES_PER_BYTE * offset):
             raise RecordingError(
-                f"recording {self.path}: {self.values} values in the messages of the first {place} "
-                f"bytes of the file, expected {VALUES_PER_BYTE} a byte at most, or {MIN_VALUES}"
+                f"recording {self.path}: {self.values} values in the messages of the first "
+                f"{offset} bytes of the file, expected {VALUES_PER_BYTE} a byte at most, "
+                f"or {MIN_VALUES}"
             )
 
     def _check_magic(self, begin: bytes) -> None:
@@ -568,7 +569,7 @@ class _Scan:
                 f"{' and '.join(FORMATS)}; it was written by smartcam {version}"
             )
 
-    def _check_ours(self, schemas: dict[int, str]) -> None:
+    def _check_is_recording(self, schemas: dict[int, str]) -> None:
         if not self.file_facts:
             names = ", ".join(sorted(set(schemas.values()))[:8]) or "nothing"
             if any(name.startswith("smartcam.") for name in schemas.values()):

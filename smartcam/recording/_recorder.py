@@ -26,7 +26,7 @@ from smartcam._forks import notify_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer, RawFrame, TraceEntry
-from smartcam.recording._exclusive_files import opened
+from smartcam.recording._exclusive_files import open_exclusively
 from smartcam.recording._mcap.bodies import LastBodies
 from smartcam.recording._mcap.form import (
     ANNOTATIONS,
@@ -41,14 +41,14 @@ from smartcam.recording._mcap.form import (
     PROFILE,
     RecordedError,
     RecordedPicture,
-    bounded,
     captured_at,
+    checked_bytes,
     load_compress,
     message_of,
     nanoseconds,
     topic_of,
 )
-from smartcam.recording._mcap.json import FrameTexts, body_of
+from smartcam.recording._mcap.json import FrameTexts, data_of
 from smartcam.recording._mcap.writer import McapWriter
 from smartcam.settings import is_fleet, parse_address
 
@@ -67,7 +67,8 @@ INTERVAL = 0.5
 chunks is kept in memory until the end: about 25 MB for a day without a pause."""
 
 CHUNK = 1 << 20
-"""Number of waiting bytes at which a chunk is written sooner; also the largest chunk."""
+"""Number of waiting bytes at which a chunk is written before the interval ends; also the size at
+which a chunk ends."""
 
 MAX_WAITING_BYTES = 1 << 26
 """Largest number of bytes that wait for the disk before the recording gives up: a minute of a fast
@@ -84,7 +85,7 @@ CLOSE_TIMEOUT = 30.0
 """Seconds that :meth:`Recorder.close` waits for the disk."""
 
 ITEM_OVERHEAD_BYTES = 512
-"""Bytes for which an item counts besides its data."""
+"""Number of bytes for which an item counts in addition to its data."""
 
 
 class Counts(NamedTuple):
@@ -113,16 +114,16 @@ class Description(NamedTuple):
     facts: dict[str, str]
 
 
-Given: TypeAlias = "Item | RawFrame | Description"
+RecorderInput: TypeAlias = "Item | RawFrame | Description"
 """Objects that the thread writes."""
 
 
-class _Written(Protocol):
+class _RecordingOutput(Protocol):
     """The file or folder that the thread writes to."""
 
     def start(self) -> None: ...
 
-    def add(self, item: Given, /) -> None: ...
+    def add(self, item: RecorderInput, /) -> None: ...
 
     def flush(self) -> None: ...
 
@@ -163,15 +164,15 @@ class Recorder(Observer):
         self.path: Path = check_path(path, "path", "recording")
         self._pictures = check_flag(pictures, "pictures", "recording")
         self._overwrite = check_flag(overwrite, "overwrite", "recording")
-        self._more = threading.Condition()
-        self._items: list[Given] = []
-        self._waiting = 0  # waiting bytes, without pictures
-        self._waiting_pictures = 0  # waiting bytes of pictures
+        self._condition = threading.Condition()
+        self._items: list[RecorderInput] = []
+        self._waiting_bytes = 0  # without pictures
+        self._waiting_picture_bytes = 0
         self._left_out: dict[str, int] = {}  # pictures left out since the last one, by camera
         self._counts = dict.fromkeys(Counts._fields, 0)
-        self._taking = False
-        self._closing = False
-        self._file: _Written | None = None
+        self._accepts_items = False
+        self._is_closing = False
+        self._file: _RecordingOutput | None = None
         self._thread: threading.Thread | None = None
         self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
         notify_of_forks(self)
@@ -189,14 +190,14 @@ class Recorder(Observer):
         if self._thread is not None:
             raise ConfigurationError(f"recording {self.path}: opened before; make a new recorder")
         self._file = self._make_file()
-        self._taking = True
+        self._accepts_items = True
         self._thread = threading.Thread(
             target=self._write_all, name=f"smartcam.recorder[{self.path.name}]", daemon=True
         )
         self._thread.start()
         return self
 
-    def _make_file(self) -> _Written:
+    def _make_file(self) -> _RecordingOutput:
         """Create the file; raises as :meth:`open`."""
         if self.path.suffix.lower() == VIDEO_SUFFIX:
             with from_part("frames", "videos need"):
@@ -210,7 +211,7 @@ class Recorder(Observer):
     def _open_stream(self) -> IO[bytes]:
         """Create the empty file; raises as :meth:`open`."""
         try:
-            return opened(self.path, overwrite=self._overwrite)
+            return open_exclusively(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
                 f"recording {self.path}: the file exists already; overwrite (--force) replaces it"
@@ -230,9 +231,9 @@ class Recorder(Observer):
         Raises:
             RecordingError: the recording has failed, earlier or now.
         """
-        with self._more:
-            self._taking, self._closing = False, True
-            self._more.notify()
+        with self._condition:
+            self._accepts_items, self._is_closing = False, True
+            self._condition.notify()
         if self._thread is not None:
             self._thread.join(CLOSE_TIMEOUT)
             if self._thread.is_alive():
@@ -254,9 +255,9 @@ class Recorder(Observer):
 
     def forked(self) -> None:
         """Record nothing in a fork of the process that writes the file."""
-        self._more, self._failure = threading.Condition(), concurrent.futures.Future()
-        self._thread, self._items, self._waiting = None, [], 0
-        self._waiting_pictures = 0
+        self._condition, self._failure = threading.Condition(), concurrent.futures.Future()
+        self._thread, self._items, self._waiting_bytes = None, [], 0
+        self._waiting_picture_bytes = 0
         if self._file is not None:
             self._fail("this process is a fork of the one that writes it, which goes on")
 
@@ -280,7 +281,7 @@ class Recorder(Observer):
     def describe(self, camera: str, **facts: object) -> None:
         """Write facts about a camera to the file, such as ``interpret_as``; None is left out.
 
-        The address and the dialect are written by themselves, with every session.
+        The address and the dialect are written without this call, with every session.
         """
         texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
         self._put(Description({"camera": camera, **texts}), 0)
@@ -357,26 +358,28 @@ class Recorder(Observer):
             check_text(camera, "camera", "recording", least=0, most=MAX_NAME_CHARACTERS)
             or frame.source
         )
-        made = (None, None) if result is None else (result.number, result.received_at)
+        result_key = (None, None) if result is None else (result.number, result.received_at)
         check_readable(frame)
         if (check := getattr(self._file, "check_picture", None)) is not None:
             check(frame, name)
         size = memoryview(frame.data).nbytes
-        with self._more:
-            if not self._taking:
+        with self._condition:
+            if not self._accepts_items:
                 return False
-            waiting = self._waiting_pictures
-            room = MAX_WAITING_PICTURE_BYTES - waiting if waiting else size
-            if size > min(room, MAX_PICTURE_SIZE_BYTES):
+            waiting = self._waiting_picture_bytes
+            free_bytes = MAX_WAITING_PICTURE_BYTES - waiting if waiting else size
+            if size > min(free_bytes, MAX_PICTURE_SIZE_BYTES):
                 self._counts["left_out"] += 1
                 self._left_out[name] = self._left_out.get(name, 0) + 1
                 return False
             left_out = self._left_out.pop(name, 0)
             self._counts["pictures"] += 1
-            self._items.append(RecordedPicture(name, captured_at(frame), frame, left_out, *made))
-            self._waiting_pictures += size + ITEM_OVERHEAD_BYTES
-            if not waiting or waiting < CHUNK <= self._waiting_pictures:
-                self._more.notify()
+            self._items.append(
+                RecordedPicture(name, captured_at(frame), frame, left_out, *result_key)
+            )
+            self._waiting_picture_bytes += size + ITEM_OVERHEAD_BYTES
+            if not waiting or waiting < CHUNK <= self._waiting_picture_bytes:
+                self._condition.notify()
         return True
 
     def add_image(self, camera: str, image: bytes, *, result: Result[Any] | None = None) -> bool:
@@ -456,23 +459,24 @@ class Recorder(Observer):
     @property
     def has_room(self) -> bool:
         """True if less than half of the room for waiting pictures is used."""
-        return self._waiting_pictures < MAX_WAITING_PICTURE_BYTES // 2
+        return self._waiting_picture_bytes < MAX_WAITING_PICTURE_BYTES // 2
 
-    def _put(self, item: Given, size: int, kind: str | None = None) -> None:
+    def _put(self, item: RecorderInput, size: int, kind: str | None = None) -> None:
         self._put_all((item,), size, kind)
 
-    def _put_all(self, items: Sequence[Given], size: int, kind: str | None) -> None:
+    def _put_all(self, items: Sequence[RecorderInput], size: int, kind: str | None) -> None:
         """Put items of one kind into the list, with ``size`` bytes together."""
-        with self._more:
-            if not self._taking:
+        with self._condition:
+            if not self._accepts_items:
                 return
             if kind is not None:
                 self._counts[kind] += len(items)
-            before = self._waiting
+            waiting_before = self._waiting_bytes
             self._items += items
-            self._waiting = waiting = before + size + ITEM_OVERHEAD_BYTES * len(items)
-            if not before or before < CHUNK <= waiting:
-                self._more.notify()
+            waiting = waiting_before + size + ITEM_OVERHEAD_BYTES * len(items)
+            self._waiting_bytes = waiting
+            if not waiting_before or waiting_before < CHUNK <= waiting:
+                self._condition.notify()
         if waiting > MAX_WAITING_BYTES:
             self._fail(f"the disk is too slow: {waiting >> 20} MiB wait to be written")
 
@@ -482,12 +486,12 @@ class Recorder(Observer):
         """End the recording; keep the first reason."""
         error = RecordingError(f"recording {self.path}: {reason}")
         error.__cause__ = cause
-        with self._more:
-            self._taking = False
+        with self._condition:
+            self._accepts_items = False
             self._items.clear()
-            self._waiting = self._waiting_pictures = 0
-            first = not self._failure.done()
-        if first:
+            self._waiting_bytes = self._waiting_picture_bytes = 0
+            is_first = not self._failure.done()
+        if is_first:
             with contextlib.suppress(concurrent.futures.InvalidStateError):
                 self._failure.set_result(error)
 
@@ -497,7 +501,7 @@ class Recorder(Observer):
         try:
             with contextlib.closing(self._file) as file:
                 file.start()
-                while not self._write_some(file):
+                while not self._write_batch(file):
                     pass
                 file.finish()
         except OSError as exc:
@@ -507,20 +511,23 @@ class Recorder(Observer):
         except Exception as exc:  # noqa: BLE001 - the thread must not end silently
             self._fail(f"unexpected {exc!r}", exc)
 
-    def _write_some(self, file: _Written) -> bool:
-        """Wait for items and write them; return whether they were the last."""
-        with self._more:
-            self._more.wait_for(lambda: self._items or self._closing)
-            self._more.wait_for(
-                lambda: self._closing or self._waiting + self._waiting_pictures > CHUNK, INTERVAL
+    def _write_batch(self, file: _RecordingOutput) -> bool:
+        """Wait for items and write them; return True if they were the last."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._items or self._is_closing)
+            self._condition.wait_for(
+                lambda: (
+                    self._is_closing or self._waiting_bytes + self._waiting_picture_bytes > CHUNK
+                ),
+                INTERVAL,
             )
             items, self._items = self._items, []
-            self._waiting, over = 0, self._closing
-            self._waiting_pictures = 0
+            self._waiting_bytes, is_last = 0, self._is_closing
+            self._waiting_picture_bytes = 0
         for item in items:
             file.add(item)
         file.flush()
-        return over
+        return is_last
 
 
 class RecordingFile:
@@ -539,13 +546,13 @@ class RecordingFile:
         self._on_disk = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
-        self._numbers: dict[int, int] = {}
+        self._sequences: dict[int, int] = {}
         self._facts: dict[str, dict[str, str]] = {}
         self._frame_texts = FrameTexts()
         self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # frame numbers by data
         self._size = 0  # size when the file was closed
-        # time of the last message, and the same in nanoseconds: those of a delivery share one
-        self._at: tuple[datetime | None, int] = None, 0
+        # time of the last message, also in nanoseconds: frames that came together share it
+        self._last_time: tuple[datetime | None, int] = None, 0
 
     def start(self) -> None:
         """Write the beginning of the file."""
@@ -555,41 +562,41 @@ class RecordingFile:
         self._writer.add_metadata(FILE_METADATA, facts)
         self.flush()
 
-    def add(self, item: Given) -> None:
+    def add(self, item: RecorderInput) -> None:
         """Write one item; it is on the disk after the next :meth:`flush`."""
-        if isinstance(item, RawFrame):  # these two are most of a recording
+        if isinstance(item, RawFrame):  # raw frames and results are most of a recording
             text, data = self._frame_texts.text(item)
-            self._frame(item.camera, item.at, bounded(text), data)
+            self._write_frame(item.camera, item.at, checked_bytes(text), data)
             return
         if isinstance(item, Result):
             frame = self._bodies.get((item.camera, item.raw.hex()))
-            self._message("results", item.camera, item.received_at, item, frame)
+            self._write_message("results", item.camera, item.received_at, item, frame)
             return
         match item:
             case TraceEntry():
-                self._frame(item.camera, item.at, message_of("frames", item), body_of(item))
+                self._write_frame(item.camera, item.at, message_of("frames", item), data_of(item))
             case Description(facts):
-                self._describe(facts)
+                self._write_camera_facts(facts)
             case RecordedError():
-                self._message("errors", item.camera, item.at, item)
+                self._write_message("errors", item.camera, item.at, item)
             case RecordedPicture():
-                self._picture(item)
+                self._write_picture(item)
             case _:
                 if isinstance(item, (Connected, Reconnected)):
-                    self._describe({"camera": item.camera, **address_facts(item.url)})
-                self._message("events", item.camera, item.at, item)
+                    self._write_camera_facts({"camera": item.camera, **address_facts(item.url)})
+                self._write_message("events", item.camera, item.at, item)
 
     @property
     def size(self) -> int:
         """Number of bytes so far, without the chunk that is being filled."""
         return self._size if self._stream.closed else self._stream.tell()
 
-    def note(self, name: str, facts: dict[str, str]) -> None:
+    def add_facts(self, name: str, facts: dict[str, str]) -> None:
         """Write facts under a name, after the items so far."""
         self._writer.flush()  # write the chunk, which would otherwise follow the facts
         self._writer.add_metadata(name, facts)
 
-    def check(self) -> None:
+    def check_path(self) -> None:
         """Check that the file is still at its path.
 
         Raises:
@@ -599,7 +606,7 @@ class RecordingFile:
         if not os.path.samestat(status, self.path.stat()):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.path))
 
-    def cut(self, size: int) -> None:
+    def cut_to(self, size: int) -> None:
         """Cut the file to its first ``size`` bytes, if the disk allows it, and close it."""
         self.close()
         with contextlib.suppress(OSError):
@@ -626,46 +633,46 @@ class RecordingFile:
         with contextlib.suppress(OSError):
             self._stream.close()
 
-    def _message(
+    def _write_message(
         self, kind: str, camera: str, at: datetime, item: Item, raw_from: int | None = None
     ) -> int:
-        """Write a message; return its number, which is the topic's own count."""
+        """Write a message; return its number, which is counted for each topic."""
         return self._write(kind, camera, at, message_of(kind, item, raw_from))
 
-    def _frame(self, camera: str, at: datetime, text: bytes, data: str) -> None:
+    def _write_frame(self, camera: str, at: datetime, text: bytes, data: str) -> None:
         """Write a frame; keep its data, as hex, for its result."""
         number = self._write("frames", camera, at, text)
         if data:
             self._bodies.add((camera, data), number, len(data))
 
     def _write(self, kind: str, camera: str, at: datetime, text: bytes) -> int:
-        channel = self._channels.get((camera, kind)) or self._channel(camera, kind)
-        self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
-        if at is not self._at[0]:
-            self._at = at, nanoseconds(at)
-        self._writer.add_message(channel, self._at[1], text, number)
+        channel = self._channels.get((camera, kind)) or self._channel_of(camera, kind)
+        self._sequences[channel] = number = self._sequences[channel] + 1 & 0xFFFFFFFF
+        if at is not self._last_time[0]:
+            self._last_time = at, nanoseconds(at)
+        self._writer.add_message(channel, self._last_time[1], text, number)
         return number
 
-    def _picture(self, picture: RecordedPicture) -> None:
+    def _write_picture(self, picture: RecordedPicture) -> None:
         """Write a picture; do not compress its chunk."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import messages
 
-        marked_by = self._annotations(picture) if picture.frame.drawings else None
+        annotations_number = self._write_annotations(picture) if picture.frame.drawings else None
         schema = messages.schema_of(picture)
-        data = messages.picture_message(picture, marked_by)
-        self._foxglove(picture, PICTURES, schema, messages.schema_data, data)
+        data = messages.picture_message(picture, annotations_number)
+        self._write_foxglove(picture, PICTURES, schema, messages.schema_data, data)
 
-    def _annotations(self, picture: RecordedPicture) -> int:
+    def _write_annotations(self, picture: RecordedPicture) -> int:
         """Write the marks of a picture, which comes next; return the number of the message."""
         with from_part("frames", "pictures need"):
             from smartcam.recording._pictures import annotations
 
         data = annotations.annotations_message(picture.frame)
         schema_data = annotations.schema_data
-        return self._foxglove(picture, ANNOTATIONS, ANNOTATIONS_SCHEMA, schema_data, data)
+        return self._write_foxglove(picture, ANNOTATIONS, ANNOTATIONS_SCHEMA, schema_data, data)
 
-    def _foxglove(
+    def _write_foxglove(
         self,
         picture: RecordedPicture,
         topic: str,
@@ -673,25 +680,27 @@ class RecordingFile:
         schema_data: Callable[[str], bytes],
         data: bytes,
     ) -> int:
-        """Write a message of Foxglove's of the time of a picture; return its number."""
+        """Write a message of Foxglove with a picture's time; return the message's number."""
         key = picture.camera, schema
         if key not in self._channels:
             if schema not in self._schemas:
-                described = schema_data(schema)
-                self._schemas[schema] = self._writer.register_schema(schema, "protobuf", described)
+                schema_bytes = schema_data(schema)
+                self._schemas[schema] = self._writer.register_schema(
+                    schema, "protobuf", schema_bytes
+                )
             self._channels[key] = channel = self._writer.register_channel(
                 f"/{picture.camera}/{topic}",
                 "protobuf",
                 self._schemas[schema],
                 {"camera": picture.camera},
             )
-            self._numbers[channel] = 0
+            self._sequences[channel] = 0
         channel = self._channels[key]
-        self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
-        self._writer.add_message(channel, nanoseconds(picture.at), data, number, packs=False)
+        self._sequences[channel] = number = self._sequences[channel] + 1 & 0xFFFFFFFF
+        self._writer.add_message(channel, nanoseconds(picture.at), data, number, compressed=False)
         return number
 
-    def _channel(self, camera: str, kind: str) -> int:
+    def _channel_of(self, camera: str, kind: str) -> int:
         known = self._channels.get((camera, kind))
         if known is not None:
             return known
@@ -704,16 +713,16 @@ class RecordingFile:
             topic_of(camera, kind), "json", self._schemas[kind], {"camera": camera}
         )
         self._channels[camera, kind] = channel
-        self._numbers[channel] = 0
+        self._sequences[channel] = 0
         return channel
 
-    def _describe(self, facts: dict[str, str]) -> None:
+    def _write_camera_facts(self, facts: dict[str, str]) -> None:
         """Write a camera's facts if they are new."""
-        before = self._facts.get(facts["camera"], {})
-        now = {**before, **facts}
-        if now != before:
-            self._facts[facts["camera"]] = now
-            self._writer.add_metadata(CAMERA_METADATA, now)
+        old_facts = self._facts.get(facts["camera"], {})
+        new_facts = {**old_facts, **facts}
+        if new_facts != old_facts:
+            self._facts[facts["camera"]] = new_facts
+            self._writer.add_metadata(CAMERA_METADATA, new_facts)
 
 
 def address_facts(url: str) -> dict[str, str]:

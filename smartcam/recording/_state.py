@@ -1,4 +1,4 @@
-"""The state of a camera at a place in a recording, for readers that skip earlier items."""
+"""The state of a camera at a point of a recording, for readers that skip earlier items."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ and after a gap."""
 
 
 class RecordedState(NamedTuple):
-    """The state of a camera at a place in the file.
+    """The state of a camera at a point of the file.
 
     Attributes:
         camera: name of the camera.
@@ -57,11 +57,11 @@ class RecordedState(NamedTuple):
             case _:
                 return self
 
-    def facts(self, endian: int, at: datetime) -> dict[str, str]:
+    def to_facts(self, endian: int, at: datetime) -> dict[str, str]:
         """Return the texts of the camera's state at a time, for a metadata record.
 
-        The time is that of the next record, not of writing: records wait for the disk, and a replay
-        of a span would begin too early.
+        The time is that of the next record. With the time of writing, which is later since records
+        wait for the disk, a replay of a span would begin at a wrong time.
         """
         facts = {
             "camera": self.camera,
@@ -76,8 +76,8 @@ class RecordedState(NamedTuple):
         return facts
 
     @classmethod
-    def of(cls, facts: Mapping[str, str]) -> RecordedState:
-        """Return the state of a metadata record.
+    def from_facts(cls, facts: Mapping[str, str]) -> RecordedState:
+        """Return the state that a metadata record describes.
 
         Raises:
             ValueError: the texts contain no valid state.

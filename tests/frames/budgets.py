@@ -21,8 +21,8 @@ from tests.frames.inside import (
     MAX_MESSAGE_BYTES,
     Assembler,
     Depacketizer,
-    H265Units,
-    JpegUnits,
+    H265PayloadFormat,
+    JpegPayloadFormat,
     RequestParser,
     RtpPacket,
     RtspError,
@@ -31,17 +31,17 @@ from tests.frames.inside import (
     cut_chunks,
     decode_events,
     decode_jpeg,
-    described,
-    options_of,
+    parse_description,
     parse_rtcp,
     picture_size,
     requested_transport,
     target_of,
+    transport_options,
     units,
     url_of,
 )
 from tests.frames.inside import MAX_PIXEL_BYTES as MAX_BITMAP
-from tests.frames.inside import _parts as digest_parts
+from tests.frames.inside import _digest_parameters as digest_parameters
 from tests.frames.inside import answers as _answers
 from tests.frames.inside import description as _description
 from tests.frames.inside import expressions as _expressions
@@ -61,7 +61,7 @@ def _rtsp(pieces: list[bytes]) -> None:
                 try:
                     target_of(request.url)
                     requested_transport(request.headers.get("transport", ""), "10.0.0.1")
-                    digest_parts(request.headers.get("authorization", ""))
+                    digest_parameters(request.headers.get("authorization", ""))
                 except RtspError:
                     pass
 
@@ -82,11 +82,11 @@ def _redirect(pieces: list[bytes]) -> None:
     with _Pieces(
         [one[at : at + 4096] for one in pieces for at in range(0, len(one), 4096)]
     ) as link:
-        answer = _redirects._read(link, "10.0.0.1", time.monotonic() + 1e6, web=False)
+        answer = _redirects._read_answer(link, "10.0.0.1", time.monotonic() + 1e6, is_http=False)
     shown = answer.headers.get("www-authenticate", ())
     _redirects._authorization(asked, asked._replace(netloc="10.0.0.1"), "DESCRIBE", shown)
     for location in answer.headers.get("location", ()):
-        _redirects.followed(asked.geturl(), location, answer.peer, "camera")
+        _redirects.checked_redirect(asked.geturl(), location, answer.peer, "camera")
 
 
 _ANSWER = b"RTSP/1.0 401 No\r\n"
@@ -135,11 +135,11 @@ def _rtsp_answers(pieces: list[bytes]) -> None:
         parser.feed(piece)
         while (came := parser.next()) is not None:
             if isinstance(came, _answers.ServerAnswer):
-                options_of(came.header("transport"))
+                transport_options(came.header("transport"))
                 challenge_of(came.headers.get("www-authenticate", ()))
-                found = described(came.body)
+                found = parse_description(came.body)
                 url_of(found.control, came.header("content-base"))
-                drain(one.sets for one in found.tracks)
+                drain(one.parameter_sets for one in found.tracks)
 
 
 _OK = b"RTSP/1.0 200 OK\r\nCSeq: 1\r\n"
@@ -218,11 +218,11 @@ _WEB_PICTURES: dict[str, Make] = {
 def _rtp(datagrams: list[bytes]) -> None:
     taker = Depacketizer()
     for number, datagram in enumerate(datagrams):
-        for unit in taker.take(RtpPacket.parse(datagram), number * 1e-3):
+        for unit in taker.add_packet(RtpPacket.parse(datagram), number * 1e-3):
             drain(units(unit.data) if unit.data else ())
         if not number % 50:  # as a timer does
-            taker.missing()
-            taker.waits_since()
+            taker.missing_sequences()
+            taker.waiting_since()
     taker.give_up(1e9)
 
 
@@ -274,9 +274,9 @@ _RTP: dict[str, Make] = {
 
 
 def _h265(datagrams: list[bytes]) -> None:
-    taker = Depacketizer(64, H265Units(), wary=True)
+    taker = Depacketizer(64, H265PayloadFormat(), verify_markers=True)
     for number, datagram in enumerate(datagrams):
-        for unit in taker.take(RtpPacket.parse(datagram), number * 1e-3):
+        for unit in taker.add_packet(RtpPacket.parse(datagram), number * 1e-3):
             size_in_h265(unit.data)
     taker.give_up(1e9)
 
@@ -311,9 +311,9 @@ _H265: dict[str, Make] = {
 
 
 def _jpegs(datagrams: list[bytes]) -> None:
-    taker = Depacketizer(64, JpegUnits(), wary=True)
+    taker = Depacketizer(64, JpegPayloadFormat(), verify_markers=True)
     for number, datagram in enumerate(datagrams):
-        drain(taker.take(RtpPacket.parse(datagram), number * 1e-3))
+        drain(taker.add_packet(RtpPacket.parse(datagram), number * 1e-3))
     taker.give_up(1e9)
 
 

@@ -29,8 +29,8 @@ from smartcam.frames._streaming.rtp.assembling import MAX_ACCESS_UNIT_BYTES, Acc
 from smartcam.frames._streaming.rtp.depacketizer import MAX_PACKETS_AHEAD, Depacketizer
 from smartcam.frames._streaming.rtp.driver import RtpDriver
 from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets, units
-from smartcam.frames._streaming.rtp.h265 import H265Units, size_in
-from smartcam.frames._streaming.rtp.jpeg import JpegUnits
+from smartcam.frames._streaming.rtp.h265 import H265PayloadFormat, size_in
+from smartcam.frames._streaming.rtp.jpeg import JpegPayloadFormat
 from smartcam.frames._streaming.rtp.packets import (
     Goodbye,
     PacketsMissing,
@@ -56,12 +56,12 @@ from smartcam.frames._streaming.rtsp.addresses import (
     target_of,
 )
 from smartcam.frames._streaming.rtsp.authentication import (
-    MAX_WRONG_ANSWERS,
+    MAX_WRONG_PASSWORDS,
     Authentication,
-    PasswordGate,
-    _parts,
+    PasswordCheck,
+    _digest_parameters,
 )
-from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, _ControlPort, port_pair
+from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, _RtcpReceiver, open_port_pair
 from smartcam.frames._streaming.rtsp.messages import (
     MAX_MESSAGE_BYTES,
     RequestParser,
@@ -70,8 +70,8 @@ from smartcam.frames._streaming.rtsp.messages import (
 )
 from smartcam.frames._streaming.rtsp_client import answers
 from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
-from smartcam.frames._streaming.rtsp_client.channels import options_of
-from smartcam.frames._streaming.rtsp_client.description import described, url_of
+from smartcam.frames._streaming.rtsp_client.channels import transport_options
+from smartcam.frames._streaming.rtsp_client.description import parse_description, url_of
 from smartcam.frames._streaming.shared_stream import (
     KEY_FRAME_INTERVAL,
     LINGER,
@@ -85,4 +85,4 @@ from smartcam.frames._v4l2.controls import DeviceControl
 from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 from smartcam.frames._v4l2.driver import V4L2Driver
 from smartcam.frames._video import multipart, redirects
-from smartcam.frames._video.multipart import MAX_BETWEEN_BYTES, MAX_PICTURE_BYTES, PictureCutter
+from smartcam.frames._video.multipart import MAX_BYTES_BETWEEN, MAX_PICTURE_BYTES, PictureCutter

@@ -24,7 +24,7 @@ def test_drift_and_moment_are_found_with_any_delay(
     for number in range(int(60 * rate)):
         taken = 1000 + number / rate
         way = 0.002 + (chance.expovariate(500) if chance.random() < 0.9 else 0.2 * chance.random())
-        found = clock.captured(ahead + taken * (1 + drift), taken + way)
+        found = clock.host_time(ahead + taken * (1 + drift), taken + way)
         assert found <= taken + way
         if number > 20 * rate:
             assert found - taken == pytest.approx(0.002, abs=0.0015)
@@ -39,7 +39,7 @@ def test_reset_clock_is_noticed_and_followed(by: float) -> None:
     for number in range(400):
         taken = number * 0.02
         jumped = by if number >= 200 else 0.0
-        found = clock.captured(50 + taken + jumped, taken + 0.004)
+        found = clock.host_time(50 + taken + jumped, taken + 0.004)
         if not 200 <= number < 210:
             assert found == pytest.approx(taken + 0.004)
         assert found <= taken + 0.004
@@ -51,7 +51,7 @@ def test_frames_that_come_late_for_a_while_are_no_jump() -> None:
     for number in range(600):
         taken = number * 0.1
         way = 0.8 if 100 < number < 120 else 0.001
-        assert clock.captured(taken, taken + way) == pytest.approx(taken + 0.001, abs=1e-4)
+        assert clock.host_time(taken, taken + way) == pytest.approx(taken + 0.001, abs=1e-4)
     assert clock.statistics().jumps == 0
 
 
@@ -62,7 +62,7 @@ def test_queue_on_the_way_is_no_reset_clock(queue: float, seconds: float) -> Non
     for number in range(int(10 * (seconds + 40))):
         taken = number * 0.1
         held = 0.0 if not 20 < taken < 20 + seconds else min(queue, taken - 20)
-        found = clock.captured(taken, taken + 0.001 + held)
+        found = clock.host_time(taken, taken + 0.001 + held)
         assert found <= taken + 0.001 + 0.01 * seconds  # never much later than the truth
         if taken > 21 + seconds:
             assert found == pytest.approx(taken + 0.001, abs=1e-3)
@@ -72,5 +72,5 @@ def test_queue_on_the_way_is_no_reset_clock(queue: float, seconds: float) -> Non
 def test_drift_is_unknown_before_there_are_enough_frames() -> None:
     clock = DeviceClock()
     for number in range(7):
-        clock.captured(number * 0.5, number * 0.5)
+        clock.host_time(number * 0.5, number * 0.5)
         assert clock.statistics().drift is None

@@ -22,7 +22,7 @@ from smartcam.exceptions import (
     MissingExtraError,
 )
 from smartcam.frames import Codecs, find_format
-from smartcam.frames._codecs.threads import MAX_LOOP_TIME, StreamRuns
+from smartcam.frames._codecs.threads import MAX_LOOP_TIME, StreamRunner
 from smartcam.frames._inside import read_stamp
 from tests.frames.inside import pictures
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
@@ -332,7 +332,7 @@ def _spend(seconds: float) -> threading.Thread:
 
 
 async def test_slow_calls_leave_the_event_loop(codecs: Codecs) -> None:
-    runs, loop = StreamRuns(codecs), threading.current_thread()
+    runs, loop = StreamRunner(codecs), threading.current_thread()
     long = 3 * MAX_LOOP_TIME
     assert await runs(lambda: _spend(0)) is not loop  # the duration was unknown
     assert await runs(lambda: _spend(0)) is loop

@@ -18,8 +18,8 @@ from tests.frames.inside import (
     NEW_HOST_DELAY,
     Network,
     RtpPacket,
-    _ControlPort,
     _NetworkSearch,
+    _RtcpReceiver,
 )
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
 from tests.frames.rtp.ways import HOST, two_ports
@@ -116,7 +116,7 @@ async def test_another_host_does_not_replace_a_sender_between_two_pictures() -> 
 
 def test_reports_to_an_rtsp_server_count_of_its_viewer_alone() -> None:
     heard: list[bytes] = []
-    port = _ControlPort("10.0.0.1", heard.append)
+    port = _RtcpReceiver("10.0.0.1", heard.append)
     port.datagram_received(b"stranger", ("10.0.0.2", 5001))
     port.datagram_received(b"viewer", ("10.0.0.1", 5001))
     assert heard == [b"viewer"]
@@ -129,7 +129,7 @@ async def test_gige_packets_count_of_the_camera_alone() -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as stranger:
         stranger.bind(("127.0.0.2", 0))
         stranger.sendto(bytes(size - 28), ("127.0.0.1", where.port))
-        assert not await where.test_packet(size, 0.1)
+        assert not await where.receives_test_packet(size, 0.1)
     where.close()
 
 

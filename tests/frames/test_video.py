@@ -25,7 +25,7 @@ from smartcam.frames import Codecs, Moment
 from smartcam.frames._inside import read_stamp
 from smartcam.frames._video import driver as video
 from tests.frames.inside import (
-    MAX_BETWEEN_BYTES,
+    MAX_BYTES_BETWEEN,
     MAX_PICTURE_BYTES,
     PictureCutter,
     SenderReport,
@@ -263,9 +263,9 @@ def test_query_is_the_server_s_and_a_path_may_have_a_sharp() -> None:
     made = video.VideoDriver(frames.FrameAddress.parse("rtsp://h/x?transport=9#transport=udp"))
     assert made._options["rtsp_transport"] == "udp"
     made = video.VideoDriver(frames.FrameAddress.parse("take#1/a#b.mp4#pace=none"))
-    assert (made.name, made._paced) == ("take#1/a#b.mp4", False)
+    assert (made.name, made._keeps_pace) == ("take#1/a#b.mp4", False)
     made = video.VideoDriver(frames.FrameAddress.parse("take#1/a#b.mp4"))
-    assert (made.name, made._paced) == ("take#1/a#b.mp4", True)
+    assert (made.name, made._keeps_pace) == ("take#1/a#b.mp4", True)
 
 
 def test_certificates_are_checked_unless_switched_off() -> None:
@@ -466,7 +466,7 @@ async def test_thread_that_exceeds_its_limits_is_abandoned_and_logged(
     gate = threading.Event()
     driver = video.VideoDriver(frames.FrameAddress.parse(f"{path}#timeout=0.1"))
     monkeypatch.setattr(video, "THREAD_GRACE", -0.05)
-    monkeypatch.setattr(driver, "_opened", lambda: gate.wait(60))
+    monkeypatch.setattr(driver, "_open_reading", lambda: gate.wait(60))
     task = asyncio.create_task(driver.open())
     await asyncio.sleep(0)
     task.cancel()
@@ -634,7 +634,7 @@ def test_truncated_picture_is_counted_and_the_next_one_comes() -> None:
 def test_memory_and_patience_are_bounded() -> None:
     cutter, endless = PictureCutter(), PictureCutter()
     with pytest.raises(MessageError, match="belong to no picture"):
-        _fed(cutter, 1000, MAX_BETWEEN_BYTES // 1000 + 20)
+        _fed(cutter, 1000, MAX_BYTES_BETWEEN // 1000 + 20)
     list(endless.feed(PICTURES[0][:-2]))
     with pytest.raises(MessageError, match="bytes at most"):
         _fed(endless, 1 << 20, MAX_PICTURE_BYTES // (1 << 20) + 1)

@@ -212,7 +212,8 @@ def _matched(*pictures: RecordedPicture, max_bytes: int = 1 << 20) -> list[int |
         matcher.add_picture(picture)
     matcher.results.append(result(1, 1.55, 1.05))
     return [
-        None if one.picture is None else one.picture.sequence for one in matcher.settled(over=True)
+        None if one.picture is None else one.picture.sequence
+        for one in matcher.take_matched(at_end=True)
     ]
 
 
@@ -280,8 +281,9 @@ def test_results_that_are_alike_have_pictures_only_in_one_order(tmp_path: Path) 
         pictures = ReplayedPictures(found, "left", applications, 1.0)
         numbers: list[int | None] = []
         for data in given:
-            pictures.given(5, data)
-            numbers.append(None if pictures.shown is None else pictures.shown.sequence)
+            pictures.show_picture_of(5, data)
+            picture = pictures.current_picture
+            numbers.append(None if picture is None else picture.sequence)
         return numbers
 
     one = [(True, b"a"), (True, b"b"), (True, b"a")]

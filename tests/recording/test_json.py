@@ -39,7 +39,7 @@ from smartcam.observers import RawFrame, TraceEntry
 from smartcam.protocols import BVS, Frame
 from smartcam.protocols._inside import INSIGHT
 from smartcam.protocols.messages import Sender
-from smartcam.recording._mcap.json import MAX_CACHED_FRAME_TEXTS, FrameTexts, body_of, frame_text
+from smartcam.recording._mcap.json import MAX_CACHED_FRAME_TEXTS, FrameTexts, data_of, frame_text
 from tests.recording.inside import KINDS, message_fields, message_of, nanoseconds
 from tests.recording.recordingkit import at
 
@@ -303,7 +303,7 @@ def test_texts_of_frames_that_are_alike_are_those_of_each(
     for second, (dialect, sender, message_id, front, data) in enumerate(frames * 2):
         raw = RawFrame(at(second), "left", dialect, sender, Frame(message_id, front + data))
         entry = raw.entry()
-        assert texts.text(raw) == (frame_text(entry), body_of(entry))
+        assert texts.text(raw) == (frame_text(entry), data_of(entry))
 
 
 def test_texts_of_frames_of_a_delivery_are_those_of_each() -> None:
@@ -325,7 +325,7 @@ def test_texts_of_frames_of_a_delivery_are_those_of_each() -> None:
             data = random.randbytes(random.choice([0, 4, 4, 4, 9]))
             raw = RawFrame(when, camera, dialect, sender, Frame(message_id, front + data))
             entry = raw.entry()
-            assert texts.text(raw) == (frame_text(entry), body_of(entry))
+            assert texts.text(raw) == (frame_text(entry), data_of(entry))
 
 
 def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
@@ -340,5 +340,5 @@ def test_kinds_of_frames_whose_texts_are_kept_are_bounded() -> None:
     for length in range(1000):
         raw = RawFrame(at(length), "left", dialect, Sender.CAMERA, Frame(result, bytes(8 + length)))
         entry = raw.entry()
-        assert texts.text(raw) == (frame_text(entry), body_of(entry))
-        assert 0 < len(texts._known) <= MAX_CACHED_FRAME_TEXTS
+        assert texts.text(raw) == (frame_text(entry), data_of(entry))
+        assert 0 < len(texts._cached_texts) <= MAX_CACHED_FRAME_TEXTS

@@ -34,12 +34,14 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
             f"expected a bitmap file, got {len(data)} bytes that begin with {data[:8].hex(' ')}"
         )
     offset = FILE.unpack_from(data)[4]
-    head, width, rows, _, bits, compression, _, _, _, used, _ = INFO.unpack_from(data, FILE.size)
+    header_size, width, rows, _, bits, compression, _, _, _, palette_size, _ = INFO.unpack_from(
+        data, FILE.size
+    )
     height = abs(rows)
-    if head < INFO.size or compression or bits not in (8, 24, 32):
+    if header_size < INFO.size or compression or bits not in (8, 24, 32):
         raise FrameFormatError(
             f"expected an uncompressed bitmap of 8, 24 or 32 bits, got one of {bits} bits, "
-            f"compression {compression}, with a head of {head} bytes"
+            f"compression {compression}, with a head of {header_size} bytes"
         )
     stride = (width * bits // 8 + 3) & ~3
     size = stride * height
@@ -52,15 +54,17 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
     if rows > 0:
         pixels = pixels[::-1]
     if bits == 8:
-        return _looked_up(pixels[..., 0], data[FILE.size + head :][: 4 * (used or 256)])
+        return _apply_palette(
+            pixels[..., 0], data[FILE.size + header_size :][: 4 * (palette_size or 256)]
+        )
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
-def _looked_up(pixels: NDArray[Any], palette: bytes) -> NDArray[np.uint8]:
+def _apply_palette(pixels: NDArray[Any], palette: bytes) -> NDArray[np.uint8]:
     """Return the palette's colours for indices; an index beyond the palette is black."""
     colours = np.zeros((256, 4), np.uint8)
-    given = np.frombuffer(palette[: len(palette) // 4 * 4], np.uint8).reshape(-1, 4)[:256]
-    colours[: len(given)] = given
+    entries = np.frombuffer(palette[: len(palette) // 4 * 4], np.uint8).reshape(-1, 4)[:256]
+    colours[: len(entries)] = entries
     if (colours[:, :1] == colours[:, 1:3]).all():
         grey: NDArray[np.uint8] = colours[:, 0][pixels]
         return grey

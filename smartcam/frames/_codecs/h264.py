@@ -14,7 +14,7 @@ from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.pictures import decoded
 from smartcam.frames._frame import changed
 from smartcam.frames._pixels.formats import find_format
-from smartcam.frames._video.frames import converted, from_video, to_video
+from smartcam.frames._video.frames import from_video, reformatted, to_video
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -28,11 +28,11 @@ MAX_WAITING_FRAMES: Final = 32
 """Largest number of encoded frames whose data a decoder keeps until it returns their pictures."""
 
 
-class Runs(Protocol):
-    """A function that runs work in a thread or at once, such as a method of ``Codecs``."""
+class RunsWork(Protocol):
+    """A callable that runs work in a thread or at once, such as a method of ``Codecs``."""
 
     def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
-        """Run the work, in a thread or at once, and return its result."""
+        """Run the work in a thread or at once; return its result."""
         ...
 
 
@@ -40,16 +40,16 @@ class H264Encoder:
     """Encoder of one stream of H.264, made by :meth:`Codecs.h264_encoder`.
 
     Each frame is encoded at once into its own bytes. Instead of large key frames, a column of each
-    frame is encoded without reference to earlier ones (intra refresh). The parameter sets are
+    frame is encoded without reference to earlier frames (intra refresh). The parameter sets are
     repeated, so a viewer can join late. Another size or format restarts the stream with a key
-    frame; so does a cancelled call, whose bytes are lost.
+    frame. A cancelled call does so too, since its bytes are lost.
 
     Four pixels share U and V. Y is encoded as the camera sent it, and the stream says its range;
     only RGB is converted, to BT.601 with limited range. A JPEG is decoded to RGB first.
     """
 
     def __init__(
-        self, run: Runs, *, fps: float, keyint: int, crf: float, bitrate: int | None
+        self, run: RunsWork, *, fps: float, keyint: int, crf: float, bitrate: int | None
     ) -> None:
         load("av")
         caller = "h264_encoder"
@@ -71,17 +71,19 @@ class H264Encoder:
         else:
             self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
         self._bitrate = bitrate
-        self._turn = asyncio.Lock()
-        self._in_use = threading.Lock()  # the thread of a cancelled call may still be using it
+        self._call_lock = asyncio.Lock()
+        self._codec_lock = (
+            threading.Lock()
+        )  # the thread of a cancelled call may still use the codec
         self._codec: Any = None
-        self._grey: Any = None  # frame of the last grey picture, of which x264 has made a copy
-        self._kind: tuple[object, ...] = ()
-        self._broken = 0  # number of calls whose bytes were never returned
+        self._grey: Any = None  # the last grey picture's frame, reusable since x264 copied it
+        self._stream_key: tuple[object, ...] = ()
+        self._restarts = 0  # how often the stream was to begin with a new key frame
         self._count = 0
 
     def begin_anew(self) -> None:
         """Make the next frame a key frame, for a viewer that joins or has lost data."""
-        self._broken += 1
+        self._restarts += 1
 
     async def encode(self, frame: Frame) -> Frame:
         """Return a frame of format ``H264`` with all other attributes of the given one.
@@ -92,23 +94,29 @@ class H264Encoder:
 
         Cancellation: safe; the stream restarts with the next frame.
         """
-        async with self._turn:
+        async with self._call_lock:
             try:
-                return await self._run(partial(self._encode, frame, self._broken))
+                return await self._run(partial(self._encode, frame, self._restarts))
             except BaseException:
                 self.begin_anew()
                 raise
 
-    def _encode(self, frame: Frame, broken: int) -> Frame:
-        with self._in_use:
+    def _encode(self, frame: Frame, restarts: int) -> Frame:
+        with self._codec_lock:
             if frame.format.name == "MJPEG":
                 frame = decoded(frame, "RGB8")
             video = to_video(frame, self._grey)
             self._grey = video if frame.format.name == "Mono8" else None
-            kind = (broken, video.width, video.height, video.format.name, *_colours(video))
-            if kind != self._kind:
-                self._codec = self._begun(video)
-                self._kind = kind
+            stream_key = (
+                restarts,
+                video.width,
+                video.height,
+                video.format.name,
+                *_colour_properties(video),
+            )
+            if stream_key != self._stream_key:
+                self._codec = self._new_codec(video)
+                self._stream_key = stream_key
             video.pts = self._count
             video.time_base = self._time_base
             self._count += 1
@@ -116,11 +124,11 @@ class H264Encoder:
             data = bytes(packets[0]) if len(packets) == 1 else b"".join(map(bytes, packets))
             return changed(frame, data=data, format=find_format("H264"), stride=0)
 
-    def _begun(self, video: Any) -> Any:
+    def _new_codec(self, video: Any) -> Any:
         codec = load("av").CodecContext.create("libx264", "w")
         codec.width, codec.height, codec.pix_fmt = video.width, video.height, video.format.name
         codec.framerate, codec.time_base = self._rate, self._time_base
-        codec.color_range, codec.colorspace = _colours(video)
+        codec.color_range, codec.colorspace = _colour_properties(video)
         codec.thread_count = 1
         codec.options = self._options
         if self._bitrate is not None:
@@ -141,7 +149,7 @@ class H264Decoder:
         run: function that runs the work.
         reorders: whether pictures are sent in another order than they are shown, so that some wait
             for others.
-        to: pixel format of FFmpeg that pictures are converted to; "": no conversion.
+        pixel_format: pixel format of FFmpeg that pictures are converted to; "": no conversion.
     """
 
     CODEC: ClassVar = "h264"
@@ -149,29 +157,29 @@ class H264Decoder:
     NAME: ClassVar = "H264"
     """The codec's name in texts."""
 
-    def __init__(self, run: Runs, *, reorders: bool = False, to: str = "") -> None:
+    def __init__(self, run: RunsWork, *, reorders: bool = False, pixel_format: str = "") -> None:
         load("av")
-        self._run, self._reorders, self._to = run, reorders, to
-        self._turn = asyncio.Lock()
-        self._in_use = threading.Lock()
+        self._run, self._reorders, self._pixel_format = run, reorders, pixel_format
+        self._call_lock = asyncio.Lock()
+        self._codec_lock = threading.Lock()
         self._codec: Any = None
         self._size = (0, 0)
         self._losses = self._losses_seen = 0
-        # number of frames until the picture is whole; None: unknown
-        self._missing: int | None = None
-        self._begun = False  # whether something was decoded that a refresh can refer to
-        self._waiting: dict[int, Frame] = {}
+        # number of frames until the picture is whole; 0: it is whole; None: unknown
+        self._frames_until_whole: int | None = None
+        self._has_decoded = False  # whether something was decoded that a refresh can refer to
+        self._pending_frames: dict[int, Frame] = {}
         self._count = 0
 
     @property
-    def whole(self) -> bool:
+    def has_whole_picture(self) -> bool:
         """True if the decoder has decoded a whole picture since its start or the last loss."""
-        return self._missing == 0 and self._losses == self._losses_seen
+        return self._frames_until_whole == 0 and self._losses == self._losses_seen
 
     def lost(self) -> None:
-        """Report missing bytes: no picture is returned until a whole one was decoded.
+        """Tell the decoder that bytes were lost: it returns no picture until one is whole again.
 
-        A decoder cannot detect missing bytes, and would return broken pictures.
+        A decoder cannot detect lost bytes, and would return broken pictures.
         """
         self._losses += 1
 
@@ -191,7 +199,7 @@ class H264Decoder:
 
         Cancellation: safe; a cancelled call counts as a loss.
         """
-        async with self._turn:
+        async with self._call_lock:
             try:
                 return await self._run(partial(self._decode, frame, self._losses))
             except BaseException:
@@ -199,49 +207,49 @@ class H264Decoder:
                 raise
 
     def _decode(self, frame: Frame, losses: int) -> Frame | None:
-        with self._in_use:
+        with self._codec_lock:
             if self._size != (frame.width, frame.height):
-                self._begin(frame)
+                self._restart(frame)
             if losses != self._losses_seen:
-                self._losses_seen, self._missing = losses, None
-            missing = self._follow(bytes(frame.data))
+                self._losses_seen, self._frames_until_whole = losses, None
+            until_whole = self._count_until_whole(bytes(frame.data))
             packet = self._packet(frame)
             try:
                 pictures = self._codec.decode(packet)
             except load("av").FFmpegError as exc:
-                if self._missing is None:
+                if self._frames_until_whole is None:
                     return None
                 raise self._damaged_error(frame, str(exc)) from exc
-            self._begun = True
-            made = [self._made(picture) for picture in pictures]
-            if any(picture.is_corrupt for picture in pictures) and missing == 0:
+            self._has_decoded = True
+            frames = [self._to_frame(picture) for picture in pictures]
+            if any(picture.is_corrupt for picture in pictures) and until_whole == 0:
                 raise self._damaged_error(frame, "a picture with holes")
-            return made[-1] if made and missing == 0 else None
+            return frames[-1] if frames and until_whole == 0 else None
 
-    def _begin(self, frame: Frame) -> None:
+    def _restart(self, frame: Frame) -> None:
         self._codec = codec = load("av").CodecContext.create(self.CODEC, "r")
         codec.thread_count = 1
         self._size = (frame.width, frame.height)
-        room = (frame.width + 64) * (frame.height + 64)
+        max_pixels = (frame.width + 64) * (frame.height + 64)
         codec.options = {
-            "max_pixels": str(room),
+            "max_pixels": str(max_pixels),
             "err_detect": "explode",  # half a picture must be refused
         } | ({} if self._reorders else {"flags": "low_delay"})
-        self._waiting.clear()
-        self._missing, self._begun = None, False
+        self._pending_frames.clear()
+        self._frames_until_whole, self._has_decoded = None, False
 
-    def _follow(self, data: bytes) -> int | None:
+    def _count_until_whole(self, data: bytes) -> int | None:
         """Return the number of frames until the picture is whole; None if that is not known."""
-        if self._missing == 0:
+        if self._frames_until_whole == 0:
             return 0
-        key, refresh = self._entry_point(data)
-        if key:
-            self._missing = 0
-        elif self._missing is not None:
-            self._missing -= 1
-        elif refresh is not None and self._begun:
-            self._missing = refresh
-        return self._missing
+        is_key_frame, refresh = self._entry_point(data)
+        if is_key_frame:
+            self._frames_until_whole = 0
+        elif self._frames_until_whole is not None:
+            self._frames_until_whole -= 1
+        elif refresh is not None and self._has_decoded:
+            self._frames_until_whole = refresh
+        return self._frames_until_whole
 
     def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
         return entry_point(data)
@@ -250,15 +258,15 @@ class H264Decoder:
         packet = load("av").Packet(frame.data)
         self._count += 1
         packet.pts = self._count
-        self._waiting[self._count] = frame
-        if len(self._waiting) > MAX_WAITING_FRAMES:
-            del self._waiting[next(iter(self._waiting))]
+        self._pending_frames[self._count] = frame
+        if len(self._pending_frames) > MAX_WAITING_FRAMES:
+            del self._pending_frames[next(iter(self._pending_frames))]
         return packet
 
-    def _made(self, picture: Any) -> Frame:
-        frame = self._waiting.pop(picture.pts)
-        picture = converted(picture, self._to) if self._to else picture
-        pixels = from_video(picture, apart=True)
+    def _to_frame(self, picture: Any) -> Frame:
+        frame = self._pending_frames.pop(picture.pts)
+        picture = reformatted(picture, self._pixel_format) if self._pixel_format else picture
+        pixels = from_video(picture, keep_planes=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged_error(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
@@ -271,7 +279,7 @@ class H264Decoder:
         )
 
 
-SLICES, KEY, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
+SLICES, KEY_SLICE, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
 """Types of NAL units (ITU-T H.264, table 7-1), and one type of message in an SEI unit (annex D)."""
 
 
@@ -281,36 +289,38 @@ def entry_point(data: bytes) -> tuple[bool, int | None]:
     The number is None if no refresh begins with the frame.
     """
     refresh = None
-    place = data.find(b"\0\0\1")
-    while 0 <= place < len(data) - 3:
-        kind, after = data[place + 3] & 0x1F, data.find(b"\0\0\1", place + 3)
-        if kind == KEY or kind in SLICES:
-            return kind == KEY, refresh
-        if kind == SEI:
-            end = after if after >= 0 else len(data)
-            frames_to_recovery = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
+    offset = data.find(b"\0\0\1")
+    while 0 <= offset < len(data) - 3:
+        unit_type, next_start = data[offset + 3] & 0x1F, data.find(b"\0\0\1", offset + 3)
+        if unit_type == KEY_SLICE or unit_type in SLICES:
+            return unit_type == KEY_SLICE, refresh
+        if unit_type == SEI:
+            end = next_start if next_start >= 0 else len(data)
+            frames_to_recovery = _recovery_frame_count(
+                data[offset + 4 : end].replace(b"\0\0\3", b"\0\0")
+            )
             refresh = refresh if frames_to_recovery is None else frames_to_recovery
-        place = after
+        offset = next_start
     return False, refresh
 
 
-def _recovery(messages: bytes) -> int | None:
+def _recovery_frame_count(messages: bytes) -> int | None:
     """Return recovery_frame_cnt from the messages of an SEI unit."""
-    place = 0
-    while place + 2 <= len(messages) and messages[place] != 0x80:
+    offset = 0
+    while offset + 2 <= len(messages) and messages[offset] != 0x80:
         numbers = []
         for _ in range(2):  # type and size: each is a sum of bytes of 255 and a last smaller one
             number = 0
-            while place < len(messages) and messages[place] == 0xFF:
-                number, place = number + 0xFF, place + 1
-            if place == len(messages):
+            while offset < len(messages) and messages[offset] == 0xFF:
+                number, offset = number + 0xFF, offset + 1
+            if offset == len(messages):
                 return None
-            numbers.append(number + messages[place])
-            place += 1
-        kind, size = numbers
-        if kind == RECOVERY_POINT:
-            return _exp_golomb(messages[place : place + size])
-        place += size
+            numbers.append(number + messages[offset])
+            offset += 1
+        payload_type, size = numbers
+        if payload_type == RECOVERY_POINT:
+            return _exp_golomb(messages[offset : offset + size])
+        offset += size
     return None
 
 
@@ -320,5 +330,5 @@ def _exp_golomb(data: bytes) -> int | None:
     return int(bits[zeros : 2 * zeros + 1], 2) - 1 if len(bits) > 2 * zeros else None
 
 
-def _colours(video: Any) -> tuple[int, int]:
+def _colour_properties(video: Any) -> tuple[int, int]:
     return int(video.color_range), int(video.colorspace)

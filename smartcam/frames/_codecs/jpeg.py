@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-DAMAGE: Final = (
+DAMAGE_WARNINGS: Final = (
     "premature end",
     "bad huffman code",
     "bad arithmetic code",
@@ -22,7 +22,7 @@ DAMAGE: Final = (
     "too many scanlines",
 )
 """Texts in libjpeg's warnings (``jerror.h``) that mean that a part of the picture is grey or wrong.
-Other warnings concern whole pictures: surplus bytes, an unknown revision or profile. Common webcams
+Other warnings, such as surplus bytes or an unknown revision, concern whole pictures. Common webcams
 send such pictures, and other decoders show them."""
 
 _JFIF: Final = (b"JFIF\0\x01", b"JFXX\0\x10", b"JFXX\0\x11", b"JFXX\0\x13")
@@ -52,7 +52,7 @@ def jpeg_header(data: bytes | bytearray | memoryview, label: str) -> tuple[int, 
     simplejpeg = load("simplejpeg")
     try:
         height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except (ValueError, KeyError) as exc:  # the second value is for unknown kinds of colours
+    except (ValueError, KeyError) as exc:  # a KeyError means unknown kinds of colours
         raise _jpeg_error(label, data, exc) from exc
     return width, height, colours != "Gray"
 
@@ -82,7 +82,7 @@ def decode_jpeg(
         return DecodedJpeg(decode(data, colours), "")
     except ValueError as exc:
         remark = str(exc)
-        if not remark.strip() or any(text in remark.lower() for text in DAMAGE):
+        if not remark.strip() or any(text in remark.lower() for text in DAMAGE_WARNINGS):
             raise _jpeg_error(label, data, exc) from exc
         _check_restarts(data, label, exc)
         return DecodedJpeg(_decode_tolerantly(decode, data, colours, label), remark)
@@ -92,44 +92,44 @@ def _decode_tolerantly(
     decode: Any, data: bytes | bytearray | memoryview, colours: str, label: str
 ) -> Any:
     try:
-        return decode(_joined_segments(bytes(data)), colours, strict=False)
+        return decode(_without_surplus_bytes(bytes(data)), colours, strict=False)
     except ValueError as exc:
         raise _jpeg_error(label, data, exc) from exc
 
 
-def _joined_segments(data: bytes) -> bytes:
+def _without_surplus_bytes(data: bytes) -> bytes:
     """Return a JPEG without surplus bytes between the segments before its first scan.
 
     Even in its tolerant mode simplejpeg 1.9 refuses such bytes, and a JFIF segment of an unknown
     revision, which does not affect the pixels.
     """
-    segments, place = [data[:2]], 2
-    while place + 4 <= len(data):
-        begin = data.find(b"\xff", place)
-        if begin < 0 or data[begin + 1 : begin + 2] in (b"", b"\xda"):
+    segments, end = [data[:2]], 2
+    while end + 4 <= len(data):
+        start = data.find(b"\xff", end)
+        if start < 0 or data[start + 1 : start + 2] in (b"", b"\xda"):
             break
-        if data[begin + 1] in (0, 0xFF):  # a surplus byte, or a fill byte
-            place = begin + 1
+        if data[start + 1] in (0, 0xFF):  # a surplus byte, or a fill byte
+            end = start + 1
             continue
-        place = begin + 2 + int.from_bytes(data[begin + 2 : begin + 4], "big")
-        if not data[begin:].startswith(b"\xff\xe0") or data[begin + 4 : begin + 10] in _JFIF:
-            segments.append(data[begin:place])
-    scan = data.find(b"\xff\xda", place)
+        end = start + 2 + int.from_bytes(data[start + 2 : start + 4], "big")
+        if not data[start:].startswith(b"\xff\xe0") or data[start + 4 : start + 10] in _JFIF:
+            segments.append(data[start:end])
+    scan = data.find(b"\xff\xda", end)
     return b"".join([*segments, data[scan:]]) if scan >= 0 else data
 
 
 def _check_restarts(data: bytes | bytearray | memoryview, label: str, warning: Exception) -> None:
-    """Raise if a restart marker is missing: libjpeg reports only its last warning.
+    """Check the restart markers: libjpeg's last warning may have hidden that one is missing.
 
     Raises:
         FrameFormatError: the markers are not in sequence, or the end marker is missing.
     """
     octets = bytes(data)
     scan = octets.rfind(b"\xff\xda")
-    marks = [mark[0] - 0xD0 for mark in _RESTART.findall(octets, max(scan, 0))]
+    numbers = [marker[0] - 0xD0 for marker in _RESTART.findall(octets, max(scan, 0))]
     if scan < 0 or b"\xff\xd9" not in octets[scan:]:
         raise _jpeg_error(label, data, warning)
-    if marks != [place % 8 for place in range(len(marks))]:
+    if numbers != [index % 8 for index in range(len(numbers))]:
         raise _jpeg_error(label, data, ValueError(f"a restart mark is missing; {warning}"))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg, jpeg_header
-from smartcam.frames._pixels.compiled import looked_up
+from smartcam.frames._pixels.compiled import apply_table
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._pixels.layouts import Planes, SampleLayout, YuvPairs
 
@@ -72,9 +72,9 @@ def to_jpeg(frame: Frame, quality: int) -> Frame:
         pixels = pixels if pixels.ndim == 3 else pixels[..., None]
         data = _samples_to_jpeg(pixels, _JPEG_COLOURS[frame.format.name], quality)
     elif frame.format.name == "MJPEG":
-        *_, coloured = jpeg_header(frame.data, "MJPEG")
-        pixels = frame.rgb() if coloured else frame.grey()[..., None]
-        data = _samples_to_jpeg(pixels, "RGB" if coloured else "GRAY", quality)
+        *_, has_colours = jpeg_header(frame.data, "MJPEG")
+        pixels = frame.rgb() if has_colours else frame.grey()[..., None]
+        data = _samples_to_jpeg(pixels, "RGB" if has_colours else "GRAY", quality)
     else:
         raise _no_conversion_error(frame, "JPEG", "converted")
     return _with_bytes(frame, data, "MJPEG")
@@ -86,8 +86,8 @@ _JPEG_COLOURS: Final = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
 def _samples_to_jpeg(pixels: NDArray[np.uint8], colours: str, quality: int) -> bytes:
     if pixels.strides[1:] != (pixels.shape[2], 1):
         pixels = np.ascontiguousarray(pixels)
-    shared = "Gray" if colours == "GRAY" else "420"
-    data: bytes = load("simplejpeg").encode_jpeg(pixels, quality, colours, shared)
+    subsampling = "Gray" if colours == "GRAY" else "420"
+    data: bytes = load("simplejpeg").encode_jpeg(pixels, quality, colours, subsampling)
     return data
 
 
@@ -97,21 +97,23 @@ def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
         return _samples_to_jpeg(frame.rgb(), "RGB", quality)
     planes = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
     if matrix == "601":
-        y, chroma = _wideners()
+        y, chroma = _full_range_tables()
         tables = (y, chroma, chroma)
-        ready = [looked_up(table, plane) for table, plane in zip(tables, planes, strict=True)]
+        full_range = [
+            apply_table(table, plane) for table, plane in zip(tables, planes, strict=True)
+        ]
     else:
-        ready = [np.ascontiguousarray(plane) for plane in planes]
-    data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*ready, quality)
+        full_range = [np.ascontiguousarray(plane) for plane in planes]
+    data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*full_range, quality)
     return data
 
 
 @lru_cache(maxsize=1)
-def _wideners() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _full_range_tables() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the full-range value for each limited-range value of Y, and of U and V."""
     value = np.arange(256.0)
-    wide = ((value - 16) * 255 / 219, (value - 128) * 255 / 224 + 128)
-    y, chroma = (np.clip(np.rint(table), 0, 255).astype(np.uint8) for table in wide)
+    exact = ((value - 16) * 255 / 219, (value - 128) * 255 / 224 + 128)
+    y, chroma = (np.clip(np.rint(table), 0, 255).astype(np.uint8) for table in exact)
     return y, chroma
 
 
@@ -120,19 +122,19 @@ def _wideners() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 def to_png(frame: Frame) -> Frame:
     """Return the frame as a PNG, without loss."""
-    samples = _lossless(frame, "PNG")
+    samples = _lossless_samples(frame, "PNG")
     return _with_bytes(frame, load("imagecodecs").png_encode(samples, level=1), "PNG")
 
 
 def to_jpegxl(frame: Frame) -> Frame:
     """Return the frame as a JPEG XL, without loss."""
-    samples = _lossless(frame, "JPEG XL")
+    samples = _lossless_samples(frame, "JPEG XL")
     data: bytes = load("imagecodecs").jpegxl_encode(samples, effort=1, lossless=True)
     return _with_bytes(frame, data, "JPEGXL")
 
 
-def _lossless(frame: Frame, to: str) -> NDArray[Any]:
-    """Return the samples that are written to the file."""
+def _lossless_samples(frame: Frame, to: str) -> NDArray[Any]:
+    """Return the samples as a file format without loss stores them."""
     if not isinstance(frame.format.layout, SampleLayout):
         raise _no_conversion_error(frame, to, "converted")
     name, pixels = frame.format.name, frame.array()
@@ -166,49 +168,51 @@ def decoded(frame: Frame, name: str) -> Frame:
 
 
 def _from_jpeg(frame: Frame, name: str) -> Frame:
-    *_, coloured = jpeg_header(frame.data, "MJPEG")
-    name = find_format(name or ("RGB8" if coloured else "Mono8")).name
+    *_, has_colours = jpeg_header(frame.data, "MJPEG")
+    name = find_format(name or ("RGB8" if has_colours else "Mono8")).name
     colours = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
     if name not in colours:
-        raise _unfit_error(frame, "Mono8, RGB8 or BGR8", name)
+        raise _mismatch_error(frame, "Mono8, RGB8 or BGR8", name)
     size = (frame.width, frame.height)
     pixels, remark = decode_jpeg(frame.data, colours[name], size, "MJPEG")
-    made = with_pixels(frame, pixels[..., 0] if name == "Mono8" else pixels, name)
-    return replace(made, remark=remark) if remark else made
+    picture = with_pixels(frame, pixels[..., 0] if name == "Mono8" else pixels, name)
+    return replace(picture, remark=remark) if remark else picture
 
 
 def _from_png(frame: Frame, name: str) -> Frame:
     head = bytes(frame.data[:24])
     if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
-        raise _unfit_error(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
+        raise _mismatch_error(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
     size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-    return _lossless_back(frame, name, size, "png_decode")
+    return _decode_lossless(frame, name, size, "png_decode")
 
 
 def _from_jpegxl(frame: Frame, name: str) -> Frame:
-    return _lossless_back(frame, name, jpegxl_size(frame), "jpegxl_decode")
+    return _decode_lossless(frame, name, jpegxl_size(frame), "jpegxl_decode")
 
 
-def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
+def _decode_lossless(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
     """Decode a picture if it has the stated size; no memory is allocated for another size."""
     if size != (frame.width, frame.height):
-        raise _unfit_error(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
+        raise _mismatch_error(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
     try:
         pixels: NDArray[Any] = getattr(load("imagecodecs"), decoder)(frame.data)
     except (ValueError, RuntimeError) as exc:
-        raise _unfit_error(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
+        raise _mismatch_error(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
     if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha is returned with colours
         pixels = pixels[..., [0, 0, 0, 1]]
-    wanted = _samples_named(name, pixels)
+    wanted = _format_of_samples(name, pixels)
     if wanted is None:
-        raise _unfit_error(frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}")
+        raise _mismatch_error(
+            frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}"
+        )
     return with_pixels(frame, pixels[..., ::-1] if wanted.name == "BGR8" else pixels, wanted.name)
 
 
-def _samples_named(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
-    """Return the format of a name, or the usual one, if pixels with these samples can have it."""
+def _format_of_samples(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
+    """Return the format of a name, or the default one; None if the pixels do not fit the format."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    wanted = find_format(name or _USUAL.get((channels, pixels.dtype.itemsize), "RGB8"))
+    wanted = find_format(name or _DEFAULT_FORMATS.get((channels, pixels.dtype.itemsize), "RGB8"))
     layout = wanted.layout
     if not isinstance(layout, SampleLayout) or layout.packing is not None:
         return None
@@ -216,7 +220,7 @@ def _samples_named(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
     return wanted if fits and pixels.dtype.kind == "u" else None
 
 
-_USUAL: Final = {
+_DEFAULT_FORMATS: Final = {
     (1, 1): "Mono8",
     (1, 2): "Mono16",
     (3, 1): "RGB8",
@@ -224,7 +228,7 @@ _USUAL: Final = {
     (4, 1): "RGBa8",
     (4, 2): "RGBa16",
 }
-"""Formats by the number of samples per pixel, and the bytes of a sample."""
+"""Default format by the number of samples per pixel and the number of bytes per sample."""
 
 
 def jpegxl_size(frame: Frame) -> tuple[int, int]:
@@ -233,44 +237,44 @@ def jpegxl_size(frame: Frame) -> tuple[int, int]:
     Raises:
         FrameFormatError: the bytes do not begin as a JPEG XL.
     """
-    stream = _jpegxl_stream(bytes(frame.data[:4096]))
+    stream = _jpegxl_codestream(bytes(frame.data[:4096]))
     if stream[:2] != b"\xff\x0a":
-        raise _unfit_error(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
-    bits, place = int.from_bytes(stream[2:14], "little"), 0
+        raise _mismatch_error(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
+    bits, offset = int.from_bytes(stream[2:14], "little"), 0
 
-    def take(count: int) -> int:
-        nonlocal place
-        place += count
-        return bits >> (place - count) & ((1 << count) - 1)
+    def read_bits(count: int) -> int:
+        nonlocal offset
+        offset += count
+        return bits >> (offset - count) & ((1 << count) - 1)
 
-    small = take(1)
+    is_small = read_bits(1)
 
-    def side() -> int:
-        return (take(5) + 1) * 8 if small else take((9, 13, 18, 30)[take(2)]) + 1
+    def read_size() -> int:
+        return (read_bits(5) + 1) * 8 if is_small else read_bits((9, 13, 18, 30)[read_bits(2)]) + 1
 
-    height = side()
-    ratio = take(3)
+    height = read_size()
+    ratio = read_bits(3)
     if not ratio:
-        return side(), height
-    times, over = _JPEGXL_RATIOS[ratio]
-    return height * times // over, height
+        return read_size(), height
+    numerator, denominator = _JPEGXL_RATIOS[ratio]
+    return height * numerator // denominator, height
 
 
 _JPEGXL_RATIOS: Final = ((0, 0), (1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))
 
 
-def _jpegxl_stream(data: bytes) -> bytes:
+def _jpegxl_codestream(data: bytes) -> bytes:
     """Return the codestream in the boxes of a file (ISO/IEC 18181-2), or the bytes unchanged."""
-    place = 0 if data[4:8] == b"JXL " else len(data)
-    while place + 8 <= len(data):
-        size, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]
+    offset = 0 if data[4:8] == b"JXL " else len(data)
+    while offset + 8 <= len(data):
+        size, kind = int.from_bytes(data[offset : offset + 4], "big"), data[offset + 4 : offset + 8]
         if kind in (b"jxlc", b"jxlp"):
-            return data[place + (8 if kind == b"jxlc" else 12) :]
-        place += max(size, 8)
+            return data[offset + (8 if kind == b"jxlc" else 12) :]
+        offset += max(size, 8)
     return data
 
 
-def _unfit_error(frame: Frame, expected: str, actual: str) -> FrameFormatError:
+def _mismatch_error(frame: Frame, expected: str, actual: str) -> FrameFormatError:
     return FrameFormatError(
         f"{frame.source}: {frame.format.name}: expected {expected}, got {actual}",
         source=frame.source,

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_LOOP_TIME: Final = 0.002
-"""Largest CPU time, seconds, of one picture in the event loop. For a small picture, the two
-wake-ups of a thread take longer than the work."""
+"""Longest CPU time of one picture's work, seconds, for which the work runs in the event loop. For a
+small picture, the two wake-ups of a thread take longer than the work."""
 
 LONGEST_TIME_DECAY: Final = 0.8
 """Factor by which the remembered longest time shrinks with each picture."""
@@ -52,8 +52,8 @@ class Codecs:
     Args:
         threads: number of threads, 1 to 64.
 
-    Cancellation: all coroutines are safe; a picture that a thread is working on is finished and
-    thrown away, and occupies its thread until then.
+    Cancellation: all coroutines are safe. A picture that a thread is working on occupies the thread
+    until it is finished, and is then thrown away.
 
     Raises:
         ConfigurationError: the number of threads is out of range.
@@ -61,9 +61,9 @@ class Codecs:
 
     def __init__(self, threads: int = 2) -> None:
         threads = self._threads = check_integer(threads, "threads", 1, 64, "Codecs")
-        self._free = asyncio.Semaphore(threads)
+        self._free_threads = asyncio.Semaphore(threads)
         self._pool: ThreadPoolExecutor | None = None
-        self._closed = False
+        self._is_closed = False
         self._running: set[asyncio.Future[Any]] = set()
 
     async def __aenter__(self) -> Self:
@@ -81,7 +81,7 @@ class Codecs:
         Raises:
             LocalProtocolError: the object was entered before.
         """
-        if self._pool is not None or self._closed:
+        if self._pool is not None or self._is_closed:
             raise LocalProtocolError("Codecs: entered before; make new ones")
         self._pool = ThreadPoolExecutor(self._threads, "smartcam codecs")
 
@@ -95,7 +95,7 @@ class Codecs:
 
         Cancellation: the threads end nevertheless, when they have finished their pictures.
         """
-        self._closed = True
+        self._is_closed = True
         pool, self._pool = self._pool, None
         if pool is None:
             return
@@ -203,31 +203,33 @@ class Codecs:
     async def _run(self, work: Callable[[], T]) -> T:
         """Run work in a thread as soon as one is free."""
         self._open_pool()
-        await self._free.acquire()
+        await self._free_threads.acquire()
         try:
-            under_way = asyncio.get_running_loop().run_in_executor(self._open_pool(), work)
+            future = asyncio.get_running_loop().run_in_executor(self._open_pool(), work)
         except BaseException:
-            self._free.release()
+            self._free_threads.release()
             raise
-        self._running.add(under_way)
-        under_way.add_done_callback(self._done)
-        return await asyncio.shield(under_way)
+        self._running.add(future)
+        future.add_done_callback(self._on_work_done)
+        return await asyncio.shield(future)
 
     def _open_pool(self) -> ThreadPoolExecutor:
         if self._pool is None:
             raise LocalProtocolError(
-                "Codecs: they are closed" if self._closed else "Codecs: not open: async with them"
+                "Codecs: they are closed"
+                if self._is_closed
+                else "Codecs: not open: async with them"
             )
         return self._pool
 
-    def _done(self, under_way: asyncio.Future[Any]) -> None:
-        self._running.discard(under_way)
-        self._free.release()
-        if not under_way.cancelled():
-            under_way.exception()  # mark the error as retrieved: the caller may be cancelled
+    def _on_work_done(self, future: asyncio.Future[Any]) -> None:
+        self._running.discard(future)
+        self._free_threads.release()
+        if not future.cancelled():
+            future.exception()  # mark the error as retrieved: the caller may be cancelled
 
 
-class StreamRuns:
+class StreamRunner:
     """Run the work of one stream in the event loop if its pictures are small, else in a thread.
 
     The first picture runs in a thread, which measures its time; later pictures run in the thread if
@@ -239,30 +241,30 @@ class StreamRuns:
 
     def __init__(self, codecs: Codecs) -> None:
         self._codecs = codecs
-        self._longest: float | None = None  # longest CPU time of recent pictures, seconds
+        self._longest_time: float | None = None  # longest CPU time of recent pictures, seconds
 
     @property
-    def short(self) -> bool:
+    def runs_in_loop(self) -> bool:
         """True if the next work runs at once, in the event loop."""
-        return self._longest is not None and self._longest <= MAX_LOOP_TIME
+        return self._longest_time is not None and self._longest_time <= MAX_LOOP_TIME
 
     async def __call__(self, work: Callable[[], T]) -> T:
         """Run the work, and return its result."""
-        if not self.short:
-            return await self._codecs._run(partial(self._timed, work))  # noqa: SLF001
+        if not self.runs_in_loop:
+            return await self._codecs._run(partial(self._run_timed, work))  # noqa: SLF001
         self._codecs._open_pool()  # noqa: SLF001 - closed codecs run nothing
-        return self._timed(work)
+        return self._run_timed(work)
 
-    def _timed(self, work: Callable[[], T]) -> T:
-        began = time.thread_time()
+    def _run_timed(self, work: Callable[[], T]) -> T:
+        started_at = time.thread_time()
         try:
             return work()
         finally:
-            took = time.thread_time() - began
-            self._longest = max(took, LONGEST_TIME_DECAY * (self._longest or 0.0))
+            duration = time.thread_time() - started_at
+            self._longest_time = max(duration, LONGEST_TIME_DECAY * (self._longest_time or 0.0))
 
 
-def at_once(work: Coroutine[Any, Any, T]) -> T:
+def run_without_waiting(work: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine that never waits, and return its result.
 
     Raises:
@@ -270,8 +272,8 @@ def at_once(work: Coroutine[Any, Any, T]) -> T:
     """
     try:
         work.send(None)
-    except StopIteration as done:
-        result: T = done.value
+    except StopIteration as stop:
+        result: T = stop.value
         return result
     work.close()
     raise RuntimeError("the coroutine waits; expected one that does not")

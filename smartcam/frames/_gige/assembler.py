@@ -1,6 +1,6 @@
 """Assemble packets of a stream into frames, and count incomplete frames as lost.
 
-The module uses no socket and no clock: it gets packets with their time, and returns pictures in the
+The module uses no socket and no clock: it gets packets with their time. It returns pictures in the
 order of their blocks, and requests for missing packets. At most :data:`MAX_OPEN_BLOCKS` blocks are
 kept.
 
@@ -32,7 +32,7 @@ MAX_OPEN_BLOCKS: Final = 4
 """Largest number of blocks that wait for packets or an earlier block: 40 ms at 100 frames/s."""
 
 REORDER_GRACE: Final = 0.003
-"""Seconds by which a packet may come after its successors before it is requested."""
+"""Seconds for which a packet may come later than its successors before it is requested."""
 
 SILENCE_TIMEOUT: Final = 0.05
 """Seconds of silence in a block after which the rest counts as missing."""
@@ -44,8 +44,8 @@ MAX_REQUESTS: Final = 4
 """Largest number of requests for the packets of one block."""
 
 MAX_MISSING_PACKETS: Final = 64
-"""Number of missing packets of a block that is always requested; more, only up to a quarter of the
-block."""
+"""Up to this number, a block's missing packets are always requested. More are requested only if
+they are at most a quarter of the block."""
 
 MAX_GAPS_PER_BLOCK: Final = 1000
 """Largest number of gaps in a block; each gap needs its own request."""
@@ -57,13 +57,13 @@ RESTART_TIMEOUT: Final = 1.0
 """Seconds without a useful packet after which a leader with an old id restarts the count."""
 
 MAX_FRAME_RATE: Final = 2000.0
-"""Highest plausible frame rate, frames per second: ids that advance faster were restarted."""
+"""Highest plausible frame rate, frames per second: if ids advance faster, they were restarted."""
 
 MAX_SHORT_ID: Final = 65535
 """Largest block id of 16 bits; the ids begin at 1."""
 
-_SHORT: Final = struct.Struct(">HHI")
-_GONE: Final = {
+_SHORT_HEADER: Final = struct.Struct(">HHI")
+_NOT_AVAILABLE: Final = {
     GvcpStatus.PACKET_UNAVAILABLE,
     GvcpStatus.PACKET_REMOVED_FROM_MEMORY,
     GvcpStatus.PACKET_AND_PREV_REMOVED_FROM_MEMORY,
@@ -71,7 +71,7 @@ _GONE: Final = {
 
 
 class Resend(NamedTuple):
-    """A request to send again the packets ``first`` to ``last`` of a block."""
+    """A request that the camera sends the packets ``first`` to ``last`` of a block again."""
 
     block: int
     first: int
@@ -109,56 +109,60 @@ class Assembler:
 
     Args:
         payload_size: largest number of bytes of a frame, the camera's ``PayloadSize``.
-        datagram: bytes of a full packet with its GVSP header, without IP and UDP.
+        datagram_bytes: bytes of a full packet with its GVSP header, without IP and UDP.
         resend: whether missing packets are requested from the camera.
-        begins_low: whether the ids begin at 1, so that blocks before the first received block count
-            as lost; otherwise they belong to an earlier stream.
-        implied: picture size for leaders without a size; None: such leaders are an error.
+        starts_at_one: whether the ids start at 1, so that blocks before the first received block
+            count as lost; otherwise those blocks belong to an earlier stream.
+        implied_picture: picture size for leaders without a size; None: such leaders are an error.
     """
 
     def __init__(
         self,
         payload_size: int,
-        datagram: int,
+        datagram_bytes: int,
         *,
         resend: bool = True,
-        begins_low: bool = True,
-        implied: ImpliedPicture | None = None,
+        starts_at_one: bool = True,
+        implied_picture: ImpliedPicture | None = None,
     ) -> None:
         self.counts = PacketCounts()
         self.fault: MessageError | None = None
         """Error of unreadable blocks, such as a payload type that is no picture."""
-        self._most, self._datagram, self._resend = payload_size, datagram, resend
-        self._implied = implied
+        self._payload_size, self._datagram_bytes, self._resend = (
+            payload_size,
+            datagram_bytes,
+            resend,
+        )
+        self._implied_picture = implied_picture
         self._blocks: dict[int, Block] = {}
         self._current: Block | None = None  # block of the last packet
-        self._newest = self._closed = 0
-        self._offset = 0  # difference between a block's number and its id
-        self._begun, self._begins_low = False, begins_low
-        self._ticks = 0
-        self._accepted = -math.inf
-        self._pictures: list[WholePicture] = []
-        self._untold = 0
+        self._newest_number = self._closed_number = 0
+        self._number_offset = 0  # difference between a block's number and its id
+        self._has_started, self._starts_at_one = False, starts_at_one
+        self._ticks = 0  # largest clock reading of any leader
+        self._accepted_at = -math.inf
+        self._ready_pictures: list[WholePicture] = []
+        self._uncounted_lost = 0
 
-    def feed(self, data: memoryview, size: int, now: float, arrived: float) -> None:
+    def feed(self, data: memoryview, size: int, now: float, arrived_at: float) -> None:
         """Process the packet in the first ``size`` bytes of ``data``, which are copied.
 
         Args:
             data: buffer of at least ``size`` bytes.
             size: size of the packet.
             now: present time, seconds, on the clock of the deadlines.
-            arrived: time of arrival; the first packet's becomes the picture's.
+            arrived_at: time of arrival; the first packet's becomes the picture's.
         """
         current = self._current
-        if current is not None and size == self._datagram:
-            status, block_id, word = _SHORT.unpack_from(data)
+        if current is not None and size == self._datagram_bytes:
+            status, block_id, word = _SHORT_HEADER.unpack_from(data)
             if (
                 word == current.expected
                 and block_id == current.block_id
                 and status == 0
-                and current.take_next(word & PACKET_ID_BITS, data[HEADER_BYTES:size], now)
+                and current.store_next(word & PACKET_ID_BITS, data[HEADER_BYTES:size], now)
             ):
-                self._accepted = now
+                self._accepted_at = now
                 return
         header = decode_header(data, size)
         if header is None or not header.block:
@@ -166,23 +170,23 @@ class Assembler:
             return
         block = self._block_of(header, data, size, now)
         if block is not None:
-            if block.arrived is None:
-                block.arrived = arrived
-            self._put(block, header, data[header.size : size], now)
+            if block.arrived_at is None:
+                block.arrived_at = arrived_at
+            self._store_packet(block, header, data[header.size : size], now)
 
     def pictures(self) -> list[WholePicture]:
         """Return new complete pictures in order."""
-        done, self._pictures = self._pictures, []
-        return done
+        pictures, self._ready_pictures = self._ready_pictures, []
+        return pictures
 
     @property
-    def untold(self) -> int:
+    def uncounted_lost(self) -> int:
         """Number of lost frames that no picture has counted yet."""
-        return self._untold
+        return self._uncounted_lost
 
     def take_lost(self) -> int:
         """Return the number of lost frames that no picture has counted, and reset it."""
-        lost, self._untold = self._untold, 0
+        lost, self._uncounted_lost = self._uncounted_lost, 0
         return lost
 
     def next_deadline(self) -> float | None:
@@ -191,52 +195,58 @@ class Assembler:
 
     def handle_timeout(self, now: float) -> list[Resend]:
         """Drop overdue packets; return the requests to send."""
-        wanted: list[Resend] = []
+        requests: list[Resend] = []
         for block in self._open_blocks():
             if self._deadline(block) <= now:
-                self._overdue(block, now, wanted)
-        self._settle()
-        self.counts.requested += sum(span.last - span.first + 1 for span in wanted)
-        return wanted
+                self._handle_overdue(block, now, requests)
+        self._close_finished()
+        self.counts.requested += sum(span.last - span.first + 1 for span in requests)
+        return requests
 
     def _open_blocks(self) -> list[Block]:
-        return [block for block in self._blocks.values() if not (block.complete or block.dead)]
+        return [
+            block for block in self._blocks.values() if not (block.is_complete or block.is_lost)
+        ]
 
     def _deadline(self, block: Block) -> float:
         if block.missing_since < math.inf:
             return max(block.missing_since + REORDER_GRACE, block.requested_at + RESEND_INTERVAL)
-        if block.highest or block.trailer is not None:
-            return block.progress + SILENCE_TIMEOUT
-        return block.progress + LEADER_TIMEOUT
+        if block.highest_packet or block.trailer_packet is not None:
+            return block.progress_at + SILENCE_TIMEOUT
+        return block.progress_at + LEADER_TIMEOUT
 
-    def _overdue(self, block: Block, now: float, wanted: list[Resend]) -> None:
+    def _handle_overdue(self, block: Block, now: float, requests: list[Resend]) -> None:
         if block.missing_since == math.inf:
             block.missing_since = now - REORDER_GRACE
-            block.over = True
-            if not block.highest and block.trailer is None:
-                block.dead = True
+            block.has_ended = True
+            if not block.highest_packet and block.trailer_packet is None:
+                block.is_lost = True
                 return
-        holes = block.holes(MAX_GAPS_PER_BLOCK + 1)
-        if not holes:  # no gaps: only the rest of the block is missing
+        gaps = block.gaps(MAX_GAPS_PER_BLOCK + 1)
+        if not gaps:  # no gaps: only the rest of the block is missing
             block.missing_since = math.inf
             return
         if not self._resend:
-            block.dead = block.progress + SILENCE_TIMEOUT <= now
-            block.missing_since = block.progress + SILENCE_TIMEOUT
+            block.is_lost = block.progress_at + SILENCE_TIMEOUT <= now
+            block.missing_since = block.progress_at + SILENCE_TIMEOUT
             return
-        missing = sum(last - first + 1 for first, last in holes)
+        missing = sum(last - first + 1 for first, last in gaps)
         too_many = (
-            missing > max(MAX_MISSING_PACKETS, block.packets // 4)
-            or len(holes) > MAX_GAPS_PER_BLOCK
+            missing > max(MAX_MISSING_PACKETS, block.max_packets // 4)
+            or len(gaps) > MAX_GAPS_PER_BLOCK
         )
-        if block.tries >= MAX_REQUESTS or too_many:
-            block.dead = True
+        if block.request_count >= MAX_REQUESTS or too_many:
+            block.is_lost = True
             return
-        past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now
-        # while other packets come, the next request is delayed
-        block.tries += past
+        is_past = (
+            block.has_ended
+            or block.trailer_packet is not None
+            or block.progress_at + SILENCE_TIMEOUT <= now
+        )
+        # while other packets of the block come, a request does not count
+        block.request_count += is_past
         block.requested_at = now
-        wanted += [Resend(block.block_id, *hole, block.extended) for hole in holes]
+        requests += [Resend(block.block_id, *gap, block.extended) for gap in gaps]
 
     # packets
 
@@ -245,163 +255,173 @@ class Assembler:
     ) -> Block | None:
         """Return the block of a packet; None: the block is finished."""
         extended = header.size != HEADER_BYTES
-        if not self._begun:
-            self._begun = True
-            if (
-                not self._begins_low or header.block > MAX_OPEN_BLOCKS
-            ):  # otherwise blocks before were lost, or come later
-                self._newest = self._closed = header.block - 1
-        number = self._number(header.block, extended)
-        ahead = number - self._newest
-        if header.kind == PacketKind.LEADER and self._restarted(
+        if not self._has_started:
+            self._has_started = True
+            # if the ids start at 1, blocks before this one were lost, or come later
+            if not self._starts_at_one or header.block > MAX_OPEN_BLOCKS:
+                self._newest_number = self._closed_number = header.block - 1
+        number = self._number_of(header.block, extended)
+        advance = number - self._newest_number
+        if header.kind == PacketKind.LEADER and self._shows_restart(
             number, bytes(data[header.size : size])
         ):
-            number = self._restart(header.block)
-        elif ahead > MAX_OPEN_BLOCKS + MAX_FRAME_RATE * min(now - self._accepted, 1e6):
+            number = self._restart_ids(header.block)
+        elif advance > MAX_OPEN_BLOCKS + MAX_FRAME_RATE * min(now - self._accepted_at, 1e6):
             if header.kind != PacketKind.LEADER:
                 self.counts.late += 1
                 return None
-            number = self._restart(header.block)
-        elif number <= self._closed:
-            if header.kind != PacketKind.LEADER or now - self._accepted < RESTART_TIMEOUT:
+            number = self._restart_ids(header.block)
+        elif number <= self._closed_number:
+            if header.kind != PacketKind.LEADER or now - self._accepted_at < RESTART_TIMEOUT:
                 self.counts.late += 1
                 return None
-            number = self._restart(header.block)
-        self._accepted = now
+            number = self._restart_ids(header.block)
+        self._accepted_at = now
         block = self._blocks.get(number)
         if block is None:
-            block = self._open(number, extended, now)
+            block = self._open_block(number, extended, now)
         if block.extended != extended:
             self.counts.malformed += 1
             return None
         self._current = block
         return block
 
-    def _number(self, block_id: int, extended: bool) -> int:
-        """Return a block's number: its id with wraps counted."""
+    def _number_of(self, block_id: int, extended: bool) -> int:
+        """Return the number of a block: its id with wraps and restarts counted."""
         if extended:
-            return block_id + self._offset
-        ahead = (block_id + self._offset - self._newest) % MAX_SHORT_ID
-        if ahead > MAX_SHORT_ID // 2:
-            ahead -= MAX_SHORT_ID
-        return self._newest + ahead
+            return block_id + self._number_offset
+        advance = (block_id + self._number_offset - self._newest_number) % MAX_SHORT_ID
+        if advance > MAX_SHORT_ID // 2:
+            advance -= MAX_SHORT_ID
+        return self._newest_number + advance
 
-    def _restarted(self, number: int, leader: bytes) -> bool:
+    def _shows_restart(self, number: int, leader: bytes) -> bool:
         """Return True if a leader shows that the camera restarted its block ids."""
         if len(leader) < 12:
             return False
         ticks = int.from_bytes(leader[4:12], "big")
-        if number <= self._closed:
+        if number <= self._closed_number:
             return bool(self._ticks) and ticks > self._ticks
         block = self._blocks.get(number)
         return block is not None and block.leader is not None and block.leader.ticks != ticks
 
-    def _restart(self, block_id: int) -> int:
+    def _restart_ids(self, block_id: int) -> int:
         """Restart the count, and return the block's number; open blocks are lost."""
         self.counts.restarts += 1
-        self._lose(self._newest - self._closed)
+        self._count_lost(self._newest_number - self._closed_number)
         self._blocks.clear()
         self._current = None
-        self._closed = self._newest
+        self._closed_number = self._newest_number
         self._ticks = 0
-        self._offset = self._newest if block_id <= MAX_OPEN_BLOCKS else self._newest + 1 - block_id
-        return block_id + self._offset
+        self._number_offset = (
+            self._newest_number
+            if block_id <= MAX_OPEN_BLOCKS
+            else self._newest_number + 1 - block_id
+        )
+        return block_id + self._number_offset
 
-    def _open(self, number: int, extended: bool, now: float) -> Block:
+    def _open_block(self, number: int, extended: bool, now: float) -> Block:
         """Open a block, and earlier blocks of which no packet came."""
         for opened in self._blocks.values():
-            if opened.number < number and not opened.over:
-                opened.over = True
+            if opened.number < number and not opened.has_ended:
+                opened.has_ended = True
                 opened.missing_since = min(opened.missing_since, now)
-        for missing in range(max(self._newest + 1, number - MAX_OPEN_BLOCKS + 1), number):
-            self._make(missing, extended, now).over = True
+        for missing in range(max(self._newest_number + 1, number - MAX_OPEN_BLOCKS + 1), number):
+            self._new_block(missing, extended, now).has_ended = True
             self._blocks[missing].missing_since = now
-        block = self._blocks.get(number) or self._make(number, extended, now)
-        self._newest = max(self._newest, number)
-        self._settle()
+        block = self._blocks.get(number) or self._new_block(number, extended, now)
+        self._newest_number = max(self._newest_number, number)
+        self._close_finished()
         return block
 
-    def _make(self, number: int, extended: bool, now: float) -> Block:
-        block_id = number - self._offset
+    def _new_block(self, number: int, extended: bool, now: float) -> Block:
+        block_id = number - self._number_offset
         if not extended:
             block_id = (block_id - 1) % MAX_SHORT_ID + 1
         block = Block(
             number,
             block_id,
             extended=extended,
-            datagram=self._datagram,
-            most=self._most,
+            datagram_bytes=self._datagram_bytes,
+            payload_size=self._payload_size,
             now=now,
-            implied=self._implied,
+            implied_picture=self._implied_picture,
         )
         self._blocks[number] = block
         return block
 
-    def _put(self, block: Block, header: PacketHeader, payload: memoryview, now: float) -> None:
-        """Store a packet in its block."""
+    def _store_packet(
+        self, block: Block, header: PacketHeader, payload: memoryview, now: float
+    ) -> None:
+        """Store a packet in its block, or count why it is not stored."""
         packet = header.packet
-        if block.dead or block.complete:
+        if block.is_lost or block.is_complete:
             self.counts.late += 1
             return
         if header.status >= 0x8000:
             self.counts.refused += 1
-            if header.status in _GONE:
-                block.dead = True
-                self._settle()
+            if header.status in _NOT_AVAILABLE:
+                block.is_lost = True
+                self._close_finished()
             return
         if packet < len(block.received) and block.received[packet]:
             self.counts.doubled += 1
             return
-        if not self._fits(block, header, payload):
+        if not self._store_contents(block, header, payload):
             self.counts.malformed += 1
             return
-        block.progress = now
-        if packet > block.highest + 1 and block.missing_since == math.inf:
+        block.progress_at = now
+        if packet > block.highest_packet + 1 and block.missing_since == math.inf:
             block.missing_since = now
-        block.highest = max(block.highest, packet)
-        block.mark(packet)
-        if block.complete:
-            self._settle()
+        block.highest_packet = max(block.highest_packet, packet)
+        block.mark_received(packet)
+        if block.is_complete:
+            self._close_finished()
 
-    def _fits(self, block: Block, header: PacketHeader, payload: memoryview) -> bool:
+    def _store_contents(self, block: Block, header: PacketHeader, payload: memoryview) -> bool:
+        """Store a packet's contents; return False if they do not fit into the block."""
         try:
             if header.kind == PacketKind.PAYLOAD:
-                return block.take_payload(header.packet, payload)
+                return block.store_payload(header.packet, payload)
             if header.kind == PacketKind.LEADER and header.packet == 0:
-                block.take_leader(bytes(payload))
+                block.store_leader(bytes(payload))
                 if block.leader is not None:
                     self._ticks = max(self._ticks, block.leader.ticks)
                 return True
             if header.kind == PacketKind.TRAILER:
-                return block.take_trailer(header.packet, bytes(payload))
+                return block.store_trailer(header.packet, bytes(payload))
         except MessageError as exc:
             self.fault = self.fault or exc
         return False
 
     # blocks
 
-    def _settle(self) -> None:
-        """Close finished blocks, from the oldest on."""
-        while self._closed < self._newest:
-            number = self._closed + 1
-            head = self._blocks.get(number)
-            if head is None:
-                number = min(self._blocks) if self._blocks else self._newest + 1
-                self._lose(number - 1 - self._closed)
-                self._closed = number - 1
+    def _close_finished(self) -> None:
+        """Close finished blocks, the oldest first, up to the first unfinished block."""
+        while self._closed_number < self._newest_number:
+            number = self._closed_number + 1
+            oldest = self._blocks.get(number)
+            if oldest is None:
+                number = min(self._blocks) if self._blocks else self._newest_number + 1
+                self._count_lost(number - 1 - self._closed_number)
+                self._closed_number = number - 1
                 continue
-            if not head.complete and not head.dead and len(self._blocks) <= MAX_OPEN_BLOCKS:
+            if (
+                not oldest.is_complete
+                and not oldest.is_lost
+                and len(self._blocks) <= MAX_OPEN_BLOCKS
+            ):
                 return
-            picture = head.picture(self._untold) if head.complete else None
+            picture = oldest.picture(self._uncounted_lost) if oldest.is_complete else None
             if picture is None:
-                self._lose(1)
+                self._count_lost(1)
             else:
                 self.counts.pictures += 1
-                self._untold = 0
-                self._pictures.append(picture)
+                self._uncounted_lost = 0
+                self._ready_pictures.append(picture)
             del self._blocks[number]
-            self._closed = number
+            self._closed_number = number
 
-    def _lose(self, count: int) -> None:
+    def _count_lost(self, count: int) -> None:
         self.counts.lost += count
-        self._untold += count
+        self._uncounted_lost += count

@@ -59,7 +59,7 @@ class ControlChannel(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._lock = asyncio.Lock()
         self._id = 0
-        self._expected = 0  # id of the pending request; 0: none
+        self._expected_id = 0  # id of the pending request; 0: none
         self._answers: asyncio.Queue[Ack | OSError] = asyncio.Queue(maxsize=16)
         self.dropped = 0
         """Number of datagrams that answered no request."""
@@ -77,7 +77,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                 _, channel = await loop.create_datagram_endpoint(
                     lambda: cls(source), remote_addr=(host, port), family=socket.AF_INET
                 )
-        except OSError as exc:  # TimeoutError is one
+        except OSError as exc:  # a TimeoutError is an OSError
             raise FrameSourceError(
                 f"{source}: {host}:{port} cannot be reached: {exc or 'no name server answers'}",
                 source=source,
@@ -87,20 +87,20 @@ class ControlChannel(asyncio.DatagramProtocol):
     @property
     def local_address(self) -> str:
         """Address of this host, as the camera reaches it."""
-        return str(self._name("sockname")[0])
+        return str(self._socket_address("sockname")[0])
 
     @property
     def camera_address(self) -> str:
         """Address of the camera."""
-        return str(self._name("peername")[0])
+        return str(self._socket_address("peername")[0])
 
     @property
     def path_mtu(self) -> int:
         """Size of the largest IP packet on the path, bytes, as the system knows it; else 1500."""
         if self._transport is None or sys.platform != "linux":
             return 1500
-        inside = self._transport.get_extra_info("socket")
-        return int(inside.getsockopt(socket.IPPROTO_IP, IP_MTU))
+        sock = self._transport.get_extra_info("socket")
+        return int(sock.getsockopt(socket.IPPROTO_IP, IP_MTU))
 
     def close(self) -> None:
         """Close the socket. Idempotent."""
@@ -131,10 +131,13 @@ class ControlChannel(asyncio.DatagramProtocol):
         begin = address & ~3
         end = (address + length + 3) & ~3
         parts = []
-        for place in range(begin, end, MAX_BYTES_PER_REQUEST):
-            count = min(MAX_BYTES_PER_REQUEST, end - place)
+        for offset in range(begin, end, MAX_BYTES_PER_REQUEST):
+            count = min(MAX_BYTES_PER_REQUEST, end - offset)
             payload = await self.request(
-                GvcpCommand.READMEM, read_memory(place, count), 4 + count, f"{place:#06x}, {count}"
+                GvcpCommand.READMEM,
+                read_memory(offset, count),
+                4 + count,
+                f"{offset:#06x}, {count}",
             )
             parts.append(payload[4 : 4 + count])
         return b"".join(parts)[address - begin :][:length]
@@ -147,19 +150,23 @@ class ControlChannel(asyncio.DatagramProtocol):
         begin = address & ~3
         end = (address + len(data) + 3) & ~3
         if end - begin != len(data):  # only whole words can be written
-            before = await self.read(begin, end - begin)
-            data = before[: address - begin] + data + before[address - begin + len(data) :]
-        for place in range(begin, end, MAX_BYTES_PER_REQUEST):
-            part = data[place - begin :][:MAX_BYTES_PER_REQUEST]
+            words = await self.read(begin, end - begin)
+            data = words[: address - begin] + data + words[address - begin + len(data) :]
+        for offset in range(begin, end, MAX_BYTES_PER_REQUEST):
+            chunk = data[offset - begin :][:MAX_BYTES_PER_REQUEST]
             await self.request(
-                GvcpCommand.WRITEMEM, write_memory(place, part), 0, f"{place:#06x}, {len(part)}"
+                GvcpCommand.WRITEMEM, write_memory(offset, chunk), 0, f"{offset:#06x}, {len(chunk)}"
             )
 
-    def resend(self, wanted: Resend) -> None:
-        """Request packets again; the camera answers only by the packets."""
+    def request_resend(self, packets: Resend) -> None:
+        """Request packets again; the camera sends the packets, but no other answer."""
         if self._transport is not None and not self._transport.is_closing():
             data = encode_resend(
-                self._next_id(), wanted.block, wanted.first, wanted.last, extended=wanted.extended
+                self._next_id(),
+                packets.block,
+                packets.first,
+                packets.last,
+                extended=packets.extended,
             )
             self._transport.sendto(data)
 
@@ -184,13 +191,13 @@ class ControlChannel(asyncio.DatagramProtocol):
             request_id = self._next_id()
             datagram = encode(command, request_id, payload)
             try:
-                self._expected = request_id
+                self._expected_id = request_id
                 for _ in range(MAX_ATTEMPTS):
                     ack = await self._send_once(datagram, command, subject)
                     if ack is not None:
                         return self._checked_payload(ack, command, least, subject)
             finally:
-                self._expected = 0
+                self._expected_id = 0
                 self._drop_answers()
         raise FrameTimeoutError(
             f"{self.source}: no answer to {command.name} {subject} in "
@@ -204,7 +211,7 @@ class ControlChannel(asyncio.DatagramProtocol):
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
         loop = asyncio.get_running_loop()
         self._transport.sendto(datagram)
-        begun = loop.time()
+        started_at = loop.time()
         try:
             async with asyncio.timeout(ANSWER_TIMEOUT) as limit:
                 while True:
@@ -218,7 +225,7 @@ class ControlChannel(asyncio.DatagramProtocol):
                     if ack.command != GvcpCommand.PENDING_ACK:
                         return ack
                     wait = int.from_bytes(ack.payload[2:4], "big") / 1e3 + ANSWER_TIMEOUT
-                    limit.reschedule(min(loop.time() + wait, begun + MAX_PENDING_TIME))
+                    limit.reschedule(min(loop.time() + wait, started_at + MAX_PENDING_TIME))
         except TimeoutError:
             return None
 
@@ -246,13 +253,13 @@ class ControlChannel(asyncio.DatagramProtocol):
         while not self._answers.empty():
             self._answers.get_nowait()
 
-    def _name(self, kind: str) -> tuple[str, int]:
+    def _socket_address(self, name: str) -> tuple[str, int]:
         if self._transport is None:
             raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
-        return cast("tuple[str, int]", self._transport.get_extra_info(kind))
+        return cast("tuple[str, int]", self._transport.get_extra_info(name))
 
-    def _take(self, answer: Ack | OSError) -> None:
-        if self._expected and not self._answers.full():
+    def _put_answer(self, answer: Ack | OSError) -> None:
+        if self._expected_id and not self._answers.full():
             self._answers.put_nowait(answer)
         else:
             self.dropped += 1
@@ -270,15 +277,15 @@ class ControlChannel(asyncio.DatagramProtocol):
         except MessageError:
             self.dropped += 1
             return
-        if ack.request_id == self._expected:
-            self._take(ack)
+        if ack.request_id == self._expected_id:
+            self._put_answer(ack)
         else:
             self.dropped += 1
 
     def error_received(self, exc: Exception) -> None:
-        """Note that no process listens at the address."""
+        """Fail the pending request: no process listens at the address."""
         if isinstance(exc, OSError):
-            self._take(exc)
+            self._put_answer(exc)
 
 
 class RequestRefusedError(FrameSourceError):
@@ -296,34 +303,37 @@ class RequestRefusedError(FrameSourceError):
 
 
 async def heartbeat(
-    control: ControlChannel, timeout: float, source: str, lost: Callable[[FrameSourceError], None]
+    control: ControlChannel,
+    timeout: float,
+    source: str,
+    on_lost: Callable[[FrameSourceError], None],
 ) -> None:
-    """Keep control of a camera until it is lost, then call ``lost``.
+    """Keep control of a camera until control is lost, then call ``on_lost``.
 
     Args:
         control: control channel of the camera.
         timeout: seconds without a request after which the camera gives up control.
         source: name of the camera, for errors.
-        lost: function that is called once, at the end, with the error.
+        on_lost: function that is called once, at the end, with the error.
     """
     loop = asyncio.get_running_loop()
-    answered = loop.time()
+    last_answer_at = loop.time()
     while True:
         await asyncio.sleep(timeout / 3)
         try:
             privilege = await control.read_register(Register.CONTROL_PRIVILEGE)
         except FrameSourceError as exc:
-            if loop.time() - answered >= timeout:
+            if loop.time() - last_answer_at >= timeout:
                 error = FrameSourceError(
-                    f"{source}: no answer for {loop.time() - answered:.1f} s: {exc}",
+                    f"{source}: no answer for {loop.time() - last_answer_at:.1f} s: {exc}",
                     source=source,
                 )
                 error.__cause__ = exc
-                lost(error)
+                on_lost(error)
                 return
             continue
         if not privilege & (CONTROL | EXCLUSIVE):
-            lost(
+            on_lost(
                 FrameSourceError(
                     f"{source}: control was lost: the camera restarted, or got no heartbeat for "
                     f"{timeout:g} s",
@@ -331,4 +341,4 @@ async def heartbeat(
                 )
             )
             return
-        answered = loop.time()
+        last_answer_at = loop.time()

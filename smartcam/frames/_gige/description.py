@@ -91,12 +91,12 @@ def locate(url: str) -> Location:
     )
     if match is None:
         raise MessageError(f"expected 'Local:NAME;ADDRESS;LENGTH', got {url[:80]!r}")
-    place = Location(match[1], int(match[2], 16), int(match[3], 16))
-    if not 0 < place.length <= MAX_PLAIN_BYTES:
+    location = Location(match[1], int(match[2], 16), int(match[3], 16))
+    if not 0 < location.length <= MAX_PLAIN_BYTES:
         raise MessageError(
-            f"{url[:80]!r}: expected 1 to {MAX_PLAIN_BYTES} bytes, got {place.length}"
+            f"{url[:80]!r}: expected 1 to {MAX_PLAIN_BYTES} bytes, got {location.length}"
         )
-    return place
+    return location
 
 
 def unpack(data: bytes) -> bytes:
@@ -118,11 +118,11 @@ def unpack(data: bytes) -> bytes:
             names = sorted(archive.namelist(), key=lambda name: not name.lower().endswith(".xml"))
             if not names:
                 raise MessageError("the description's ZIP archive is empty")
-            how = archive.getinfo(names[0]).compress_type
-            if how not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            method = archive.getinfo(names[0]).compress_type
+            if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise MessageError(
                     f"the description's ZIP archive: expected DEFLATE (8) or no compression (0), "
-                    f"got method {how}"
+                    f"got method {method}"
                 )
             with archive.open(names[0]) as file:
                 text = file.read(MAX_PLAIN_BYTES + 1)
@@ -198,13 +198,13 @@ class _XmlReader:
 
 
 def _nodes(root: Element) -> dict[str, Element]:
-    """Return the named elements; an entry of a StructReg also gets the register's elements."""
+    """Return the named elements; each entry of a StructReg also gets the StructReg's elements."""
     nodes: dict[str, Element] = {}
-    waiting, copies = [root], 0
-    while waiting:
-        element = waiting.pop()
+    pending, copies = [root], 0
+    while pending:
+        element = pending.pop()
         if element.kind in ("RegisterDescription", "Group"):
-            waiting += element.children
+            pending += element.children
         elif element.kind == "StructReg":
             shared = [child for child in element.children if child.kind != "StructEntry"]
             for entry in element.all("StructEntry"):

@@ -59,7 +59,7 @@ class AnsweringCamera(NamedTuple):
     Attributes:
         info: the camera's description of itself.
         address: address that the answer came from.
-        reachable: whether its address belongs to the network that the answer came through.
+        reachable: whether the camera's address belongs to the network that the answer came through.
     """
 
     info: DeviceInfo
@@ -68,34 +68,34 @@ class AnsweringCamera(NamedTuple):
 
 
 def networks() -> list[Network]:
-    """Return this machine's IPv4 networks, or the default one if they cannot be listed."""
+    """Return this machine's IPv4 networks; one that stands for all if they cannot be listed."""
     try:
         import fcntl
     except ImportError:
         return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - any address of its own
-    places = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         for _, name in socket.if_nameindex():
             request = struct.pack("256s", name.encode()[:15])
             with contextlib.suppress(OSError):  # an interface without an IPv4 address
                 address, broadcast, mask = (
-                    socket.inet_ntoa(fcntl.ioctl(asking.fileno(), number, request)[20:24])
+                    socket.inet_ntoa(fcntl.ioctl(sock.fileno(), number, request)[20:24])
                     for number in (_SIOCGIFADDR, _SIOCGIFBRDADDR, _SIOCGIFNETMASK)
                 )
                 network = ipaddress.IPv4Network(f"{address}/{mask}", strict=False)
                 target = broadcast if broadcast != "0.0.0.0" else str(network.broadcast_address)  # noqa: S104
                 targets = (target, address if network.is_loopback else "255.255.255.255")
-                places.append(Network(address, targets, network))
-    return places
+                found.append(Network(address, targets, network))
+    return found
 
 
 async def find(
-    places: Iterable[Network], *, port: int = PORT, wait: float = ANSWER_WAIT
+    interfaces: Iterable[Network], *, port: int = PORT, wait: float = ANSWER_WAIT
 ) -> list[AnsweringCamera]:
     """Search for cameras.
 
     Args:
-        places: networks to search; a target may be a camera's own address.
+        interfaces: networks to search; a target may be a camera's own address.
         port: UDP port that cameras listen at.
         wait: seconds to wait for answers.
 
@@ -105,24 +105,24 @@ async def find(
     searches: list[_NetworkSearch] = []
     transports: list[asyncio.DatagramTransport] = []
     try:
-        for place in places:
+        for interface in interfaces:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, search = await loop.create_datagram_endpoint(
-                    functools.partial(_NetworkSearch, place),
-                    local_addr=(place.address, 0),
+                    functools.partial(_NetworkSearch, interface),
+                    local_addr=(interface.address, 0),
                     allow_broadcast=True,
                 )
                 transports.append(transport)
                 searches.append(search)
                 flags = ACK_REQUIRED | BROADCAST_ACK
-                for target in place.targets:
+                for target in interface.targets:
                     transport.sendto(
                         encode(GvcpCommand.DISCOVERY, _REQUEST_ID, flags=flags), (target, port)
                     )
         await asyncio.sleep(wait)
     finally:
-        for opened in transports:
-            opened.close()
+        for transport in transports:
+            transport.close()
     answers = sorted(
         (answer for search in searches for answer in search.cameras),
         key=lambda answer: answer.reachable,
@@ -132,8 +132,8 @@ async def find(
 
 
 class _NetworkSearch(asyncio.DatagramProtocol):
-    def __init__(self, place: Network) -> None:
-        self._place = place
+    def __init__(self, interface: Network) -> None:
+        self._interface = interface
         self.cameras: list[AnsweringCamera] = []
         self._answers = Counter[str]()  # number of answers by address
 
@@ -149,7 +149,7 @@ class _NetworkSearch(asyncio.DatagramProtocol):
             info = DeviceInfo.decode(ack.payload)
         except MessageError:
             return
-        network = self._place.network
+        network = self._interface.network
         reachable = network is None or ipaddress.IPv4Address(info.address) in network
         self._answers[addr[0]] += 1
         if len(self.cameras) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:

@@ -23,25 +23,25 @@ from smartcam.frames._gige.device_features import GigEFeatures
 from smartcam.frames._gige.discovery import find, networks
 from smartcam.frames._gige.gvcp import GvcpStatus, Register
 from smartcam.frames._gige.gvsp import IP_UDP_BYTES, ImpliedPicture, PayloadType
-from smartcam.frames._gige.messages import in_doubt
-from smartcam.frames._gige.places import found, place, wanted
+from smartcam.frames._gige.messages import doubt_about_size
+from smartcam.frames._gige.places import as_source, place, wanted
 from smartcam.frames._gige.session import GigESession
 from smartcam.frames._gige.setup import (
     MAX_NUMBER,
-    connect,
-    lock,
+    connect_stream,
     read_exposure,
     read_shape,
+    set_locked,
     set_up,
 )
 from smartcam.frames._gige.stream import Stream, StreamSocket
 from smartcam.frames._gige.triggering import (
-    EXPOSED,
-    MISSED,
+    EXPOSURE_END_EVENT,
+    MISSED_EVENT,
     ArmedTrigger,
-    one_setting,
     read_settings,
-    selected,
+    selected_trigger,
+    usable_setting,
 )
 
 if TYPE_CHECKING:
@@ -59,9 +59,8 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.triggering import TriggerSetting
     from smartcam.frames._trigger import AwaitedTrigger
 
-MAX_SETTLING_TIME: Final = 30.0
-"""Longest time, seconds, that the stream waits for the picture of a failed trigger before it is
-restarted."""
+MAX_LATE_PICTURE_TIME: Final = 30.0
+"""Longest time, seconds, that a restart of the stream waits for the picture of a failed trigger."""
 
 
 class GigEDriver(FrameDriver):
@@ -99,30 +98,32 @@ class GigEDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        self._wanted = wanted(address)
+        self._options = wanted(address)
         self._session: GigESession | None = None
         self._shape: StreamShape | None = None
         self._stream: Stream | None = None
         self._sink: FrameSink | None = None
         self._packet_size = 0  # packet size that passed the test
-        self._setting = asyncio.Lock()  # held while related features are set
-        self._opening = asyncio.Lock()
-        self._features = GigEFeatures(self._present, self._feature_changed, self._setting)
+        self._feature_lock = asyncio.Lock()  # held while related features are set
+        self._open_lock = asyncio.Lock()
+        self._features = GigEFeatures(
+            self._current_features, self._feature_changed, self._feature_lock
+        )
         self._triggers: list[TriggerSetting] = []
         self._armed: ArmedTrigger | None = None
         self._busy_until = 0.0  # on the clock of time.monotonic()
-        self._is_wanted = False  # whether the driver is open
-        self._is_changed = False  # whether a feature was set during the stream
-        # duration of frames in progress when a feature was set, and the time until which they may
-        # come
-        self._before = 0.0, 0.0
+        self._is_open = False  # whether the driver is open
+        self._has_changed_features = False  # whether a feature was set during the stream
+        # longest duration before the last change of a feature, and the time until which frames with
+        # this duration may come
+        self._old_duration = 0.0, 0.0
         self.counts: PacketCounts | None = None
         """Packet counts of the running stream, or of the last one."""
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
         """Return the cameras that answer on this machine's networks, within half a second."""
-        return [found(camera) for camera in await find(networks())]
+        return [as_source(camera) for camera in await find(networks())]
 
     @property
     def name(self) -> str:
@@ -131,26 +132,26 @@ class GigEDriver(FrameDriver):
 
     async def open(self) -> StreamFormat:
         """Take control of the camera, and apply the URL's settings."""
-        self._is_wanted = True
-        return (await self._opened())[1].format
+        self._is_open = True
+        return (await self._open_session())[1].format
 
-    async def _opened(self) -> tuple[GigESession, StreamShape]:
+    async def _open_session(self) -> tuple[GigESession, StreamShape]:
         """Return the open session; open a new one if it was lost.
 
         Raises:
             FrameSourceError: the session cannot be opened, or was closed meanwhile.
         """
-        async with self._opening:
+        async with self._open_lock:
             if self._session is not None and self._session.lost is not None:
-                await self._drop()
+                await self._close_session()
             if self._session is None or self._shape is None:
-                host, port = await place(self.address, self._wanted)
+                host, port = await place(self.address, self._options)
                 session = await GigESession.open(host, port, self.address.shown)
                 try:
-                    self._shape = await set_up(session, self._wanted)
+                    self._shape = await set_up(session, self._options)
                     self.form = self._shape.format
                     await self._read_triggers(session)
-                    if not self._is_wanted:
+                    if not self._is_open:
                         raise FrameSourceError(f"{self.name}: closed meanwhile", source=self.name)
                 except BaseException:
                     await session.close()
@@ -160,41 +161,41 @@ class GigEDriver(FrameDriver):
 
     async def start(self, sink: FrameSink) -> None:
         """Start the stream, and open the camera if needed."""
-        self._is_wanted = True
-        session, shape = await self._opened()
+        self._is_open = True
+        session, shape = await self._open_session()
         self._sink = sink
         try:
-            if self._is_changed:
+            if self._has_changed_features:
                 shape = await self._read_shape(session)
             # the picture of an earlier trigger must not come into this stream
             await asyncio.sleep(max(0.0, self._busy_until - time.monotonic()))
-            self._stream = await self._listen(session, shape)
-            session.on_lost = self._end
-            await lock(session.features, True)
+            self._stream = await self._open_stream(session, shape)
+            session.on_lost = self._end_stream
+            await set_locked(session.features, True)
             await session.features.execute("AcquisitionStart")
         except BaseException:
-            self._quiet()
+            self._close_stream()
             raise
 
     async def stop(self) -> None:
         """Stop the stream; the camera stays open."""
-        streamed, session = self._stream is not None, self._session
-        self._quiet()
-        if not streamed or session is None or session.lost is not None:
+        was_streaming, session = self._stream is not None, self._session
+        self._close_stream()
+        if not was_streaming or session is None or session.lost is not None:
             return
         try:
             await session.features.execute("AcquisitionStop")
-            await lock(session.features, False)
+            await set_locked(session.features, False)
             await session.control.write_register(Register.STREAM_PORT, 0)
         except FrameSourceError as exc:  # the camera is gone; the next start opens it again
             session.lost = exc
 
     async def close(self) -> None:
         """Stop the stream and give up control of the camera."""
-        self._is_wanted = False
-        await self._drop()
+        self._is_open = False
+        await self._close_session()
 
-    async def _drop(self) -> None:
+    async def _close_session(self) -> None:
         """Stop the stream and give up control of the camera, which may be opened again."""
         try:
             await self.stop()
@@ -210,31 +211,31 @@ class GigEDriver(FrameDriver):
         """The features that the camera's GenICam description lists."""
         return self._features
 
-    async def _present(self) -> GenicamFeatures:
-        return (await self._opened())[0].features
+    async def _current_features(self) -> GenicamFeatures:
+        return (await self._open_session())[0].features
 
     async def _feature_changed(self) -> None:
         """Read the format and the trigger settings, which a feature may have changed."""
-        session, shape = await self._opened()
+        session, shape = await self._open_session()
         if self._stream is not None:
             exposure = await read_exposure(session.features)
             now = time.monotonic()
-            longest = max(self._longest(shape, now), exposure.duration)
-            self._before = longest, now + 2 * longest
+            longest = max(self._longest_duration(shape, now), exposure.duration)
+            self._old_duration = longest, now + 2 * longest
             self._shape = shape._replace(exposure=exposure)
         await self._read_triggers(session)
-        self._is_changed = True
+        self._has_changed_features = True
         if self._stream is None:
             await self._read_shape(session)
 
-    def _longest(self, shape: StreamShape, arrived: float) -> float:
+    def _longest_duration(self, shape: StreamShape, arrived: float) -> float:
         """Return the longest possible duration, seconds, of a frame that arrived at a time."""
-        before, until = self._before
+        before, until = self._old_duration
         return max(shape.exposure.duration, before if arrived < until else 0.0)
 
     async def _read_shape(self, session: GigESession) -> StreamShape:
         shape = self._shape = await read_shape(session)
-        self.form, self._is_changed = shape.format, False
+        self.form, self._has_changed_features = shape.format, False
         return shape
 
     async def _read_triggers(self, session: GigESession) -> None:
@@ -248,15 +249,15 @@ class GigEDriver(FrameDriver):
         session, stream = self._session, self._stream
         if session is None or stream is None:
             raise FrameSourceError(f"{self.name}: the camera does not stream", source=self.name)
-        async with self._setting:
-            setting = await one_setting(
+        async with self._feature_lock:
+            setting = await usable_setting(
                 self._triggers, session.features, fire is not None, self.name
             )
             await self._watch_exposures(session)
-            async with selected(session.features, setting):
+            async with selected_trigger(session.features, setting):
                 armed = ArmedTrigger(
                     pending,
-                    await session.latched_clock(),
+                    await session.read_clock(),
                     setting,
                     delay=(await session.features.number("TriggerDelay") or 0.0) / 1e6,
                     is_first=not stream.assembler.counts.pictures,
@@ -267,16 +268,16 @@ class GigEDriver(FrameDriver):
                     pending.fire_begins()
 
                 if fire is None:
-                    await self._fire(session, pending, begin)
+                    await self._send_software_trigger(session, pending, begin)
         if fire is not None:
             begin()
             await fire()
 
-    async def _fire(
+    async def _send_software_trigger(
         self, session: GigESession, pending: AwaitedTrigger, begin: Callable[[], None]
     ) -> None:
         try:
-            await session.features.execute("TriggerSoftware", writing=begin)
+            await session.features.execute("TriggerSoftware", before_write=begin)
         except RequestRefusedError as exc:
             pending.refused()
             if exc.status != GvcpStatus.BUSY:
@@ -287,8 +288,8 @@ class GigEDriver(FrameDriver):
         """Assign no more pictures to the last trigger."""
         armed, self._armed = self._armed, None
         if armed is not None and armed.pending.fired is not None and self._shape is not None:
-            longest = self._longest(self._shape, time.monotonic())
-            busy = min(longest + armed.delay, MAX_SETTLING_TIME)
+            longest = self._longest_duration(self._shape, time.monotonic())
+            busy = min(longest + armed.delay, MAX_LATE_PICTURE_TIME)
             self._busy_until = armed.pending.fired + busy
 
     def _trigger_of(
@@ -298,14 +299,14 @@ class GigEDriver(FrameDriver):
         armed = self._armed
         if armed is None or armed.is_older(picture):
             return None
-        if doubt := armed.doubt(picture, ids_agree=session.ids_agree):
+        if doubt := armed.reason_for_doubt(picture, ids_agree=session.ids_agree):
             self.disarm()
             return FrameLostError(
                 f"{self.name}: the trigger of block {picture.block_id} is uncertain: {doubt}"
             )
         self._armed = None
         session.ids_agree = session.ids_agree or picture.block_id in armed.exposed
-        return armed.record(picture, session.ticks_per_second)
+        return armed.to_frame_trigger(picture, session.ticks_per_second)
 
     async def watch_events(
         self,
@@ -314,13 +315,13 @@ class GigEDriver(FrameDriver):
         ended: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
         """Start reports of the camera's events through its message channel."""
-        async with self._setting:
-            session, _ = await self._opened()
-            end = await session.events.watch(names, take, ended)
+        async with self._feature_lock:
+            session, _ = await self._open_session()
+            stop_watching = await session.events.watch(names, take, ended)
 
         async def stop() -> None:
-            async with self._setting:
-                await end()
+            async with self._feature_lock:
+                await stop_watching()
 
         return stop
 
@@ -329,50 +330,56 @@ class GigEDriver(FrameDriver):
         if session.watches_exposures:
             return
         session.watches_exposures = True
-        names = [name for name in await session.events.names() if name in (EXPOSED, MISSED)]
+        names = [
+            name
+            for name in await session.events.names()
+            if name in (EXPOSURE_END_EVENT, MISSED_EVENT)
+        ]
         if names:
             with contextlib.suppress(FrameSourceError):  # triggering works without these events
-                await session.events.watch(names, self._take_event, lambda _: None)
+                await session.events.watch(names, self._on_event, lambda _: None)
 
-    def _take_event(self, event: FrameEvent) -> None:
+    def _on_event(self, event: FrameEvent) -> None:
         armed, session = self._armed, self._session
         if armed is None or session is None:
             return
         ticks = session.ticks_per_second
-        at = None if event.device_time is None else event.device_time * ticks
-        if armed.take_event(event, at) and self._sink is not None:
+        event_ticks = None if event.device_time is None else event.device_time * ticks
+        if armed.on_event(event, event_ticks) and self._sink is not None:
             self.disarm()
             self._sink.trigger_failed(
                 OvertriggeredError(f"{self.name}: its event {event.name} came for this trigger")
             )
 
-    async def _listen(self, session: GigESession, shape: StreamShape) -> Stream:
+    async def _open_stream(self, session: GigESession, shape: StreamShape) -> Stream:
         """Direct the camera's stream to a new socket."""
         try:
-            where = StreamSocket(session.control.local_address, session.control.camera_address)
+            sock = StreamSocket(session.control.local_address, session.control.camera_address)
         except OSError as exc:
             raise FrameSourceError(
                 f"{self.name}: no socket for the stream: {exc}", source=self.name
             ) from exc
         try:
-            packet_size = self._wanted.packet_size or self._packet_size
-            size = self._packet_size = await connect(session, where, packet_size)
-            resend = session.can_resend and self._wanted.resend
+            packet_size = self._options.packet_size or self._packet_size
+            size = self._packet_size = await connect_stream(session, sock, packet_size)
+            resend = session.can_resend and self._options.resend
             assembler = Assembler(
                 shape.payload,
                 size - IP_UDP_BYTES,
                 resend=resend,
-                begins_low=not self._triggers and not session.streamed,
-                implied=ImpliedPicture(shape.number, shape.format.width, shape.format.height),
+                starts_at_one=not self._triggers and not session.has_streamed,
+                implied_picture=ImpliedPicture(
+                    shape.number, shape.format.width, shape.format.height
+                ),
             )
-            session.streamed = True
+            session.has_streamed = True
             self.counts = assembler.counts
-            return Stream(where, assembler, self._take, session.control.resend)
+            return Stream(sock, assembler, self._on_pictures, session.control.request_resend)
         except BaseException:
-            where.close()
+            sock.close()
             raise
 
-    def _quiet(self) -> None:
+    def _close_stream(self) -> None:
         """Stop listening; report lost frames."""
         self.disarm()
         stream, self._stream = self._stream, None
@@ -384,14 +391,14 @@ class GigEDriver(FrameDriver):
             if sink is not None and (lost := stream.assembler.take_lost()):
                 sink.lost(lost)
 
-    def _end(self, error: FrameSourceError) -> None:
+    def _end_stream(self, error: FrameSourceError) -> None:
         sink = self._sink
-        self._quiet()
+        self._close_stream()
         if sink is not None:
             sink.ended(error)
 
-    def _take(self, pictures: list[WholePicture]) -> None:
-        """Deliver the stream's pictures; a receiver of a frame may close the stream."""
+    def _on_pictures(self, pictures: list[WholePicture]) -> None:
+        """Pass pictures to the sink, which may close the stream; report lost ones to a trigger."""
         stream = self._stream
         sink = None if pictures or self._armed is None else self._sink
         if sink is not None and stream is not None and (lost := stream.assembler.take_lost()):
@@ -408,22 +415,26 @@ class GigEDriver(FrameDriver):
                 return
             shape, leader = self._shape, picture.leader
             if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
-                self._end(self._changed_format_error(picture, shape))
+                self._end_stream(self._changed_format_error(picture, shape))
                 return
             chunks, remark = self._session.read_chunks(picture)
-            if leader.payload_type == PayloadType.CHUNK and (doubt := in_doubt(picture, chunks)):
-                self._end(FrameFormatError(f"{self.name}: {doubt}", source=self.name))
+            if leader.payload_type == PayloadType.CHUNK and (
+                doubt := doubt_about_size(picture, chunks)
+            ):
+                self._end_stream(FrameFormatError(f"{self.name}: {doubt}", source=self.name))
                 return
             trigger = self._trigger_of(picture, self._session)
             if isinstance(trigger, SmartCamError):
                 self._sink.trigger_failed(trigger)
                 trigger = None
-            self._sink.frame(self._frame(picture, shape, self._session, trigger, chunks, remark))
+            self._sink.frame(
+                self._new_frame(picture, shape, self._session, trigger, chunks, remark)
+            )
         fault = None if self._stream is None else self._stream.assembler.fault
         if fault is not None:
             error = FrameFormatError(f"{self.name}: its stream: {fault}", source=self.name)
             error.__cause__ = fault
-            self._end(error)
+            self._end_stream(error)
 
     def _changed_format_error(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
         leader = picture.leader
@@ -434,7 +445,7 @@ class GigEDriver(FrameDriver):
             available=(str(shape.format),),
         )
 
-    def _frame(
+    def _new_frame(
         self,
         picture: WholePicture,
         shape: StreamShape,
@@ -444,7 +455,7 @@ class GigEDriver(FrameDriver):
         remark: str,
     ) -> Frame:
         ticks = session.ticks_per_second
-        duration = self._longest(shape, picture.arrived)
+        duration = self._longest_duration(shape, picture.arrived_at)
         exposure = chunks.get("ChunkExposureTime") if shape.exposure.is_auto else None
         if isinstance(exposure, (int, float)) and 0 < exposure < MAX_NUMBER:
             duration = exposure / 1e6 + shape.exposure.readout
@@ -454,8 +465,8 @@ class GigEDriver(FrameDriver):
             width=picture.leader.width,
             height=picture.rows,
             stride=picture.stride,
-            captured=picture.arrived,
-            utc=time.time() - (time.monotonic() - picture.arrived),
+            captured=picture.arrived_at,
+            utc=time.time() - (time.monotonic() - picture.arrived_at),
             moment=Moment.ARRIVAL,
             duration=duration,
             device_time=picture.leader.ticks / ticks if ticks else None,

@@ -98,21 +98,22 @@ def decode_events(datagram: bytes) -> EventRequest:
     if len(payload) < length:
         raise MessageError(f"event: {length} bytes are announced, got {len(payload)}")
     extended = bool(flags & EXTENDED_ID)
-    head = _LONG_ITEM.size if extended else _ITEM.size
+    header_bytes = _LONG_ITEM.size if extended else _ITEM.size
     items: list[EventItem] = []
     while payload:
-        if len(payload) < head or len(items) >= MAX_EVENTS_IN_MESSAGE:
+        if len(payload) < header_bytes or len(items) >= MAX_EVENTS_IN_MESSAGE:
             raise MessageError(
-                f"event {len(items) + 1}: expected {head} bytes or more and at most "
+                f"event {len(items) + 1}: expected {header_bytes} bytes or more and at most "
                 f"{MAX_EVENTS_IN_MESSAGE} events, got {len(payload)} bytes",
                 data=datagram,
             )
-        size = len(payload) if command == GvcpCommand.EVENTDATA else head
+        size = len(payload) if command == GvcpCommand.EVENTDATA else header_bytes
         if extended:
             size = int.from_bytes(payload[:2], "big") or size
-        if not head <= size <= len(payload):
+        if not header_bytes <= size <= len(payload):
             raise MessageError(
-                f"event {len(items) + 1}: expected {head} to {len(payload)} bytes, it says {size}",
+                f"event {len(items) + 1}: expected {header_bytes} to {len(payload)} bytes, it says "
+                f"{size}",
                 data=datagram,
             )
         items.append(_item(bytes(payload[:size]), extended))
@@ -135,12 +136,12 @@ def encode_event_ack(command: int, request_id: int) -> bytes:
 
 class _EventWatcher(NamedTuple):
     names: tuple[str, ...]
-    take: Callable[[FrameEvent], None]
-    ended: Callable[[FrameSourceError | None], None]
+    on_event: Callable[[FrameEvent], None]
+    on_end: Callable[[FrameSourceError | None], None]
 
 
 class EventChannel(asyncio.DatagramProtocol):
-    """The events of a camera, for any number of watchers, until :meth:`close`.
+    """Receive the events of a camera for any number of watchers, until :meth:`close`.
 
     Args:
         session: session with the camera.
@@ -151,8 +152,8 @@ class EventChannel(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._lock = asyncio.Lock()
         self._watchers: list[_EventWatcher] = []
-        self._names: dict[int, str] = {}
-        self._numbers: dict[str, int] = {}
+        self._names_by_number: dict[int, str] = {}
+        self._numbers_by_name: dict[str, int] = {}
         self._messages: MessageFeatures | None = None
         self._recent_requests: collections.deque[int] = collections.deque(maxlen=MAX_KEPT_REQUESTS)
         self.dropped = 0
@@ -168,8 +169,8 @@ class EventChannel(asyncio.DatagramProtocol):
     async def watch(
         self,
         names: Sequence[str],
-        take: Callable[[FrameEvent], None],
-        ended: Callable[[FrameSourceError | None], None],
+        on_event: Callable[[FrameEvent], None],
+        on_end: Callable[[FrameSourceError | None], None],
     ) -> Callable[[], Coroutine[Any, Any, None]]:
         """Start reports of events; return the coroutine function that stops them.
 
@@ -189,33 +190,33 @@ class EventChannel(asyncio.DatagramProtocol):
                     source=label,
                     available=tuple(known),
                 )
-        watcher = _EventWatcher(tuple(dict.fromkeys(names)), take, ended)
+        watcher = _EventWatcher(tuple(dict.fromkeys(names)), on_event, on_end)
         async with self._lock:
             await self._open()
             self._watchers.append(watcher)
             try:
                 for name in watcher.names:
-                    await self._number(name)
-                    await self._switch(name, on=True)
+                    await self._learn_number(name)
+                    await self._set_notification(name, on=True)
             except BaseException:
                 self._watchers.remove(watcher)
                 raise
 
-        async def end() -> None:
-            await self._leave(watcher)
+        async def stop() -> None:
+            await self._remove_watcher(watcher)
 
-        return end
+        return stop
 
-    async def _leave(self, watcher: _EventWatcher) -> None:
+    async def _remove_watcher(self, watcher: _EventWatcher) -> None:
         async with self._lock:
             if watcher in self._watchers:
                 self._watchers.remove(watcher)
-            watched = {name for other in self._watchers for name in other.names}
+            still_watched = {name for other in self._watchers for name in other.names}
             if self._session.lost is None and self._transport is not None:
                 for name in watcher.names:
-                    if name not in watched:
+                    if name not in still_watched:
                         with contextlib.suppress(FrameSourceError):
-                            await self._switch(name, on=False)
+                            await self._set_notification(name, on=False)
 
     async def _open(self) -> None:
         """Direct the camera's message channel to a new socket."""
@@ -250,9 +251,9 @@ class EventChannel(asyncio.DatagramProtocol):
             raise
         self._transport = transport
 
-    async def _number(self, name: str) -> None:
-        """Return the number of an event from its port or its feature."""
-        if self._messages is None or name in self._numbers:
+    async def _learn_number(self, name: str) -> None:
+        """Store the number of an event, from its port or its feature."""
+        if self._messages is None or name in self._numbers_by_name:
             return
         number: float | None = self._messages.number_of(f"Event{name}")
         if number is None:
@@ -263,26 +264,26 @@ class EventChannel(asyncio.DatagramProtocol):
                 f"{name} has",
                 source=self._session.label,
             )
-        self._numbers[name] = int(number)
-        self._names[int(number)] = name
+        self._numbers_by_name[name] = int(number)
+        self._names_by_number[int(number)] = name
 
-    async def _switch(self, name: str, *, on: bool) -> None:
+    async def _set_notification(self, name: str, *, on: bool) -> None:
         features = self._session.features
         await features.set("EventSelector", name)
         entries = await features.entries("EventNotification")
         entry = next((entry for entry in _ON_ENTRIES if entry in entries), "On") if on else "Off"
         await features.set("EventNotification", entry)
 
-    def end(self, error: FrameSourceError | None) -> None:
+    def end_watchers(self, error: FrameSourceError | None) -> None:
         """End all watchers, since no more events come."""
         watchers, self._watchers = self._watchers, []
         for watcher in watchers:
-            watcher.ended(error)
+            watcher.on_end(error)
 
     async def close(self) -> None:
         """Close the socket. Idempotent."""
         transport, self._transport = self._transport, None
-        self.end(None)
+        self.end_watchers(None)
         if transport is not None:
             transport.abort()
             if self._session.lost is None:
@@ -293,7 +294,7 @@ class EventChannel(asyncio.DatagramProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Store the transport, since acknowledgements may be needed at once."""
-        self._acks = cast("asyncio.DatagramTransport", transport)
+        self._ack_transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         """Acknowledge events, and report them."""
@@ -306,7 +307,7 @@ class EventChannel(asyncio.DatagramProtocol):
             self.dropped += 1
             return
         if request.wants_ack:
-            self._acks.sendto(encode_event_ack(request.command, request.request_id), addr)
+            self._ack_transport.sendto(encode_event_ack(request.command, request.request_id), addr)
         if request.request_id in self._recent_requests:
             return
         self._recent_requests.append(request.request_id)
@@ -314,7 +315,7 @@ class EventChannel(asyncio.DatagramProtocol):
             self._report(item)
 
     def _report(self, item: EventItem) -> None:
-        name = self._names.get(item.number)
+        name = self._names_by_number.get(item.number)
         if name is None or self._messages is None:
             return
         values, problems = self._messages.read({item.number: memoryview(item.data)})
@@ -330,4 +331,4 @@ class EventChannel(asyncio.DatagramProtocol):
         )
         for watcher in [*self._watchers]:
             if name in watcher.names:
-                watcher.take(event)
+                watcher.on_event(event)

@@ -38,7 +38,7 @@ _TOKEN: Final = re.compile(
     r"|(?P<operator>\*\*|<<|>>|<=|>=|<>|!=|&&|\|\||[-+*/%&|^~<>=?:(),!]))"
 )
 
-_LEVELS_OF_C: Final = (
+_C_PRECEDENCE: Final = (
     ("||",),
     ("&&",),
     ("|",),
@@ -50,9 +50,9 @@ _LEVELS_OF_C: Final = (
     ("+", "-"),
     ("*", "/", "%"),
 )
-"""Binary operators by C's precedence, the lowest first; ``**`` binds tighter than all."""
+"""Binary operators by C's precedence, the lowest first; ``**`` has a higher precedence than all."""
 
-_LEVELS_OF_EMVA: Final = (
+_EMVA_PRECEDENCE: Final = (
     ("||", "&&", "=", "<>", "!=", "<", ">", "<=", ">="),
     ("+", "-"),
     ("*", "/", "%"),
@@ -68,20 +68,21 @@ _TIGHTER_THAN_NOT: Final = frozenset({"&", "|", "^", "<<", ">>", "**"})
 """Operators after which EMVA's GenApi misreads ``~``."""
 
 
-def _strength(levels: tuple[tuple[str, ...], ...]) -> dict[str, int]:
-    return {sign: level for level, signs in enumerate(levels) for sign in signs}
+def _level_by_operator(levels: tuple[tuple[str, ...], ...]) -> dict[str, int]:
+    return {symbol: level for level, symbols in enumerate(levels) for symbol in symbols}
 
 
-_OF_C, _OF_EMVA = _strength(_LEVELS_OF_C), _strength(_LEVELS_OF_EMVA)
+_C_LEVELS = _level_by_operator(_C_PRECEDENCE)
+_EMVA_LEVELS = _level_by_operator(_EMVA_PRECEDENCE)
 
 
-def _wrapped(value: Number) -> int:
+def _wrap_to_64_bits(value: Number) -> int:
     """Return an integer wrapped to 64 bits with a sign."""
     unsigned = int(value) & 0xFFFFFFFFFFFFFFFF
     return unsigned - (1 << 64) if unsigned >> 63 else unsigned
 
 
-def _divided(left: Number, right: Number) -> Number:
+def _divide(left: Number, right: Number) -> Number:
     # integers are divided towards zero, as in C
     if isinstance(left, int) and isinstance(right, int):
         quotient = abs(left) // abs(right)
@@ -107,7 +108,7 @@ def _power(left: Number, right: Number) -> Number:
     return float(power)
 
 
-def _rounded(value: Number, places: Number = 0) -> Number:
+def _round(value: Number, places: Number = 0) -> Number:
     scale = 10.0 ** max(-15, min(int(places), 15))
     return math.copysign(math.floor(abs(value) * scale + 0.5) / scale, value)
 
@@ -128,7 +129,7 @@ _BINARY: Final[Mapping[str, Callable[[Number, Number], Number]]] = {
     "+": operator.add,
     "-": operator.sub,
     "*": operator.mul,
-    "/": _divided,
+    "/": _divide,
     "%": _remainder,
     "**": _power,
 }
@@ -152,7 +153,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
     "LG": (1, math.log10),
     "LN": (1, math.log),
     "NEG": (1, operator.neg),
-    "ROUND": (2, _rounded),
+    "ROUND": (2, _round),
     "SGN": (1, lambda value: (value > 0) - (value < 0)),
     "SIN": (1, math.sin),
     "SQRT": (1, math.sqrt),
@@ -180,10 +181,10 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, integral: bool) -
         MessageError: the formula is not valid, has an unknown name, or has no value: it divides by
             zero, a number exceeds its bounds, or the two readings give different values.
     """
-    tree, other = _parsed(formula)
-    value = _worked_out(formula, tree, variables, integral)
-    if other != tree:
-        second = _worked_out(formula, other, variables, integral)
+    tree, emva_tree = _parse_both_ways(formula)
+    value = _evaluate_tree(formula, tree, variables, integral)
+    if emva_tree != tree:
+        second = _evaluate_tree(formula, emva_tree, variables, integral)
         if second != value:
             raise MessageError(
                 f"formula {formula[:80]!r}: expected one value, got {value:g} in C's order of "
@@ -192,7 +193,7 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, integral: bool) -
     return value
 
 
-def _worked_out(
+def _evaluate_tree(
     formula: str, tree: Tree, variables: Mapping[str, Number], integral: bool
 ) -> Number:
     try:
@@ -214,32 +215,36 @@ def _value(tree: Tree, variables: Mapping[str, Number], integral: bool) -> Numbe
                 f"formula: unknown name {tree[:80]!r}; known are "
                 f"{', '.join([*variables][:MAX_NAMES_SHOWN]) or 'none'}"
             )
-        return _bounded(value, integral)
+        return _to_number_type(value, integral)
     if not isinstance(tree, tuple):
-        return _bounded(tree, integral)
-    sign, parts = tree
-    if sign == "?":
-        return _value(parts[1 if _value(parts[0], variables, integral) else 2], variables, integral)
-    first = _value(parts[0], variables, integral)
-    if sign in ("||", "&&"):
-        if bool(first) == (sign == "||"):
+        return _to_number_type(tree, integral)
+    symbol, operands = tree
+    if symbol == "?":
+        return _value(
+            operands[1 if _value(operands[0], variables, integral) else 2], variables, integral
+        )
+    first = _value(operands[0], variables, integral)
+    if symbol in ("||", "&&"):
+        if bool(first) == (symbol == "||"):
             return int(bool(first))
-        return int(bool(_value(parts[1], variables, integral)))
-    values = [first, *(_value(part, variables, integral) for part in parts[1:])]
-    if sign in _FUNCTIONS:
-        return _bounded(_FUNCTIONS[sign][1](*values), integral)
-    return _bounded(_UNARY[sign](*values) if len(values) == 1 else _BINARY[sign](*values), integral)
+        return int(bool(_value(operands[1], variables, integral)))
+    values = [first, *(_value(operand, variables, integral) for operand in operands[1:])]
+    if symbol in _FUNCTIONS:
+        return _to_number_type(_FUNCTIONS[symbol][1](*values), integral)
+    return _to_number_type(
+        _UNARY[symbol](*values) if len(values) == 1 else _BINARY[symbol](*values), integral
+    )
 
 
-def _bounded(value: Number, integral: bool) -> Number:
-    return _wrapped(value) if integral else float(value)
+def _to_number_type(value: Number, integral: bool) -> Number:
+    return _wrap_to_64_bits(value) if integral else float(value)
 
 
 @functools.lru_cache(maxsize=1024)
-def _parsed(formula: str) -> tuple[Tree, Tree]:
-    """Return the tree of a formula by C's precedence, and that by EMVA's GenApi."""
+def _parse_both_ways(formula: str) -> tuple[Tree, Tree]:
+    """Return two trees of a formula: by C's precedence, and as EMVA's GenApi reads it."""
     try:
-        return _FormulaParser(formula).parsed(), _EmvaParser(formula).parsed()
+        return _FormulaParser(formula).parse(), _EmvaParser(formula).parse()
     except RecursionError as exc:
         raise MessageError(f"formula {formula[:80]!r}: too many levels") from exc
 
@@ -247,7 +252,7 @@ def _parsed(formula: str) -> tuple[Tree, Tree]:
 class _FormulaParser:
     """Parser of formulas with C's precedence."""
 
-    strength = _OF_C
+    levels = _C_LEVELS
 
     def __init__(self, formula: str) -> None:
         if len(formula) > MAX_FORMULA_CHARACTERS:
@@ -255,70 +260,74 @@ class _FormulaParser:
                 f"formula: expected at most {MAX_FORMULA_CHARACTERS} characters, got {len(formula)}"
             )
         self._formula = formula
-        self._tokens = self._cut(formula)
-        self._at = self._depth = 0
+        self._tokens = self._tokenize(formula)
+        self._index = self._depth = 0
 
-    def parsed(self) -> Tree:
-        tree = self._choice()
-        if self._at < len(self._tokens):
+    def parse(self) -> Tree:
+        tree = self._conditional()
+        if self._index < len(self._tokens):
             raise self._syntax_error("an operator or the end")
         return tree
 
-    def _cut(self, formula: str) -> list[tuple[str, str]]:
-        tokens, at = [], 0
+    def _tokenize(self, formula: str) -> list[tuple[str, str]]:
+        tokens, index = [], 0
         end = len(formula.rstrip())
-        while at < end:
-            token = _TOKEN.match(formula, at)
+        while index < end:
+            token = _TOKEN.match(formula, index)
             if token is None:
-                raise MessageError(f"formula {formula[:80]!r}: unexpected {formula[at]!r} at {at}")
+                raise MessageError(
+                    f"formula {formula[:80]!r}: unexpected {formula[index]!r} at {index}"
+                )
             kind = str(token.lastgroup)
             tokens.append((kind, token[kind]))
-            at = token.end()
+            index = token.end()
         return tokens
 
     def _syntax_error(self, expected: str) -> MessageError:
-        actual = repr(self._tokens[self._at][1]) if self._at < len(self._tokens) else "its end"
+        actual = (
+            repr(self._tokens[self._index][1]) if self._index < len(self._tokens) else "its end"
+        )
         return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {actual}")
 
-    def _next(self, *signs: str) -> str | None:
-        """Consume one of these operators if it is next."""
-        if self._at < len(self._tokens):
-            kind, sign = self._tokens[self._at]
-            if kind == "operator" and sign in signs:
-                self._at += 1
-                return sign
+    def _accept(self, *symbols: str) -> str | None:
+        """Consume the next token if it is one of these operators; else return None."""
+        if self._index < len(self._tokens):
+            kind, symbol = self._tokens[self._index]
+            if kind == "operator" and symbol in symbols:
+                self._index += 1
+                return symbol
         return None
 
-    def _expect(self, sign: str) -> None:
-        if self._next(sign) is None:
-            raise self._syntax_error(repr(sign))
+    def _expect(self, symbol: str) -> None:
+        if self._accept(symbol) is None:
+            raise self._syntax_error(repr(symbol))
 
-    def _choice(self) -> Tree:
+    def _conditional(self) -> Tree:
         self._depth += 1
         if self._depth > MAX_LEVELS:
             raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
         tree = self._operation(0)
-        if self._next("?"):
-            first = self._choice()
+        if self._accept("?"):
+            first = self._conditional()
             self._expect(":")
-            tree = ("?", (tree, first, self._choice()))
+            tree = ("?", (tree, first, self._conditional()))
         self._depth -= 1
         return tree
 
     def _operation(self, level: int) -> Tree:
         tree = self._unary()
         depth = 0
-        while self._at < len(self._tokens):
-            kind, sign = self._tokens[self._at]
-            strength = self.strength.get(sign, -1) if kind == "operator" else -1
-            if strength < level:
+        while self._index < len(self._tokens):
+            kind, symbol = self._tokens[self._index]
+            own_level = self.levels.get(symbol, -1) if kind == "operator" else -1
+            if own_level < level:
                 break
             depth += 1
             if depth > MAX_LEVELS:
                 raise MessageError(f"formula: expected at most {MAX_LEVELS} operators in a row")
-            self._at += 1
+            self._index += 1
             self._depth += 1
-            tree = (sign, (tree, self._operation(strength + 1)))
+            tree = (symbol, (tree, self._operation(own_level + 1)))
             self._depth -= 1
         return tree
 
@@ -326,76 +335,76 @@ class _FormulaParser:
         self._depth += 1
         if self._depth > MAX_LEVELS:
             raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
-        sign = self._next("-", "+", "~", "!")
-        tree = (sign, (self._unary(),)) if sign else self._power()
+        symbol = self._accept("-", "+", "~", "!")
+        tree = (symbol, (self._unary(),)) if symbol else self._power()
         self._depth -= 1
         return tree
 
     def _power(self) -> Tree:
         tree = self._atom()
-        if self._next("**"):
+        if self._accept("**"):
             tree = ("**", (tree, self._unary()))
         return tree
 
     def _atom(self) -> Tree:
-        if self._next("("):
-            tree = self._choice()
+        if self._accept("("):
+            tree = self._conditional()
             self._expect(")")
             return tree
-        if self._at == len(self._tokens) or self._tokens[self._at][0] == "operator":
+        if self._index == len(self._tokens) or self._tokens[self._index][0] == "operator":
             raise self._syntax_error("a number, a name or '('")
-        kind, token = self._tokens[self._at]
-        self._at += 1
+        kind, token = self._tokens[self._index]
+        self._index += 1
         if kind == "hex":
             return int(token, 16)
         if kind == "number":
             return int(token) if token.isdigit() and len(token) <= 20 else float(token)
-        if token in _FUNCTIONS and self._next("("):
+        if token in _FUNCTIONS and self._accept("("):
             return self._call(token)
         return token
 
     def _call(self, name: str) -> Tree:
-        parts = [self._choice()]
-        while self._next(","):
-            parts.append(self._choice())
+        arguments = [self._conditional()]
+        while self._accept(","):
+            arguments.append(self._conditional())
         self._expect(")")
-        if len(parts) > _FUNCTIONS[name][0]:
-            raise MessageError(f"formula: {name} has {len(parts)} arguments")
-        return (name, tuple(parts))
+        if len(arguments) > _FUNCTIONS[name][0]:
+            raise MessageError(f"formula: {name} has {len(arguments)} arguments")
+        return (name, tuple(arguments))
 
 
 class _EmvaParser(_FormulaParser):
     """Parser of formulas that reads them like EMVA's GenApi.
 
-    A sign before a name or a number binds tighter than any operator. A minus before a parenthesis
-    or a function applies to everything after it, and is misread except at the start. In nested
-    choices the first condition decides.
+    A minus before a name or a number has a higher precedence than any operator. A minus before a
+    parenthesis or a function applies to everything after it, and is misread except at the start. In
+    nested conditionals the first condition decides.
     """
 
-    strength = _OF_EMVA
+    levels = _EMVA_LEVELS
 
-    def _choice(self) -> Tree:
+    def _conditional(self) -> Tree:
         self._depth += 1
         if self._depth > MAX_LEVELS:
             raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
         tree = self._operation(0)
         for _ in range(MAX_LEVELS):
-            if not self._next("?"):
+            if not self._accept("?"):
                 break
-            first = self._choice()
+            first = self._conditional()
             self._expect(":")
             tree = ("?", (tree, first, self._operation(0)))
         self._depth -= 1
         return tree
 
     def _unary(self) -> Tree:
-        at = self._at
-        before = self._tokens[at - 1][1] if at else "("
-        if before in _TIGHTER_THAN_NOT and self._next("~"):
+        index = self._index
+        before = self._tokens[index - 1][1] if index else "("
+        if before in _TIGHTER_THAN_NOT and self._accept("~"):
             raise self._misread_error(before, "~")
-        if self._next("-"):
-            if self._at < len(self._tokens) and self._is_whole(self._at):
-                if at:
+        if self._accept("-"):
+            if self._index < len(self._tokens) and self._starts_group(self._index):
+                if index:
                     raise self._misread_error(before, "-(")
                 self._depth += 1
                 if self._depth > MAX_LEVELS:
@@ -403,19 +412,19 @@ class _EmvaParser(_FormulaParser):
                 tree: Tree = ("-", (self._operation(0),))
                 self._depth -= 1
                 return tree
-            self._at = at
+            self._index = index
         return super()._unary()
 
-    def _misread_error(self, before: str, sign: str) -> MessageError:
+    def _misread_error(self, before: str, symbol: str) -> MessageError:
         return MessageError(
-            f"formula {self._formula[:80]!r}: expected a value after {before}, got {sign}, which "
+            f"formula {self._formula[:80]!r}: expected a value after {before}, got {symbol}, which "
             "EMVA's GenApi misreads there"
         )
 
-    def _is_whole(self, at: int) -> bool:
+    def _starts_group(self, index: int) -> bool:
         """Return True if a parenthesis or a function begins at a token."""
-        following = self._tokens[at + 1] if at + 1 < len(self._tokens) else ("", "")
-        return self._tokens[at][1] == "(" or following == ("operator", "(")
+        following = self._tokens[index + 1] if index + 1 < len(self._tokens) else ("", "")
+        return self._tokens[index][1] == "(" or following == ("operator", "(")
 
     def _power(self) -> Tree:
         return self._atom()

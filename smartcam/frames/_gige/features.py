@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeVar
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFeatureError, FrameSourceError, MessageError
-from smartcam.frames._features import Feature, spelled
+from smartcam.frames._features import Feature, spelling_key
 from smartcam.frames._gige.expressions import evaluate
 from smartcam.frames._gige.gvcp import text
 
@@ -37,16 +37,23 @@ which takes about a second. A node counts each time it is needed."""
 MAX_REGISTER_BYTES: Final = 4096
 """Largest size of a register, bytes."""
 
-_REGISTERS: Final = ("IntReg", "MaskedIntReg", "StructEntry")
-_KNIVES: Final = ("SwissKnife", "IntSwissKnife")
-_CONVERTERS: Final = ("Converter", "IntConverter")
-_HOLDERS: Final = ("Integer", "Float", "Boolean", "Enumeration", "String", "Command")
-_WHOLE: Final = ("Integer", "IntSwissKnife", "IntConverter", "Enumeration", "Boolean", *_REGISTERS)
-_TEXTS: Final = ("String", "StringReg")
+_REGISTER_NODES: Final = ("IntReg", "MaskedIntReg", "StructEntry")
+_FORMULA_NODES: Final = ("SwissKnife", "IntSwissKnife")
+_CONVERTER_NODES: Final = ("Converter", "IntConverter")
+_VALUE_NODES: Final = ("Integer", "Float", "Boolean", "Enumeration", "String", "Command")
+_INTEGER_NODES: Final = (
+    "Integer",
+    "IntSwissKnife",
+    "IntConverter",
+    "Enumeration",
+    "Boolean",
+    *_REGISTER_NODES,
+)
+_TEXT_NODES: Final = ("String", "StringReg")
 _KINDS: Final[Mapping[str, FeatureKind]] = {
-    **dict.fromkeys(("Integer", "IntSwissKnife", "IntConverter", *_REGISTERS), "integer"),
+    **dict.fromkeys(("Integer", "IntSwissKnife", "IntConverter", *_REGISTER_NODES), "integer"),
     **dict.fromkeys(("Float", "FloatReg", "SwissKnife", "Converter"), "float"),
-    **dict.fromkeys(_TEXTS, "string"),
+    **dict.fromkeys(_TEXT_NODES, "string"),
     "Boolean": "boolean",
     "Enumeration": "enumeration",
     "Command": "command",
@@ -60,7 +67,7 @@ T = TypeVar("T")
 
 
 class NoLimitError(MessageError):
-    """Error for a node whose limits the description does not give."""
+    """Error for a node without limits in the description."""
 
 
 class DeviceMemory(Protocol):
@@ -89,14 +96,14 @@ class GenicamFeatures:
     def __init__(self, nodes: Mapping[str, Element], port: DeviceMemory, source: str) -> None:
         self._nodes, self._port, self._source = nodes, port, source
         self._own_values: dict[str, FeatureValue] = {}  # values set for nodes with a <Value>
-        self._read: dict[tuple[str, int, int], bytes] = {}
-        self._steps = self._work = 0
-        self._writing: Callable[[], None] | None = None
+        self._register_cache: dict[tuple[str, int, int], bytes] = {}
+        self._visited_nodes = self._examined_elements = 0
+        self._before_write: Callable[[], None] | None = None
         self._lock = asyncio.Lock()  # guards the caches of a call
-        self._spellings = {spelled(name): name for name in nodes}
+        self._spellings = {spelling_key(name): name for name in nodes}
         self._selectors: dict[str, tuple[str, ...]] | None = None
 
-    def share(self, other: GenicamFeatures) -> None:
+    def share_description(self, other: GenicamFeatures) -> None:
         """Share the description and the set values of another object."""
         GenicamFeatures.__init__(self, other._nodes, other._port, other._source)
         self._own_values = other._own_values
@@ -117,7 +124,7 @@ class GenicamFeatures:
 
     def find(self, name: str) -> str:
         """Return the description's spelling of a name; an unknown name is returned unchanged."""
-        return name if name in self._nodes else self._spellings.get(spelled(name), name)
+        return name if name in self._nodes else self._spellings.get(spelling_key(name), name)
 
     async def get(self, name: str) -> FeatureValue:
         """Return a feature's value; for an enumeration, the entry's name.
@@ -127,7 +134,7 @@ class GenicamFeatures:
                 value.
         """
         async with self._lock:
-            node = await self._begin(name)
+            node = await self._available_node(name)
             try:
                 return await self._as_user_value(node)
             except MessageError as exc:
@@ -139,7 +146,7 @@ class GenicamFeatures:
             return None
         async with self._lock:
             try:
-                value = await self._get(await self._begin(name), 0)
+                value = await self._get_value(await self._available_node(name), 0)
             except (FrameSourceError, MessageError):
                 return None
         return None if isinstance(value, str) else value
@@ -151,49 +158,49 @@ class GenicamFeatures:
             FrameFeatureError: there is no such enumeration.
         """
         async with self._lock:
-            node = await self._begin(name)
+            node = await self._available_node(name)
             try:
                 return await self._entries_now(node)
             except MessageError as exc:
                 raise self._feature_error(name, str(exc)) from exc
 
     async def set(
-        self, name: str, value: FeatureValue, *, writing: Callable[[], None] | None = None
+        self, name: str, value: FeatureValue, *, before_write: Callable[[], None] | None = None
     ) -> None:
         """Set a feature; a command is executed, whatever the value.
 
         Args:
             name: name of the feature.
             value: value of the feature, or its text: an entry's name, ``true``, a number.
-            writing: function that is called right before the camera's register is written.
+            before_write: function that is called right before the camera's register is written.
 
         Raises:
             FrameFeatureError: there is no such feature, it cannot be set, or the value is out of
                 range.
         """
         async with self._lock:
-            node = await self._begin(name)
-            self._writing = writing
+            node = await self._available_node(name)
+            self._before_write = before_write
             try:
                 if await self._condition(node, "pIsLocked", False, 0):
                     raise self._feature_error(name, "it is locked now")
-                await self._set(node, await self._as_node_value(node, value), 0)
+                await self._set_value(node, await self._as_node_value(node, value), 0)
             except MessageError as exc:
                 raise self._feature_error(name, str(exc)) from exc
             finally:
-                self._writing = None
+                self._before_write = None
 
-    async def execute(self, name: str, *, writing: Callable[[], None] | None = None) -> None:
+    async def execute(self, name: str, *, before_write: Callable[[], None] | None = None) -> None:
         """Start a command; the camera may still be executing it afterwards.
 
         Args:
             name: name of the command.
-            writing: function that is called right before the camera's register is written.
+            before_write: function that is called right before the camera's register is written.
 
         Raises:
             FrameFeatureError: there is no command of that name, or the camera refuses.
         """
-        await self.set(name, 1, writing=writing)
+        await self.set(name, 1, before_write=before_write)
 
     def check_command(self, name: str, *, expected: bool = True) -> None:
         """Raise unless a name belongs to a command; with ``expected`` False, raise if it does.
@@ -201,7 +208,7 @@ class GenicamFeatures:
         Raises:
             FrameSourceError: the feature is no command, or there is no such feature.
         """
-        node = self._named(name)
+        node = self._find_node(name)
         if (node.kind == "Command") != expected:
             is_not = "a command: it is executed" if not expected else "no command: it is set"
             raise self._feature_error(node.name, f"it is {is_not}")
@@ -215,9 +222,9 @@ class GenicamFeatures:
             FrameSourceError: the camera does not answer.
         """
         async with self._lock:
-            node = await self._begin(name)
+            node = await self._available_node(name)
             try:
-                command = await self._field(node, "CommandValue", 0, 1)
+                command = await self._number_field(node, "CommandValue", 0, 1)
                 return await self._get_own_value(node, 0) != command
             except MessageError:
                 return True
@@ -229,8 +236,8 @@ class GenicamFeatures:
             FrameFeatureError: there is no feature of that name, or the camera does not answer.
         """
         async with self._lock:
-            node = self._named(name)
-            return await self._described(node)
+            node = self._find_node(name)
+            return await self._describe_node(node)
 
     # helpers
 
@@ -245,9 +252,9 @@ class GenicamFeatures:
             f"{self._source}: feature {name}: {text}", source=self._source, available=available
         )
 
-    def _named(self, name: str) -> Element:
-        self._steps = self._work = 0
-        self._read.clear()
+    def _find_node(self, name: str) -> Element:
+        self._visited_nodes = self._examined_elements = 0
+        self._register_cache.clear()
         node = self._nodes.get(self.find(name))
         if node is None or node.kind in ("Category", "Port"):
             names = self.names()
@@ -259,8 +266,8 @@ class GenicamFeatures:
             )
         return node
 
-    async def _begin(self, name: str) -> Element:
-        node = self._named(name)
+    async def _available_node(self, name: str) -> Element:
+        node = self._find_node(name)
         try:
             available = await self._is_available(node, 0)
         except MessageError as exc:
@@ -275,7 +282,7 @@ class GenicamFeatures:
 
     async def _condition(self, node: Element, kind: str, default: bool, depth: int) -> bool:
         child = node.first(kind)
-        return default if child is None else bool(await self._numbered(child.text, depth + 1))
+        return default if child is None else bool(await self._node_number(child.text, depth + 1))
 
     async def _entries_now(self, node: Element) -> dict[str, int]:
         return {
@@ -286,24 +293,24 @@ class GenicamFeatures:
 
     async def _as_user_value(self, node: Element) -> FeatureValue:
         """Return a node's value in the user's form."""
-        value = await self._get(node, 0)
+        value = await self._get_value(node, 0)
         if node.kind == "Enumeration":
             return next((name for name, entry in _entries(node).items() if entry == value), value)
         if node.kind == "Boolean":
-            return value == _on(node)
+            return value == _on_value(node)
         return value
 
     async def _as_node_value(self, node: Element, value: FeatureValue) -> FeatureValue:
         """Convert a user's value to the node's form; raise if the node cannot have it."""
         if node.kind == "Command":
-            return int(await self._field(node, "CommandValue", 0, 1))
-        if node.kind in _TEXTS:
+            return int(await self._number_field(node, "CommandValue", 0, 1))
+        if node.kind in _TEXT_NODES:
             return str(value)
         if node.kind == "Boolean":
             text = str(value).lower()
             if text not in ("0", "1", "true", "false", "on", "off"):
                 raise self._feature_error(node.name, f"expected true or false, got {value!r}")
-            return _on(node) if text in ("1", "true", "on") else _off(node)
+            return _on_value(node) if text in ("1", "true", "on") else _off_value(node)
         if node.kind == "Enumeration":
             entries = await self._entries_now(node)
             if str(value) not in entries:
@@ -315,15 +322,15 @@ class GenicamFeatures:
                 )
             return entries[str(value)]
         number = _number(str(value)) if isinstance(value, str) else value
-        if node.kind in _WHOLE and number != int(number):
+        if node.kind in _INTEGER_NODES and number != int(number):
             raise self._feature_error(node.name, f"expected a whole number, got {value!r}")
-        await self._within(node, number)
+        await self._check_range(node, number)
         return number
 
-    async def _within(self, node: Element, number: float) -> None:
-        least = await self._field(node, "Min", 0, -math.inf)
-        most = await self._field(node, "Max", 0, math.inf)
-        step = await self._field(node, "Inc", 0, 0) if node.kind == "Integer" else 0
+    async def _check_range(self, node: Element, number: float) -> None:
+        least = await self._number_field(node, "Min", 0, -math.inf)
+        most = await self._number_field(node, "Max", 0, math.inf)
+        step = await self._number_field(node, "Inc", 0, 0) if node.kind == "Integer" else 0
         wrong_step = step > 1 and math.isfinite(least) and (number - least) % step
         if not least <= number <= most or wrong_step:
             steps = f" in steps of {step:g}" if step > 1 else ""
@@ -335,17 +342,17 @@ class GenicamFeatures:
 
     # values
 
-    async def _numbered(self, name: str, depth: int) -> int | float:
+    async def _node_number(self, name: str, depth: int) -> int | float:
         """Return the number of a named node."""
         node = self._nodes.get(name)
         if node is None:
             raise MessageError(f"the description has no node {name[:80]!r}")
-        value = await self._get(node, depth)
+        value = await self._get_value(node, depth)
         if isinstance(value, str):
             raise MessageError(f"node {name}: expected a number, got text")
         return value
 
-    async def _field(
+    async def _number_field(
         self, node: Element, kind: str, depth: int, default: float | None = None
     ) -> int | float:
         """Return the number in ``<kind>``, or of the node named in ``<pKind>``."""
@@ -353,40 +360,40 @@ class GenicamFeatures:
             if child.kind == kind:
                 return _number(child.text)
             if child.kind == "p" + kind:
-                return await self._numbered(child.text, depth + 1)
+                return await self._node_number(child.text, depth + 1)
         if default is None:
             raise MessageError(f"{node.kind} {node.name}: it has no <{kind}>")
         return default
 
-    def _step(self, node: Element, depth: int) -> None:
+    def _count_node(self, node: Element, depth: int) -> None:
         """Count a visited node; raise MessageError beyond the limits of depth and number."""
-        self._steps += 1
-        if depth > MAX_LINKED_NODES or self._steps > MAX_NODES_VISITED:
+        self._visited_nodes += 1
+        if depth > MAX_LINKED_NODES or self._visited_nodes > MAX_NODES_VISITED:
             raise MessageError(f"node {node.name}: its description goes in a circle")
-        self._spend(node, len(node.children))
+        self._count_elements(node, len(node.children))
 
-    def _spend(self, node: Element, work: int) -> None:
+    def _count_elements(self, node: Element, work: int) -> None:
         """Count examined elements or characters; raise MessageError beyond the limit."""
-        self._work += work
-        if self._work > MAX_ELEMENTS_VISITED:
+        self._examined_elements += work
+        if self._examined_elements > MAX_ELEMENTS_VISITED:
             raise MessageError(
                 f"node {node.name}: expected at most {MAX_ELEMENTS_VISITED} elements and "
                 "characters of formulas for one value, got more"
             )
 
-    async def _get(self, node: Element, depth: int) -> FeatureValue:
-        self._step(node, depth)
+    async def _get_value(self, node: Element, depth: int) -> FeatureValue:
+        self._count_node(node, depth)
         if "WO" in _access(node):
             raise MessageError(f"{node.kind} {node.name} can only be written")
-        if node.kind in _KNIVES:
+        if node.kind in _FORMULA_NODES:
             formula = node.text_of("Formula")
-            return await self._worked_out(node, formula, {}, depth)
-        if node.kind in _CONVERTERS:
-            raw = await self._field(node, "Value", depth)
-            return await self._worked_out(node, node.text_of("FormulaFrom"), {"TO": raw}, depth)
-        if node.kind in _HOLDERS:
+            return await self._evaluate(node, formula, {}, depth)
+        if node.kind in _CONVERTER_NODES:
+            raw = await self._number_field(node, "Value", depth)
+            return await self._evaluate(node, node.text_of("FormulaFrom"), {"TO": raw}, depth)
+        if node.kind in _VALUE_NODES:
             return await self._get_own_value(node, depth)
-        data = await self._bytes(node, *await self._place(node, depth))
+        data = await self._read_register(node, *await self._register_location(node, depth))
         if node.kind == "StringReg":
             return text(data)
         if node.kind == "FloatReg":
@@ -396,10 +403,10 @@ class GenicamFeatures:
     async def _get_own_value(self, node: Element, depth: int) -> FeatureValue:
         if node.name in self._own_values:
             return self._own_values[node.name]
-        target = await self._target(node, depth)
+        target = await self._value_node(node, depth)
         if target is not None:
-            value = await self._get(target, depth + 1)
-            if node.kind == "Integer" and target.kind not in (*_WHOLE, "Command"):
+            value = await self._get_value(target, depth + 1)
+            if node.kind == "Integer" and target.kind not in (*_INTEGER_NODES, "Command"):
                 raise MessageError(
                     f"Integer {node.name}: expected a node of whole numbers as its pValue, got the "
                     f"{target.kind} {target.name}"
@@ -409,35 +416,35 @@ class GenicamFeatures:
         elif node.first("pIndex") is not None:
             value = await self._indexed(node, depth)
         else:
-            value = await self._field(node, "Value", depth)
-        if node.kind in _WHOLE and isinstance(value, float):
+            value = await self._number_field(node, "Value", depth)
+        if node.kind in _INTEGER_NODES and isinstance(value, float):
             return int(value)
         return value
 
     async def _indexed(self, node: Element, depth: int) -> int | float:
-        """Return the description's number for the value of an index."""
-        wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
+        """Return the number that the description gives for the present value of an index."""
+        index_value = await self._node_number(node.text_of("pIndex"), depth + 1)
         for child in node.all("ValueIndexed"):
-            if _number(child.attributes.get("Index", "-1")) == wanted:
+            if _number(child.attributes.get("Index", "-1")) == index_value:
                 return _number(child.text)
-        return await self._field(node, "ValueDefault", depth)
+        return await self._number_field(node, "ValueDefault", depth)
 
-    async def _target(self, node: Element, depth: int) -> Element | None:
-        """Return the node that holds a node's value; None: the node itself."""
+    async def _value_node(self, node: Element, depth: int) -> Element | None:
+        """Return the other node that holds a node's value; None: the node holds it itself."""
         element = node.first("pValue")
         index = node.first("pIndex")
         if index is not None and node.kind in ("Integer", "Float"):
-            wanted = await self._numbered(index.text, depth + 1)
+            index_value = await self._node_number(index.text, depth + 1)
             for child in node.all("pValueIndexed"):
-                if _number(child.attributes.get("Index", "-1")) == wanted:
+                if _number(child.attributes.get("Index", "-1")) == index_value:
                     element = child
                     break
             else:
-                chosen = wanted in [
+                has_value = index_value in [
                     _number(child.attributes.get("Index", "-1"))
                     for child in node.all("ValueIndexed")
                 ]
-                element = None if chosen else node.first("pValueDefault") or element
+                element = None if has_value else node.first("pValueDefault") or element
         if element is None:
             return None
         target = self._nodes.get(element.text)
@@ -445,19 +452,19 @@ class GenicamFeatures:
             raise MessageError(f"{node.kind} {node.name}: there is no node {element.text[:80]!r}")
         return target
 
-    async def _worked_out(
+    async def _evaluate(
         self, node: Element, formula: str, variables: dict[str, int | float], depth: int
     ) -> int | float:
         """Evaluate a formula with the node's variables."""
         integral = node.kind.startswith("Int")
-        self._spend(node, len(formula))
+        self._count_elements(node, len(formula))
         for child in node.children:
             if child.kind == "pVariable":
                 variables[child.name] = await self._variable(child, depth)
             elif child.kind == "Constant":
                 variables[child.name] = _number(child.text)
             elif child.kind == "Expression":
-                self._spend(node, len(child.text))
+                self._count_elements(node, len(child.text))
                 variables[child.name] = evaluate(child.text, variables, integral=integral)
         return evaluate(formula, variables, integral=integral)
 
@@ -465,7 +472,7 @@ class GenicamFeatures:
         """Return the value of a formula's variable: of its node, or of the node's ``.NAME``."""
         _, _, property_ = variable.name.partition(".")
         if property_ in ("", "Value"):
-            return await self._numbered(variable.text, depth + 1)
+            return await self._node_number(variable.text, depth + 1)
         node = self._nodes.get(variable.text)
         if node is None:
             raise MessageError(f"the description has no node {variable.text[:80]!r}")
@@ -491,66 +498,66 @@ class GenicamFeatures:
         A node without limits has the limits of the node that holds its value; without these, they
         follow from its bits (GenApi 2.0, 2.8.4 and 2.8.6).
         """
-        self._step(node, depth)
+        self._count_node(node, depth)
         if node.first(bound, "p" + bound) is not None:
-            return await self._field(node, bound, depth)
+            return await self._number_field(node, bound, depth)
         has_own_value = node.kind in ("Integer", "Float", "Enumeration")
-        target = await self._target(node, depth) if has_own_value else None
+        target = await self._value_node(node, depth) if has_own_value else None
         if target is not None:
             return await self._limit(target, bound, depth + 1)
-        if bound == "Inc" and node.kind in _WHOLE:
+        if bound == "Inc" and node.kind in _INTEGER_NODES:
             return 1
         if node.kind in ("Float", "FloatReg") and bound != "Inc":
             return -sys.float_info.max if bound == "Min" else sys.float_info.max
         if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and bound != "Inc":
             return -(1 << 63) if bound == "Min" else (1 << 63) - 1
-        if node.kind in _REGISTERS and bound != "Inc":
-            _, length = await self._place(node, depth)
-            _, bits = _span(node, length)
-            signed = int(_signed(node))
-            return -(1 << bits - 1) * signed if bound == "Min" else (1 << bits - signed) - 1
+        if node.kind in _REGISTER_NODES and bound != "Inc":
+            _, length = await self._register_location(node, depth)
+            _, bits = _bit_range(node, length)
+            sign_bits = int(_is_signed(node))
+            return -(1 << bits - 1) * sign_bits if bound == "Min" else (1 << bits - sign_bits) - 1
         raise NoLimitError(f"{node.kind} {node.name}: it has no <{bound}>")
 
-    async def _set(self, node: Element, value: FeatureValue, depth: int) -> None:
-        self._step(node, depth)
-        if node.kind in _KNIVES or "RO" in _access(node):
+    async def _set_value(self, node: Element, value: FeatureValue, depth: int) -> None:
+        self._count_node(node, depth)
+        if node.kind in _FORMULA_NODES or "RO" in _access(node):
             raise MessageError(f"{node.kind} {node.name} can only be read")
-        if node.kind in _CONVERTERS:
+        if node.kind in _CONVERTER_NODES:
             if isinstance(value, str):
                 raise MessageError(f"{node.kind} {node.name}: expected a number, got text")
             formula = node.text_of("FormulaTo")
-            value = await self._worked_out(node, formula, {"FROM": value}, depth)
-        elif node.kind not in _HOLDERS:
-            await self._write(node, value, depth)
+            value = await self._evaluate(node, formula, {"FROM": value}, depth)
+        elif node.kind not in _VALUE_NODES:
+            await self._write_register(node, value, depth)
             return
-        target = await self._target(node, depth)
+        target = await self._value_node(node, depth)
         if target is None:
             self._own_values[node.name] = value
             return
-        if target.kind in _WHOLE and isinstance(value, float):
+        if target.kind in _INTEGER_NODES and isinstance(value, float):
             value = round(value)
         if depth and target.kind in ("Integer", "Float") and not isinstance(value, str):
-            await self._within(target, value)
-        await self._set(target, value, depth + 1)
+            await self._check_range(target, value)
+        await self._set_value(target, value, depth + 1)
         for copy in node.all("pValueCopy"):
             other = self._nodes.get(copy.text)
             if other is None:
                 raise MessageError(f"{node.kind} {node.name}: there is no node {copy.text[:80]!r}")
-            await self._set(other, value, depth + 1)
+            await self._set_value(other, value, depth + 1)
 
     # descriptions
 
-    async def _described(self, node: Element) -> Feature:
+    async def _describe_node(self, node: Element) -> Feature:
         kind = _KINDS.get(node.kind)
         if kind is None:
             raise self._feature_error(node.name, f"a {node.kind} cannot be read or set")
-        more = node.text_of("Description") or node.text_of("ToolTip")
+        description = node.text_of("Description") or node.text_of("ToolTip")
         basis = Feature(
             node.name,
             kind,
             "",
-            selectors=self._selected_by(node.name),
-            description=" ".join(more.split())[:MAX_DESCRIPTION_CHARACTERS],
+            selectors=self._selectors_of(node.name),
+            description=" ".join(description.split())[:MAX_DESCRIPTION_CHARACTERS],
         )
         problems: list[str] = []
         try:
@@ -559,25 +566,29 @@ class GenicamFeatures:
                 return basis
         except MessageError as exc:
             return replace(basis, problem=str(exc))
-        parts: dict[str, Any] = {"access": access, "unit": await self._unit(node, problems)}
+        attributes: dict[str, Any] = {"access": access, "unit": await self._unit(node, problems)}
         if kind == "enumeration":
-            parts["entries"] = tuple(await self._noted(self._entries_now(node), problems) or ())
+            attributes["entries"] = tuple(
+                await self._result_or_problem(self._entries_now(node), problems) or ()
+            )
         elif kind in ("integer", "float"):
-            for part, bound in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
+            for attribute, bound in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
                 if bound == "Inc" and kind == "float":
                     continue
-                limit = await self._noted(self._limit(node, bound, 0), problems)
-                endless = limit is None or abs(limit) >= (
+                limit = await self._result_or_problem(self._limit(node, bound, 0), problems)
+                is_unlimited = limit is None or abs(limit) >= (
                     sys.float_info.max if kind == "float" else (1 << 63) - 1
                 )
-                parts[part] = None if endless else limit
+                attributes[attribute] = None if is_unlimited else limit
         if kind != "command" and access != "wo":
-            parts["value"] = await self._noted(self._as_user_value(node), problems)
-        return replace(basis, **parts, problem="; ".join(dict.fromkeys(problems)))
+            attributes["value"] = await self._result_or_problem(self._as_user_value(node), problems)
+        return replace(basis, **attributes, problem="; ".join(dict.fromkeys(problems)))
 
-    async def _noted(self, work: Coroutine[Any, Any, T], problems: list[str]) -> T | None:
-        """Return the result of ``work``; if it fails, note the problem and return None."""
-        self._steps = self._work = 0
+    async def _result_or_problem(
+        self, work: Coroutine[Any, Any, T], problems: list[str]
+    ) -> T | None:
+        """Return the result of ``work``; if it fails, add the problem to the list, return None."""
+        self._visited_nodes = self._examined_elements = 0
         try:
             return await work
         except NoLimitError:
@@ -596,10 +607,10 @@ class GenicamFeatures:
         for depth in range(MAX_LINKED_NODES):
             modes = _access(node)
             readable = readable and "WO" not in modes
-            writable = writable and "RO" not in modes and node.kind not in _KNIVES
+            writable = writable and "RO" not in modes and node.kind not in _FORMULA_NODES
             target = None
-            if node.kind in (*_HOLDERS, *_CONVERTERS):
-                target = await self._target(node, depth)
+            if node.kind in (*_VALUE_NODES, *_CONVERTER_NODES):
+                target = await self._value_node(node, depth)
             if target is None:
                 break
             node = target
@@ -614,14 +625,14 @@ class GenicamFeatures:
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
-            target = await self._noted(self._target(node, depth), problems)
+            target = await self._result_or_problem(self._value_node(node, depth), problems)
             if target is None:
                 return ""
             node = target
         return ""
 
-    def _selected_by(self, name: str) -> tuple[str, ...]:
-        """Return the features that select the instance of a feature."""
+    def _selectors_of(self, name: str) -> tuple[str, ...]:
+        """Return the features that select which instance of a feature is meant."""
         if self._selectors is None:
             selectors: dict[str, list[str]] = {}
             for node in self._nodes.values():
@@ -632,11 +643,11 @@ class GenicamFeatures:
 
     # registers
 
-    async def _place(self, node: Element, depth: int) -> tuple[int, int]:
+    async def _register_location(self, node: Element, depth: int) -> tuple[int, int]:
         """Return a register's address and its length."""
         if node.first("pPort") is None:
             raise MessageError(f"{node.kind} {node.name} is no register of the camera")
-        length = int(await self._field(node, "Length", depth, 4))
+        length = int(await self._number_field(node, "Length", depth, 4))
         if not 0 < length <= MAX_REGISTER_BYTES:
             raise MessageError(f"{node.kind} {node.name}: impossible length {length}")
         address = 0
@@ -644,22 +655,22 @@ class GenicamFeatures:
             if child.kind == "Address":
                 address += _integer(child.text)
             elif child.kind == "pAddress":
-                address += int(await self._numbered(child.text, depth + 1))
+                address += int(await self._node_number(child.text, depth + 1))
             elif child.kind == "IntSwissKnife":
-                address += int(await self._get(child, depth + 1))
+                address += int(await self._get_value(child, depth + 1))
             elif child.kind == "pIndex":
-                address += await self._index(child, length, depth)
+                address += await self._index_offset(child, length, depth)
         if not 0 <= address <= 0xFFFFFFFF - length:
             raise MessageError(f"{node.kind} {node.name}: impossible address {address:#x}")
         return address, length
 
-    async def _index(self, index: Element, length: int, depth: int) -> int:
+    async def _index_offset(self, index: Element, length: int, depth: int) -> int:
         offset: int | float = length
         if "Offset" in index.attributes:
             offset = _integer(index.attributes["Offset"])
         elif "pOffset" in index.attributes:
-            offset = await self._numbered(index.attributes["pOffset"], depth + 1)
-        return int(offset * await self._numbered(index.text, depth + 1))
+            offset = await self._node_number(index.attributes["pOffset"], depth + 1)
+        return int(offset * await self._node_number(index.text, depth + 1))
 
     def _memory(self, node: Element) -> DeviceMemory:
         """Return the memory of a register."""
@@ -670,15 +681,15 @@ class GenicamFeatures:
             raise MessageError(f"{node.name} is sent with an event only")
         return self._port
 
-    async def _bytes(self, node: Element, address: int, length: int) -> bytes:
+    async def _read_register(self, node: Element, address: int, length: int) -> bytes:
         """Read a register, at most once per public call."""
         key = node.text_of("pPort"), address, length
-        if key not in self._read:
-            self._read[key] = await self._memory(node).read(address, length)
-        return self._read[key]
+        if key not in self._register_cache:
+            self._register_cache[key] = await self._memory(node).read(address, length)
+        return self._register_cache[key]
 
-    async def _write(self, node: Element, value: FeatureValue, depth: int) -> None:
-        address, length = await self._place(node, depth)
+    async def _write_register(self, node: Element, value: FeatureValue, depth: int) -> None:
+        address, length = await self._register_location(node, depth)
         if node.kind == "StringReg":
             data = str(value).encode()
             if len(data) > length:
@@ -690,20 +701,20 @@ class GenicamFeatures:
             data = struct.pack(_float_format(node, length), value)
         else:
             number = round(value)
-            shift, bits = _span(node, length)
-            least = -(1 << bits - 1) if _signed(node) else 0
+            shift, bits = _bit_range(node, length)
+            least = -(1 << bits - 1) if _is_signed(node) else 0
             if not least <= number < least + (1 << bits):
                 raise MessageError(f"{number} does not fit into {bits} bits")
-            order = _order(node)
+            order = _byte_order(node)
             if bits < 8 * length:
-                before = int.from_bytes(await self._bytes(node, address, length), order)
+                old = int.from_bytes(await self._read_register(node, address, length), order)
                 mask = (1 << bits) - 1 << shift
-                number = before & ~mask | number << shift & mask
+                number = old & ~mask | number << shift & mask
             data = (number & (1 << 8 * length) - 1).to_bytes(length, order)
         memory = self._memory(node)
-        self._read.clear()
-        if self._writing is not None:
-            self._writing()
+        self._register_cache.clear()
+        if self._before_write is not None:
+            self._before_write()
         await memory.write(address, data)
 
 
@@ -741,24 +752,24 @@ def _access(node: Element) -> tuple[str, str]:
     return node.text_of("AccessMode"), node.text_of("ImposedAccessMode")
 
 
-def _on(node: Element) -> int:
+def _on_value(node: Element) -> int:
     return _integer(node.text_of("OnValue", "1"))
 
 
-def _off(node: Element) -> int:
+def _off_value(node: Element) -> int:
     return _integer(node.text_of("OffValue", "0"))
 
 
-def _signed(node: Element) -> bool:
+def _is_signed(node: Element) -> bool:
     return node.text_of("Sign") == "Signed"
 
 
-def _order(node: Element) -> Literal["big", "little"]:
+def _byte_order(node: Element) -> Literal["big", "little"]:
     return "big" if node.text_of("Endianess") == "BigEndian" else "little"
 
 
-def _span(node: Element, length: int) -> tuple[int, int]:
-    """Return the position of the lowest bit of a node, and the number of its bits."""
+def _bit_range(node: Element, length: int) -> tuple[int, int]:
+    """Return the position of a node's lowest bit in its register, and its number of bits."""
     if node.kind == "IntReg":
         return 0, 8 * length
     bit = node.text_of("Bit")
@@ -766,22 +777,22 @@ def _span(node: Element, length: int) -> tuple[int, int]:
     low, high = min(ends), max(ends)
     if not 0 <= low <= high < 8 * length:
         raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")
-    if _order(node) == "big":  # bit 0 is the highest bit
+    if _byte_order(node) == "big":  # bit 0 is the highest bit
         low = 8 * length - 1 - high
     return low, abs(ends[1] - ends[0]) + 1
 
 
 def _bits(node: Element, data: bytes) -> int:
-    shift, bits = _span(node, len(data))
-    value = int.from_bytes(data, _order(node)) >> shift & (1 << bits) - 1
-    return value - (1 << bits) if _signed(node) and value >> bits - 1 else value
+    shift, bits = _bit_range(node, len(data))
+    value = int.from_bytes(data, _byte_order(node)) >> shift & (1 << bits) - 1
+    return value - (1 << bits) if _is_signed(node) and value >> bits - 1 else value
 
 
 def _float_format(node: Element, length: int) -> str:
     kinds = {4: "f", 8: "d"}
     if length not in kinds:
         raise MessageError(f"FloatReg {node.name}: expected 4 or 8 bytes, got {length}")
-    return (">" if _order(node) == "big" else "<") + kinds[length]
+    return (">" if _byte_order(node) == "big" else "<") + kinds[length]
 
 
 def _float(node: Element, data: bytes) -> float:

@@ -32,7 +32,7 @@ from smartcam.frames._gige.gvcp import (
     encode,
     status_text,
 )
-from smartcam.frames._gige.places import found
+from smartcam.frames._gige.places import as_source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,7 +60,7 @@ async def force_address(
     places: Sequence[Network] | None = None,
     port: int = PORT,
 ) -> FoundSource:
-    """Set a camera's IP address until it is switched off; return the camera as then found.
+    """Set a camera's IP address until it is switched off; return the camera at its new address.
 
     Args:
         mac: hardware address of the camera, ``00:11:22:33:44:55``.
@@ -76,26 +76,26 @@ async def force_address(
 
     Cancellation: the camera may have the new address.
     """
-    wanted = checked_mac(mac)
+    checked = checked_mac(mac)
     interface = _interface(address)
-    way_out = _ip(gateway, "gateway")
+    gateway_address = _ip(gateway, "gateway")
     interfaces = networks() if places is None else places
     cameras = await find(interfaces, port=port)
-    camera = _of_mac(cameras, wanted)
-    taken = [other for other in cameras if other.info.address == str(interface.ip)]
-    if taken and taken[0].info.mac != wanted:
+    camera = _camera_with_mac(cameras, checked)
+    holders = [other for other in cameras if other.info.address == str(interface.ip)]
+    if holders and holders[0].info.mac != checked:
         raise ConfigurationError(
-            f"address: {interface.ip} is the address of {taken[0].info.label} "
-            f"({taken[0].info.mac}) already"
+            f"address: {interface.ip} is the address of {holders[0].info.label} "
+            f"({holders[0].info.mac}) already"
         )
     payload = _REQUEST.pack(
-        bytes.fromhex(wanted.replace(":", "")),
+        bytes.fromhex(checked.replace(":", "")),
         interface.ip.packed,
         interface.netmask.packed,
-        way_out.packed,
+        gateway_address.packed,
     )
-    await _sent(payload, interfaces, port, camera)
-    return await _appeared(wanted, str(interface.ip), interfaces, port)
+    await _send_request(payload, interfaces, port, camera)
+    return await _wait_for_camera(checked, str(interface.ip), interfaces, port)
 
 
 def checked_mac(mac: str) -> str:
@@ -139,7 +139,7 @@ def _ip(text: str, name: str) -> ipaddress.IPv4Address:
         raise ConfigurationError(f"{name}: expected an IPv4 address, got {given[:60]!r}") from exc
 
 
-def _of_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:
+def _camera_with_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:
     for camera in cameras:
         if camera.info.mac == mac:
             return camera
@@ -153,8 +153,8 @@ def _of_mac(cameras: list[AnsweringCamera], mac: str) -> AnsweringCamera:
     )
 
 
-async def _sent(
-    payload: bytes, places: Sequence[Network], port: int, camera: AnsweringCamera
+async def _send_request(
+    payload: bytes, interfaces: Sequence[Network], port: int, camera: AnsweringCamera
 ) -> None:
     """Broadcast the request in all networks until it is answered.
 
@@ -163,23 +163,23 @@ async def _sent(
         FrameTimeoutError: no answer came.
     """
     loop = asyncio.get_running_loop()
-    answered: asyncio.Future[int] = loop.create_future()
-    opened: list[tuple[asyncio.DatagramTransport, Network]] = []
+    status_future: asyncio.Future[int] = loop.create_future()
+    transports: list[tuple[asyncio.DatagramTransport, Network]] = []
     datagram = encode(GvcpCommand.FORCEIP, _REQUEST_ID, payload, flags=ACK_REQUIRED)
     try:
-        for place in places:
+        for interface in interfaces:
             with contextlib.suppress(OSError):  # an interface that is just going down
                 transport, _ = await loop.create_datagram_endpoint(
-                    functools.partial(_ForceAnswers, answered),
-                    local_addr=(place.address, 0),
+                    functools.partial(_ForceAnswers, status_future),
+                    local_addr=(interface.address, 0),
                     allow_broadcast=True,
                 )
-                opened.append((transport, place))
+                transports.append((transport, interface))
         for _ in range(MAX_ATTEMPTS):
-            for transport, place in opened:
-                for target in place.targets:
+            for transport, interface in transports:
+                for target in interface.targets:
                     transport.sendto(datagram, (target, port))
-            done, _ = await asyncio.wait([answered], timeout=ANSWER_TIMEOUT)
+            done, _ = await asyncio.wait([status_future], timeout=ANSWER_TIMEOUT)
             if done:
                 break
         else:
@@ -189,19 +189,21 @@ async def _sent(
                 "a camera controlled by another application does not answer"
             )
     finally:
-        for transport, _ in opened:
+        for transport, _ in transports:
             transport.close()
-    if status := answered.result():
+    if status := status_future.result():
         raise FrameSourceError(f"{camera.info.label}: FORCEIP: it answers {status_text(status)}")
 
 
-async def _appeared(mac: str, address: str, places: Sequence[Network], port: int) -> FoundSource:
+async def _wait_for_camera(
+    mac: str, address: str, interfaces: Sequence[Network], port: int
+) -> FoundSource:
     loop = asyncio.get_running_loop()
     end = loop.time() + APPEAR_TIMEOUT
     while True:
-        for camera in await find(places, port=port):
+        for camera in await find(interfaces, port=port):
             if camera.info.mac == mac and camera.info.address == address:
-                return found(camera._replace(address=address))
+                return as_source(camera._replace(address=address))
         if loop.time() >= end:
             raise FrameTimeoutError(
                 f"{mac}: it accepted the address {address}, but does not answer at it within "
@@ -210,8 +212,8 @@ async def _appeared(mac: str, address: str, places: Sequence[Network], port: int
 
 
 class _ForceAnswers(asyncio.DatagramProtocol):
-    def __init__(self, answered: asyncio.Future[int]) -> None:
-        self._answered = answered
+    def __init__(self, status_future: asyncio.Future[int]) -> None:
+        self._status_future = status_future
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         try:
@@ -219,8 +221,8 @@ class _ForceAnswers(asyncio.DatagramProtocol):
         except MessageError:
             return
         fits = ack.command == GvcpCommand.FORCEIP + 1 and ack.request_id == _REQUEST_ID
-        if fits and not self._answered.done():
-            self._answered.set_result(ack.status)
+        if fits and not self._status_future.done():
+            self._status_future.set_result(ack.status)
 
     def error_received(self, exc: Exception) -> None:
         """Ignore that no process listens at one of the targets."""

@@ -13,7 +13,7 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._codecs.threads import at_once
+from smartcam.frames._codecs.threads import run_without_waiting
 from smartcam.frames._gige.block import picture_bytes
 from smartcam.frames._gige.features import GenicamFeatures
 
@@ -32,9 +32,9 @@ MAX_MESSAGE_FEATURES: Final = 256
 """Largest number of features that are read from one message."""
 
 MAX_REFERENCES: Final = 32
-"""Largest number of nodes between a feature and the port of its message."""
+"""Largest number of nodes that are searched for the port of a feature's message."""
 
-_ENDING: Final = struct.Struct(">II")
+_CHUNK_TAIL: Final = struct.Struct(">II")
 _LEADS_TO_VALUE: Final = ("pValue", "pPort", "pVariable")
 
 
@@ -47,25 +47,25 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
     chunks: dict[int, memoryview] = {}
     end = len(payload)
     while end:
-        if end < _ENDING.size or len(chunks) >= MAX_CHUNKS:
+        if end < _CHUNK_TAIL.size or len(chunks) >= MAX_CHUNKS:
             raise MessageError(
                 f"chunk data: expected at most {MAX_CHUNKS} chunks that fill {len(payload)} bytes, "
                 f"{end} are left"
             )
-        number, length = _ENDING.unpack_from(payload, end - _ENDING.size)
-        begin = end - _ENDING.size - length
+        number, length = _CHUNK_TAIL.unpack_from(payload, end - _CHUNK_TAIL.size)
+        begin = end - _CHUNK_TAIL.size - length
         if begin < 0 or number in chunks:
             raise MessageError(
                 f"chunk data: chunk {number:#x} of {length} bytes, which is there "
                 f"{'twice' if number in chunks else f'before byte {end}'}"
             )
-        chunks[number] = payload[begin : end - _ENDING.size]
+        chunks[number] = payload[begin : end - _CHUNK_TAIL.size]
         end = begin
     return chunks
 
 
-def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
-    """Return the reason why a picture's size by the features may be wrong, or "".
+def doubt_about_size(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
+    """Return the reason why the size by the features may be wrong for a picture; "": it is right.
 
     Args:
         picture: picture with the size by the camera's features.
@@ -94,13 +94,13 @@ class MessageFeatures(GenicamFeatures):
     """
 
     def __init__(self, features: GenicamFeatures, kind: str) -> None:
-        self.share(features)
+        self.share_description(features)
         self._ports = _port_numbers(self._nodes, kind)
-        self._parts: Mapping[int, memoryview] = {}
+        self._message_parts: Mapping[int, memoryview] = {}
         self._by_number: dict[int, list[str]] = {}
         """Names of the features by the number of their port."""
         for name in features.names():
-            number = self._number_of(name)
+            number = self._message_number(name)
             if number is not None:
                 self._by_number.setdefault(number, []).append(name)
 
@@ -119,38 +119,38 @@ class MessageFeatures(GenicamFeatures):
         """
         values: dict[str, FeatureValue] = {}
         problems: list[str] = []
-        self._parts = parts
+        self._message_parts = parts
         try:
             names = [name for number in parts for name in self._by_number.get(number, ())]
             for name in names[:MAX_MESSAGE_FEATURES]:
                 try:
-                    values[name] = at_once(self._as_user_value(self._named(name)))
+                    values[name] = run_without_waiting(self._as_user_value(self._find_node(name)))
                 except (MessageError, RuntimeError) as exc:
                     problems.append(f"{name}: {exc}")
         finally:
-            self._parts = {}
+            self._message_parts = {}
         return values, problems
 
     def _memory(self, node: Element) -> DeviceMemory:
         number = self._ports.get(node.text_of("pPort"))
         if number is None:
             raise MessageError(f"{node.kind} {node.name} is a register of the camera")
-        if number not in self._parts:
+        if number not in self._message_parts:
             raise MessageError(f"{node.kind} {node.name}: its message {number:#x} did not come")
-        return _MessageBytes(self._parts[number])
+        return _MessageBytes(self._message_parts[number])
 
-    def _number_of(self, name: str) -> int | None:
-        """Return the number of the message with a feature's value."""
-        waiting, seen = [name], set[str]()
-        while waiting and len(seen) < MAX_REFERENCES:
-            reference = waiting.pop()
+    def _message_number(self, name: str) -> int | None:
+        """Return the number of the message that has a feature's value; None: no message has it."""
+        pending, seen = [name], set[str]()
+        while pending and len(seen) < MAX_REFERENCES:
+            reference = pending.pop()
             node = self._nodes.get(reference)
             if node is None or reference in seen:
                 continue
             seen.add(reference)
             if reference in self._ports:
                 return self._ports[reference]
-            waiting += [child.text for child in node.all(*_LEADS_TO_VALUE)]
+            pending += [child.text for child in node.all(*_LEADS_TO_VALUE)]
         return None
 
 

@@ -9,7 +9,7 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames._driver import FoundSource
 from smartcam.frames._gige.discovery import find, networks
 from smartcam.frames._gige.gvcp import PORT
-from smartcam.frames._gige.setup import FEATURE, PACKET_SIZES, WantedStream
+from smartcam.frames._gige.setup import FEATURE_PREFIX, PACKET_SIZES, WantedStream
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
@@ -34,26 +34,28 @@ def wanted(address: FrameAddress) -> WantedStream:
         ConfigurationError: a parameter is wrong; the text names the known ones.
     """
     names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
-    features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]
-    given = address.parameters([*_PARAMETERS, *features])
+    features = [
+        name for name in names if name.startswith(FEATURE_PREFIX) and name != FEATURE_PREFIX
+    ]
+    parameters = address.parameters([*_PARAMETERS, *features])
     if address.path not in ("", "/"):
         raise address.wrong("path", "gige://HOST", address.path)
-    if "serial" in given and address.host:
-        raise address.wrong("serial", "none beside an address", given["serial"])
-    resend = given.get("resend", "on")
+    if "serial" in parameters and address.host:
+        raise address.wrong("serial", "none together with an address", parameters["serial"])
+    resend = parameters.get("resend", "on")
     if resend not in ("on", "off"):
         raise address.wrong("resend", "on or off", resend)
-    packet_size = given.get("packet_size", "auto")
+    packet_size = parameters.get("packet_size", "auto")
     size = 0.0
     if packet_size != "auto":
         size = address.number("packet_size", packet_size, *PACKET_SIZES)
     return WantedStream(
-        given,
-        address.size(given["size"]) if "size" in given else None,
-        address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
+        parameters,
+        address.size(parameters["size"]) if "size" in parameters else None,
+        address.number("fps", parameters["fps"], 0.001, 100_000) if "fps" in parameters else None,
         int(size) & ~3,
         resend == "on",
-        given.get("trigger"),
+        parameters.get("trigger"),
     )
 
 
@@ -67,20 +69,20 @@ async def place(address: FrameAddress, stream: WantedStream) -> tuple[str, int]:
         return address.host, address.port or PORT
     serial = stream.parameters.get("serial")
     cameras = await find(networks())
-    fitting = [camera for camera in cameras if serial in (None, camera.info.serial)]
-    if len(fitting) != 1:
-        known = tuple(f"{found(camera).url} {camera.info.label}" for camera in cameras)
+    matching = [camera for camera in cameras if serial in (None, camera.info.serial)]
+    if len(matching) != 1:
+        known = tuple(f"{as_source(camera).url} {camera.info.label}" for camera in cameras)
         which = "" if serial is None else f" with the serial number {serial}"
         raise FrameSourceError(
-            f"{address.shown}: expected one camera{which}, found {len(fitting)}; there "
+            f"{address.shown}: expected one camera{which}, found {len(matching)}; there "
             f"are {', '.join(known) or 'none'}",
             source=address.shown,
             available=known,
         )
-    return fitting[0].address, PORT
+    return matching[0].address, PORT
 
 
-def found(camera: AnsweringCamera) -> FoundSource:
+def as_source(camera: AnsweringCamera) -> FoundSource:
     """Return the entry of a camera in a list of sources."""
     remark = ""
     if not camera.reachable:

@@ -53,7 +53,7 @@ class GigESession:
         self.on_lost: Callable[[FrameSourceError], None] = lambda _: None
         self.ticks_per_second = 0
         self.can_resend = False
-        self.streamed = False
+        self.has_streamed = False
         """Whether the camera has streamed before."""
         self.watches_exposures = False
         """Whether events about triggers are switched on."""
@@ -62,9 +62,9 @@ class GigESession:
         self.events = EventChannel(self)
         self._features: GenicamFeatures | None = None
         self._chunks: MessageFeatures | None = None
-        self._latches, self._latched = True, cast("int | None", None)
-        self._ours = False
-        self._heart: asyncio.Task[None] | None = None
+        self._can_latch, self._latched_ticks = True, cast("int | None", None)
+        self._has_control = False
+        self._heartbeat_task: asyncio.Task[None] | None = None
 
     @classmethod
     async def open(cls, host: str, port: int, label: str) -> GigESession:
@@ -78,7 +78,7 @@ class GigESession:
         session = cls(control, label)
         try:
             async with asyncio.timeout(OPEN_TIMEOUT):
-                await session._begin()
+                await session._set_up()
         except TimeoutError as exc:
             await session.close()
             if isinstance(exc, FrameSourceError):
@@ -116,20 +116,20 @@ class GigESession:
         Cancellation: the socket is closed nevertheless; control ends after the camera's heartbeat
         timeout.
         """
-        heart, self._heart = self._heart, None
-        ours, self._ours = self._ours, False
+        heartbeat_task, self._heartbeat_task = self._heartbeat_task, None
+        has_control, self._has_control = self._has_control, False
         try:
             await self.events.close()
-            if heart is not None:
-                heart.cancel()
-                await asyncio.wait([heart])
-            if ours and self.lost is None:
+            if heartbeat_task is not None:
+                heartbeat_task.cancel()
+                await asyncio.wait([heartbeat_task])
+            if has_control and self.lost is None:
                 with contextlib.suppress(FrameSourceError):
                     await self.control.write_register(Register.CONTROL_PRIVILEGE, 0)
         finally:
             self.control.close()
 
-    async def _begin(self) -> None:
+    async def _set_up(self) -> None:
         names = await self.control.read(Register.MANUFACTURER_NAME, 176)
         model, serial, user = text(names[32:64]), text(names[144:160]), text(names[160:176])
         self.label = user or " ".join(part for part in (model, serial) if part) or self.label
@@ -137,7 +137,7 @@ class GigESession:
         await self._take_control()
         timeout = await self.control.read_register(Register.HEARTBEAT_TIMEOUT) / 1e3
         timeout = min(max(timeout, HEARTBEAT_TIMEOUTS[0]), HEARTBEAT_TIMEOUTS[1])
-        self._heart = asyncio.create_task(
+        self._heartbeat_task = asyncio.create_task(
             heartbeat(self.control, timeout, self.label, self._on_lost),
             name=f"heartbeat of {self.label}",
         )
@@ -149,27 +149,27 @@ class GigESession:
             await read_description(self.control, self.label), self.control, self.label
         )
 
-    async def latched_clock(self) -> int | None:
-        """Return the camera's clock, ticks; None: it cannot be read.
+    async def read_clock(self) -> int | None:
+        """Return the reading of the camera's clock, ticks; None: the clock cannot be read.
 
-        A clock that stands still counts as unreadable: some cameras do not latch it.
+        A clock that stands still counts as unreadable: some cameras do not latch their clock.
 
         Raises:
             FrameSourceError: the camera does not answer.
         """
-        if not self.ticks_per_second or not self._latches:
+        if not self.ticks_per_second or not self._can_latch:
             return None
         try:
             await self.control.write_register(Register.TIMESTAMP_CONTROL, LATCH)
             high = await self.control.read_register(Register.LATCHED_TIMESTAMP_HIGH)
             low = await self.control.read_register(Register.LATCHED_TIMESTAMP_LOW)
         except RequestRefusedError:
-            self._latches = False
+            self._can_latch = False
             return None
-        before, self._latched = self._latched, high << 32 | low
-        if before is None:
-            return await self.latched_clock()
-        return self._latched if self._latched > before else None
+        previous, self._latched_ticks = self._latched_ticks, high << 32 | low
+        if previous is None:
+            return await self.read_clock()
+        return self._latched_ticks if self._latched_ticks > previous else None
 
     async def _register_or_0(self, address: int) -> int:
         """Return an optional register, 0 if the camera does not have it."""
@@ -181,7 +181,7 @@ class GigESession:
     def _on_lost(self, error: FrameSourceError) -> None:
         self.lost = error
         self.on_lost(error)
-        self.events.end(error)
+        self.events.end_watchers(error)
 
     async def _take_control(self) -> None:
         try:
@@ -190,13 +190,13 @@ class GigESession:
             if not await self._is_controlled_elsewhere(exc):
                 raise
             other = await self._register_or_0(Register.PRIMARY_APPLICATION_ADDRESS)
-            where = ".".join(str(part) for part in other.to_bytes(4, "big"))
+            other_address = ".".join(str(part) for part in other.to_bytes(4, "big"))
             raise FrameSourceError(
                 f"{self.label} is controlled by another application"
-                f"{f' at {where}' if other else ''}: it has to give the camera back first",
+                f"{f' at {other_address}' if other else ''}: it has to give the camera back first",
                 source=self.label,
             ) from exc
-        self._ours = True
+        self._has_control = True
 
     async def _is_controlled_elsewhere(self, error: FrameSourceError) -> bool:
         """Return True if taking control failed because another application has control.
@@ -217,7 +217,7 @@ async def read_description(control: ControlChannel, label: str) -> dict[str, Ele
     Raises:
         FrameSourceError: no URL leads to a description.
     """
-    tried = []
+    failures = []
     for address in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
         url = text(await control.read(address, URL_SIZE))
         try:
@@ -225,9 +225,9 @@ async def read_description(control: ControlChannel, label: str) -> dict[str, Ele
             data = await control.read(location.address, location.length)
             return await _in_thread(functools.partial(_nodes, data), label)
         except (MessageError, RequestRefusedError) as exc:
-            tried.append(str(exc))
+            failures.append(str(exc))
     raise FrameSourceError(
-        f"{label}: its description cannot be read: {'; '.join(tried)}", source=label
+        f"{label}: its description cannot be read: {'; '.join(failures)}", source=label
     )
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.stream import StreamSocket
     from smartcam.frames._pixels.formats import PixelFormat
 
-FEATURE: Final = "feature."
+FEATURE_PREFIX: Final = "feature."
 """Prefix of the URL's parameters that set features."""
 
 PACKET_SIZES: Final = (576, 16384)
@@ -69,7 +69,7 @@ class WantedStream(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """The longest duration of a frame, as far as the camera states it.
+    """The longest possible duration of a frame, as far as the camera states it.
 
     Attributes:
         duration: seconds of the longest exposure and of the readout.
@@ -107,7 +107,7 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
     features = session.features
     with contextlib.suppress(FrameSourceError):  # the camera does not stream, which may be an error
         await features.execute("AcquisitionStop")
-    await lock(features, False)
+    await set_locked(features, False)
     mode = "AcquisitionMode"
     if mode in features and "Continuous" in await features.entries(mode):
         await features.set(mode, "Continuous")
@@ -118,15 +118,15 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
             await _set_size(features, wanted.size)
         elif name == "fps" and wanted.rate is not None:
             await _set_rate(session, wanted.rate)
-        elif name.startswith(FEATURE):
-            await features.set(name.removeprefix(FEATURE), value)
+        elif name.startswith(FEATURE_PREFIX):
+            await features.set(name.removeprefix(FEATURE_PREFIX), value)
     if wanted.trigger is not None:
         await set_trigger(features, wanted.trigger)
     return await read_shape(session)
 
 
-async def lock(features: GenicamFeatures, locked: bool) -> None:
-    """Lock or unlock the stream's parameters; some cameras need this."""
+async def set_locked(features: GenicamFeatures, locked: bool) -> None:
+    """Lock or unlock the stream's parameters, as some cameras require."""
     if "TLParamsLocked" in features:
         with contextlib.suppress(FrameSourceError):  # some cameras have it read-only
             await features.set("TLParamsLocked", int(locked))
@@ -135,8 +135,8 @@ async def lock(features: GenicamFeatures, locked: bool) -> None:
 async def _set_format(session: GigESession, name: str) -> None:
     entries = await session.features.entries("PixelFormat")
     for entry, number in entries.items():
-        known = _format_of_code(number)
-        names = [entry] if known is None else [entry, known.name, known.fourcc]
+        pixel_format = _format_of_code(number)
+        names = [entry] if pixel_format is None else [entry, pixel_format.name, pixel_format.fourcc]
         if name.upper() in (spelling.upper() for spelling in names):
             await session.features.set("PixelFormat", entry)
             return
@@ -191,14 +191,12 @@ async def read_shape(session: GigESession) -> StreamShape:
     number = int(await features.number("PixelFormat") or 0)
     pixels = _format_of_code(number)
     if pixels is None:
-        fitting = tuple(
-            name for name, entry in entries.items() if _format_of_code(entry) is not None
-        )
+        known = tuple(name for name, entry in entries.items() if _format_of_code(entry) is not None)
         raise FrameFormatError(
             f"{session.label}: it is set to {entry}, {number:#010x}, which is unknown; of "
-            f"its formats, smartcam knows {', '.join(fitting) or 'none'}",
+            f"its formats, smartcam knows {', '.join(known) or 'none'}",
             source=session.label,
-            available=fitting,
+            available=known,
         )
     width, height = (
         int(await features.number("Width") or 0),
@@ -250,13 +248,13 @@ async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> fl
 # the stream channel
 
 
-async def connect(session: GigESession, where: StreamSocket, wanted: int) -> int:
+async def connect_stream(session: GigESession, sock: StreamSocket, packet_size: int) -> int:
     """Direct the camera's stream channel to a socket.
 
     Args:
         session: the camera.
-        where: socket that receives the packets.
-        wanted: number of bytes of a packet; 0: the largest that passes a test.
+        sock: socket that receives the packets.
+        packet_size: number of bytes of a packet; 0: the largest that passes a test.
 
     Returns:
         Number of bytes of an IP packet of the stream.
@@ -267,9 +265,11 @@ async def connect(session: GigESession, where: StreamSocket, wanted: int) -> int
     control = session.control
     address = int(ipaddress.IPv4Address(control.local_address))
     await control.write_register(Register.STREAM_DESTINATION, address)
-    await control.write_register(Register.STREAM_PORT, where.port)
-    chosen = _requested_packet_size(session, wanted) if wanted else _largest_tested(session, where)
-    size = await chosen
+    await control.write_register(Register.STREAM_PORT, sock.port)
+    if packet_size:
+        size = await _set_packet_size(session, packet_size)
+    else:
+        size = await _largest_tested_size(session, sock)
     if not size > IP_UDP_BYTES + EXTENDED_HEADER_BYTES:
         raise FrameSourceError(
             f"{session.label}: packet_size: expected {PACKET_SIZES[0]} bytes or more, got {size}",
@@ -278,7 +278,7 @@ async def connect(session: GigESession, where: StreamSocket, wanted: int) -> int
     return size
 
 
-async def _requested_packet_size(session: GigESession, packet_size: int) -> int:
+async def _set_packet_size(session: GigESession, packet_size: int) -> int:
     control = session.control
     await control.write_register(Register.STREAM_PACKET_SIZE, packet_size | DO_NOT_FRAGMENT)
     size = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
@@ -290,17 +290,17 @@ async def _requested_packet_size(session: GigESession, packet_size: int) -> int:
     return size
 
 
-async def _largest_tested(session: GigESession, where: StreamSocket) -> int:
+async def _largest_tested_size(session: GigESession, sock: StreamSocket) -> int:
     """Return the size of the largest received test packet, or the camera's own size."""
     control = session.control
     configured = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
     largest = min(control.path_mtu, 9000)
     for size in sorted({largest, min(largest, 1500), PACKET_SIZES[0]}, reverse=True):
         value = size | DO_NOT_FRAGMENT | FIRE_TEST_PACKET
-        # the camera does not send test packets of this size
+        # an error means that the camera does not send test packets of this size
         with contextlib.suppress(FrameSourceError):
             await control.write_register(Register.STREAM_PACKET_SIZE, value)
-            set_to = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
-            if set_to <= size and await where.test_packet(set_to, TEST_WAIT):
-                return set_to
-    return await _requested_packet_size(session, min(configured or 1500, largest, 1500))
+            actual = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
+            if actual <= size and await sock.receives_test_packet(actual, TEST_WAIT):
+                return actual
+    return await _set_packet_size(session, min(configured or 1500, largest, 1500))

@@ -62,8 +62,8 @@ class StreamSocket:
         """Port of the socket."""
         return int(self.socket.getsockname()[1])
 
-    async def test_packet(self, packet_size: int, wait: float) -> bool:
-        """Return True if a packet of the given size comes in time; drop all others."""
+    async def receives_test_packet(self, packet_size: int, wait: float) -> bool:
+        """Return True if a packet of this size comes in time; drop other packets."""
         loop = asyncio.get_running_loop()
         buffer = bytearray(65536)
         try:
@@ -84,21 +84,21 @@ class Stream:
     """A running stream, until :meth:`close`.
 
     Args:
-        where: socket that receives the packets, closed with the stream.
+        sock: socket that receives the packets, closed with the stream.
         assembler: assembler of pictures.
-        done: function that is called with new pictures.
-        resend: function that requests packets from the camera.
+        on_pictures: function that is called with new pictures, also with none if frames were lost.
+        request_resend: function that requests packets from the camera.
     """
 
     def __init__(
         self,
-        where: StreamSocket,
+        sock: StreamSocket,
         assembler: Assembler,
-        done: Callable[[list[WholePicture]], None],
-        resend: Callable[[Resend], None],
+        on_pictures: Callable[[list[WholePicture]], None],
+        request_resend: Callable[[Resend], None],
     ) -> None:
-        self._where, self.assembler = where, assembler
-        self._done, self._resend = done, resend
+        self._socket, self.assembler = sock, assembler
+        self._on_pictures, self._request_resend = on_pictures, request_resend
         self._buffer = bytearray(65536)
         self._view = memoryview(self._buffer)
         self._loop = asyncio.get_running_loop()
@@ -107,21 +107,21 @@ class Stream:
         self._closed = False
         self.foreign = 0
         """Number of datagrams from other hosts."""
-        self._loop.add_reader(where.socket, self._readable)
+        self._loop.add_reader(sock.socket, self._read_packets)
 
     def close(self) -> None:
         """Stop reading. Idempotent."""
         if not self._closed:
             self._closed = True
-            self._loop.remove_reader(self._where.socket)
-            self._where.close()
+            self._loop.remove_reader(self._socket.socket)
+            self._socket.close()
             if self._timer is not None:
                 self._timer.cancel()
 
-    def _readable(self) -> None:
+    def _read_packets(self) -> None:
         now, arrived = self._loop.time(), time.monotonic()
-        receive, feed = self._where.socket.recvfrom_into, self.assembler.feed
-        camera, view = self._where.camera, self._view
+        receive, feed = self._socket.socket.recvfrom_into, self.assembler.feed
+        camera, view = self._socket.camera, self._view
         for _ in range(MAX_PACKETS_PER_TURN):
             try:
                 size, sender = receive(view)
@@ -133,26 +133,26 @@ class Stream:
                 feed(view, size, now, arrived)
             else:
                 self.foreign += 1
-        self._report()
+        self._pass_pictures()
 
-    def _report(self) -> None:
+    def _pass_pictures(self) -> None:
         pictures = self.assembler.pictures()
-        if pictures or self.assembler.fault is not None or self.assembler.untold:
-            self._done(pictures)
+        if pictures or self.assembler.fault is not None or self.assembler.uncounted_lost:
+            self._on_pictures(pictures)
         if not self._closed:
-            self._wake()
+            self._set_timer()
 
-    def _wake(self) -> None:
+    def _set_timer(self) -> None:
         deadline = self.assembler.next_deadline()
         if deadline is None or (self._timer is not None and self._timer_at <= deadline):
             return
         if self._timer is not None:
             self._timer.cancel()
         self._timer_at = deadline  # uvloop's timers do not report cancellation
-        self._timer = self._loop.call_at(deadline, self._due)
+        self._timer = self._loop.call_at(deadline, self._on_timer)
 
-    def _due(self) -> None:
+    def _on_timer(self) -> None:
         self._timer = None
-        for wanted in self.assembler.handle_timeout(self._loop.time()):
-            self._resend(wanted)
-        self._report()
+        for packets in self.assembler.handle_timeout(self._loop.time()):
+            self._request_resend(packets)
+        self._pass_pictures()

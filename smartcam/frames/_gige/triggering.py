@@ -1,9 +1,9 @@
 """Trigger a GigE Vision camera, and find the picture that a trigger caused.
 
-A picture belongs to the pending trigger unless it was exposed before the trigger by the camera's
-clock, which is latched right before; a picture was lost meanwhile; or an event of the camera names
-another block. If the clock cannot be read, only the stream is evidence: all earlier pictures have
-come.
+A picture belongs to the pending trigger, with three exceptions. By the camera's clock, which is
+read right before the trigger, it was exposed earlier; a picture was lost meanwhile; or an event of
+the camera names another block. If the clock cannot be read, the only evidence is that all earlier
+pictures of the stream have come.
 
 Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
 ``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from smartcam.frames._gige.features import GenicamFeatures
     from smartcam.frames._trigger import AwaitedTrigger
 
-EXPOSED: Final = "ExposureEnd"
-MISSED: Final = "FrameTriggerMissed"
+EXPOSURE_END_EVENT: Final = "ExposureEnd"
+MISSED_EVENT: Final = "FrameTriggerMissed"
 """Name of the event for a trigger that caused no picture."""
 
 MAX_EXPOSURES: Final = 16
@@ -63,19 +63,19 @@ async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
     if "TriggerMode" not in features:
         return []
     if "TriggerSelector" not in features:
-        return await _setting(features, "")
-    chosen = await features.get("TriggerSelector")
+        return await _setting_of(features, "")
+    previous = await features.get("TriggerSelector")
     settings: list[TriggerSetting] = []
     try:
         for selector in await features.entries("TriggerSelector"):
             await features.set("TriggerSelector", selector)
-            settings += await _setting(features, selector)
+            settings += await _setting_of(features, selector)
     finally:
-        await features.set("TriggerSelector", chosen)
+        await features.set("TriggerSelector", previous)
     return settings
 
 
-async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:
+async def _setting_of(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:
     if await _text_of(features, "TriggerMode") != "On":
         return []
     return [TriggerSetting(selector, await _text_of(features, "TriggerSource"))]
@@ -110,16 +110,16 @@ async def set_trigger(features: GenicamFeatures, source: str) -> None:
         await features.set("TriggerMode", "Off")
         return
     sources = await features.entries("TriggerSource")
-    meant = {known.lower(): known for known in sources}.get(source.lower(), source)
+    entry = {known.lower(): known for known in sources}.get(source.lower(), source)
     # some cameras have a source only while the trigger is switched on
     await features.set("TriggerMode", "On")
-    await features.set("TriggerSource", meant)
+    await features.set("TriggerSource", entry)
 
 
-async def one_setting(
+async def usable_setting(
     settings: list[TriggerSetting], features: GenicamFeatures, by_line: bool, name: str
 ) -> TriggerSetting:
-    """Return the setting of a trigger that causes exactly one picture.
+    """Return the setting of the only trigger, which must cause exactly one picture.
 
     Raises:
         NotRunningError: no trigger is switched on, or only from another source.
@@ -151,21 +151,23 @@ async def one_setting(
 
 
 @contextlib.asynccontextmanager
-async def selected(features: GenicamFeatures, setting: TriggerSetting) -> AsyncIterator[None]:
+async def selected_trigger(
+    features: GenicamFeatures, setting: TriggerSetting
+) -> AsyncIterator[None]:
     """Set TriggerSelector to a trigger for the block, then restore it.
 
     Raises:
         FrameSourceError: the camera does not answer.
     """
-    chosen = await features.get("TriggerSelector") if setting.selector else ""
-    if chosen == setting.selector:
+    previous = await features.get("TriggerSelector") if setting.selector else ""
+    if previous == setting.selector:
         yield
         return
     await features.set("TriggerSelector", setting.selector)
     try:
         yield
     finally:
-        await features.set("TriggerSelector", chosen)
+        await features.set("TriggerSelector", previous)
 
 
 class ArmedTrigger:
@@ -173,7 +175,7 @@ class ArmedTrigger:
 
     Args:
         pending: the trigger of the source.
-        latched: the camera's clock right before the trigger, ticks; None: it cannot be read.
+        latched_ticks: the camera's clock right before the trigger, ticks; None: it cannot be read.
         setting: kind of the trigger.
         delay: seconds from the trigger to its exposure (``TriggerDelay``).
         is_first: whether the stream has had no picture yet.
@@ -182,26 +184,26 @@ class ArmedTrigger:
     def __init__(
         self,
         pending: AwaitedTrigger,
-        latched: int | None,
+        latched_ticks: int | None,
         setting: TriggerSetting,
         *,
         delay: float,
         is_first: bool,
     ) -> None:
         self.pending, self.delay = pending, delay
-        self._latched, self._setting, self._is_first = latched, setting, is_first
+        self._latched_ticks, self._setting, self._is_first = latched_ticks, setting, is_first
         self.exposed: list[int] = []
         """Blocks exposed since the trigger, by the camera's events."""
 
     def is_older(self, picture: WholePicture) -> bool:
         """Return True if a picture was exposed before the trigger, by the camera's clock."""
         ticks = picture.leader.ticks
-        older = self._latched is not None and 0 < ticks < self._latched
-        if older:
-            self._note(f"block {picture.block_id} came, which was exposed before it")
-        return older
+        is_earlier = self._latched_ticks is not None and 0 < ticks < self._latched_ticks
+        if is_earlier:
+            self._add_note(f"block {picture.block_id} came, which was exposed before it")
+        return is_earlier
 
-    def doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
+    def reason_for_doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
         """Return the reason why a picture may belong to another trigger, or ``""``.
 
         Args:
@@ -214,33 +216,35 @@ class ArmedTrigger:
             return f"the camera exposed block {self.exposed[0]} for it, which did not come"
         return ""
 
-    def take_event(self, event: FrameEvent, ticks: float | None) -> bool:
+    def on_event(self, event: FrameEvent, ticks: float | None) -> bool:
         """Record an event of the camera; return True if it reports a missed trigger.
 
         Args:
             event: reported event.
             ticks: the event's time on the camera's clock; None: no time.
         """
-        if ticks is not None and self._latched is not None and ticks < self._latched:
+        if ticks is not None and self._latched_ticks is not None and ticks < self._latched_ticks:
             return False
-        if event.name == MISSED:
+        if event.name == MISSED_EVENT:
             return True
         if event.block and len(self.exposed) < MAX_EXPOSURES:
             self.exposed.append(event.block)
-            self._note(f"its event {event.name} says that it exposed block {event.block}")
+            self._add_note(f"its event {event.name} says that it exposed block {event.block}")
         return False
 
-    def _note(self, text: str) -> None:
+    def _add_note(self, text: str) -> None:
         if len(self.pending.notes) < MAX_EXPOSURES:
             self.pending.notes.append(text)
 
-    def record(self, picture: WholePicture, ticks_per_second: int) -> FrameTrigger:
-        """Return the trigger's record for its picture."""
+    def to_frame_trigger(self, picture: WholePicture, ticks_per_second: int) -> FrameTrigger:
+        """Return the trigger with the evidence that it caused a picture."""
         evidence: list[str] = []
         if picture.block_id in self.exposed:
-            evidence.append(f"the camera's event {EXPOSED} names its block {picture.block_id}")
-        if self._latched is not None and picture.leader.ticks:
-            delay = (picture.leader.ticks - self._latched) / ticks_per_second
+            evidence.append(
+                f"the camera's event {EXPOSURE_END_EVENT} names its block {picture.block_id}"
+            )
+        if self._latched_ticks is not None and picture.leader.ticks:
+            delay = (picture.leader.ticks - self._latched_ticks) / ticks_per_second
             evidence.append(
                 f"by the camera's clock exposed {1e3 * delay:.3f} ms after its clock was read, "
                 "right before the trigger"

@@ -1,4 +1,4 @@
-"""Keep the planes of a decoded picture separate until their bytes are needed."""
+"""Keep the planes of a decoded picture separate until all bytes are needed in a row."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 
-class PlanesApart:
+class SeparatePlanes:
     """Planes in separate buffers, such as a decoder's Y, U and V.
 
-    Joining copies the whole picture, which reading the brightness does not need.
+    Joining the planes copies the whole picture. To read only the brightness, no copy is needed.
 
     Args:
         planes: buffers with the bytes of one plane each, which do not change.
@@ -27,7 +27,7 @@ class PlanesApart:
 
     @property
     def first(self) -> bytes | memoryview:
-        """Bytes that begin with the first plane: of this plane, or of all planes if joined."""
+        """Bytes that begin with the first plane; the other planes follow if they were joined."""
         planes = self._planes  # read first: another thread may join the planes
         return planes[0] if self._joined is None else self._joined
 
@@ -40,8 +40,8 @@ class PlanesApart:
         return joined
 
 
-class JoinedOnUse:
-    """A descriptor for bytes that may be set as :class:`PlanesApart`; reading it gives bytes.
+class JoinedPlanes:
+    """A descriptor for bytes that may be set as :class:`SeparatePlanes`; reading it joins them.
 
     Args:
         slot: descriptor that stores the value.
@@ -49,14 +49,14 @@ class JoinedOnUse:
 
     def __init__(self, slot: Any) -> None:
         self._slot = slot
-        self.held: Callable[[Any], Any] = slot.__get__
-        """Returns the stored value."""
+        self.stored_value: Callable[[Any], Any] = slot.__get__
+        """Function that returns an object's stored value, without joining planes."""
 
     def __get__(self, owner: Any, kind: type | None = None) -> Any:
         if owner is None:
             return self
-        held = self._slot.__get__(owner)
-        return held.joined() if type(held) is PlanesApart else held
+        stored = self._slot.__get__(owner)
+        return stored.joined() if type(stored) is SeparatePlanes else stored
 
     def __set__(self, owner: Any, value: object) -> None:
         self._slot.__set__(owner, value)

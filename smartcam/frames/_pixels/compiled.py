@@ -1,4 +1,4 @@
-"""Convert colours by OpenCV if it is installed, to within one level of the exact values."""
+"""Convert colours by OpenCV if it is installed; its values may differ by one from exact ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def opencv() -> Any:
         return None
 
 
-def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
+def apply_table(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
     """Return the table's value for each sample, from a table of 256 values."""
     cv2 = opencv()
     values: NDArray[Any]
@@ -44,7 +44,7 @@ def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
     """Return the colours (H, W, 3) of pairs of BT.601 in limited range.
 
     Args:
-        pairs: (H, W, 2): Y, and by turns U and V; W is even.
+        pairs: (H, W, 2): Y, and alternately U or V; W is even.
         y: index of Y in a pair.
 
     Returns:
@@ -53,18 +53,18 @@ def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
     cv2 = opencv()
     if cv2 is None or cv2.extractChannel(pairs, y).min() < MIN_LIMITED_Y:
         return None
-    made: NDArray[np.uint8]
-    made = cv2.cvtColor(pairs, cv2.COLOR_YUV2RGB_UYVY if y else cv2.COLOR_YUV2RGB_YUY2)
-    return made
+    result: NDArray[np.uint8]
+    result = cv2.cvtColor(pairs, cv2.COLOR_YUV2RGB_UYVY if y else cv2.COLOR_YUV2RGB_YUY2)
+    return result
 
 
 def planes_to_rgb(
     y: NDArray[Any],
     chroma: Sequence[NDArray[Any]],
     weights: NDArray[np.float64],
-    most: int,
+    max_value: int,
     *,
-    usual: bool,
+    is_bt601: bool,
 ) -> NDArray[Any]:
     """Return the colours (H, W, 3) of planes, by OpenCV.
 
@@ -73,27 +73,34 @@ def planes_to_rgb(
         chroma: U and V, (h, w) each, or one plane (h, w, 2) with both; each value is taken for all
             the pixels that share it.
         weights: (3, 4), weights of Y, U, V and 1 in red, green and blue.
-        most: largest value of a sample.
-        usual: whether the planes have 8 bits, BT.601 and limited range.
+        max_value: largest value of a sample.
+        is_bt601: whether the planes have 8 bits, BT.601 and limited range.
     """
     cv2, (height, width), (rows, columns) = opencv(), y.shape, chroma[0].shape[:2]
-    if usual and (height, width) == (2 * rows, 2 * columns) and y.min() >= MIN_LIMITED_Y:
-        made: NDArray[Any]
-        made = cv2.cvtColorTwoPlane(y, cv2.merge(chroma), cv2.COLOR_YUV2RGB_NV12)
-        return made
+    if is_bt601 and (height, width) == (2 * rows, 2 * columns) and y.min() >= MIN_LIMITED_Y:
+        result: NDArray[Any]
+        result = cv2.cvtColorTwoPlane(y, cv2.merge(chroma), cv2.COLOR_YUV2RGB_NV12)
+        return result
     across, down = 1 + (columns < width), 1 + (rows < height)
-    colours, spare = np.empty((height, width, 3), y.dtype), most < np.iinfo(y.dtype).max
+    colours, has_spare_bits = (
+        np.empty((height, width, 3), y.dtype),
+        max_value < np.iinfo(y.dtype).max,
+    )
     step = -(-BAND_BYTES // (colours.strides[0] * down))
     for top in range(0, rows, step):
-        parts = [plane[top : top + step] for plane in chroma]
+        chroma_band = [plane[top : top + step] for plane in chroma]
         if across * down > 1:
-            size = (columns * across, len(parts[0]) * down)
-            interleaved = cv2.merge(parts)
-            parts = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
+            size = (columns * across, len(chroma_band[0]) * down)
+            interleaved = cv2.merge(chroma_band)
+            chroma_band = [cv2.resize(interleaved, size, interpolation=cv2.INTER_NEAREST)]
         band = slice(top * down, (top + step) * down)
-        merged = cv2.merge([y[band], *(part[: height - band.start, :width] for part in parts)])
-        if spare:  # bits above the depth have no meaning
-            cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
+        merged = cv2.merge(
+            [y[band], *(plane[: height - band.start, :width] for plane in chroma_band)]
+        )
+        if has_spare_bits:  # bits above the depth have no meaning
+            cv2.threshold(merged, max_value, 0, cv2.THRESH_TRUNC, merged)
         rgb = cv2.transform(merged, weights)
-        colours[band] = cv2.threshold(rgb, most, 0, cv2.THRESH_TRUNC)[1] if spare else rgb
+        colours[band] = (
+            cv2.threshold(rgb, max_value, 0, cv2.THRESH_TRUNC)[1] if has_spare_bits else rgb
+        )
     return colours

@@ -59,7 +59,7 @@ class PixelFormat:
 
     @property
     def grey_is_sent(self) -> bool:
-        """True if the camera sends :meth:`Frame.grey` itself; else it is computed from colours."""
+        """True if the camera sends the brightness; else :meth:`Frame.grey` computes it."""
         return self.layout.grey_is_sent
 
     def stride(self, width: int) -> int:
@@ -127,7 +127,7 @@ def _samples(
 
 def _packed(name: str, code: int, colours: str) -> PixelFormat:
     """Return a format of packed samples; the second byte of the code has the bits per pixel."""
-    packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
+    packing = PACKINGS[next(suffix for suffix in PACKINGS if name.endswith(suffix))]
     depth = 10 if "10" in name else 12
     layout = SampleLayout(COLOURS[colours], 2, packing=packing)
     return PixelFormat(name, "", code >> 16 & 0xFF, code, depth, layout=layout)
@@ -146,7 +146,7 @@ def _planes(
     return PixelFormat(name, fourcc, bits, 0, depth, layout=layout)
 
 
-_MATRIX_ENDS: Final = (
+_MATRIX_SUFFIXES: Final = (
     ("", "601"),
     ("_full", "601 full"),
     ("_709", "709"),
@@ -154,7 +154,7 @@ _MATRIX_ENDS: Final = (
     ("_2020", "2020"),
     ("_2020_full", "2020 full"),
 )
-"""Endings of names, with their matrix and range."""
+"""Suffixes of names, each with its matrix and range."""
 
 
 _BAYER: Final = {
@@ -191,8 +191,8 @@ PIXEL_FORMATS: Final = (
         for column, (depth, code) in enumerate(_BAYER_CODES)
     ),
     *(
-        _packed(f"Bayer{pattern}{end}", code, pattern)
-        for end, codes in _BAYER_PACKED
+        _packed(f"Bayer{pattern}{suffix}", code, pattern)
+        for suffix, codes in _BAYER_PACKED
         for pattern, code in codes.items()
     ),
     _samples("RGB8", "RGB3", 0x02180014, 8, "rgb", 3),
@@ -213,25 +213,25 @@ PIXEL_FORMATS: Final = (
     _pairs("YCbCr709_422_8", "", 0x02100041, 0, "709"),
     _pairs("YCbCr709_422_8_CbYCrY", "", 0x02100045, 1, "709"),
     *(
-        _pairs(f"{name}{end}", "", 0, y, matrix)
+        _pairs(f"{name}{suffix}", "", 0, y, matrix)
         for name, y in (("YUV422_8", 0), ("YUV422_8_UYVY", 1))
-        for end, matrix in _MATRIX_ENDS[3:]
+        for suffix, matrix in _MATRIX_SUFFIXES[3:]
     ),
     *(
-        _planes(f"{name}{end}", "" if end else fourcc, across, down, matrix)
+        _planes(f"{name}{suffix}", "" if suffix else fourcc, across, down, matrix)
         for name, fourcc, across, down in (
             ("NV12", "NV12", 2, 2),
             ("I420", "YU12", 2, 2),
             ("I422", "422P", 2, 1),
             ("I444", "", 1, 1),
         )
-        for end, matrix in _MATRIX_ENDS
+        for suffix, matrix in _MATRIX_SUFFIXES
     ),
     *(
-        _planes(f"{name}_{depth}{end}", "", across, down, matrix, depth)
+        _planes(f"{name}_{depth}{suffix}", "", across, down, matrix, depth)
         for name, across, down in (("I420", 2, 2), ("I422", 2, 1), ("I444", 1, 1))
         for depth in (10, 12, 16)
-        for end, matrix in _MATRIX_ENDS
+        for suffix, matrix in _MATRIX_SUFFIXES
     ),
     PixelFormat("MJPEG", "MJPG", 0, layout=Jpeg()),
     PixelFormat("PNG", "", 0, 0, 16, layout=Compressed("Codecs.decode")),
@@ -264,7 +264,7 @@ def with_matrix(pixel_format: PixelFormat, matrix: str) -> PixelFormat:
 
 _BY_EXACT_NAME: Final = {pixel_format.name: pixel_format for pixel_format in PIXEL_FORMATS}
 
-_VARIANTS: Final = ("_709", "_2020", "_full")
+_VARIANT_SUFFIXES: Final = ("_709", "_2020", "_full")
 
 _ALIASES: Final = {"JPEG": "MJPEG", "YUY2": "YUV422_8"}
 
@@ -297,15 +297,15 @@ def find_format(name: str | int) -> PixelFormat:
     if pixel_format is not None:
         return pixel_format
     known = [pixel_format.name for pixel_format in PIXEL_FORMATS]
-    plain = [
+    listed = [
         format_name
         for format_name in known
-        if not format_name.endswith((*_VARIANTS, "_10", "_12", "_16"))
+        if not format_name.endswith((*_VARIANT_SUFFIXES, "_10", "_12", "_16"))
     ]
     shown, guess = (f"{name:#010x}", "") if isinstance(name, int) else (repr(name), None)
     raise FrameFormatError(
-        f"unknown pixel format {shown}; known are {', '.join(plain)}, those "
-        f"of Y, U and V also with _10, _12 or _16 and {', '.join(_VARIANTS)} at the end"
+        f"unknown pixel format {shown}; known are {', '.join(listed)}, those "
+        f"of Y, U and V also with _10, _12 or _16 and {', '.join(_VARIANT_SUFFIXES)} at the end"
         f"{did_you_mean(str(name), known) if guess is None else guess}",
         available=tuple(known),
     )

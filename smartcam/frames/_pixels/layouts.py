@@ -11,7 +11,7 @@ import numpy as np
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg
-from smartcam.frames._pixels.apart import PlanesApart
+from smartcam.frames._pixels.apart import SeparatePlanes
 from smartcam.frames._pixels.colours import MATRICES, Colours, yuv_to_rgb
 from smartcam.frames._pixels.compiled import pairs_to_rgb
 from smartcam.frames._pixels.unpacking import Packing, unpack
@@ -27,7 +27,7 @@ class RawPicture(NamedTuple):
 
     Attributes:
         format: name of the format, for errors.
-        data: bytes of the picture; for brightness only, also :class:`PlanesApart`.
+        data: bytes of the picture; for brightness only, also :class:`SeparatePlanes`.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next.
@@ -51,7 +51,7 @@ class PixelLayout(ABC):
 
     @property
     def grey_is_sent(self) -> bool:
-        """True if :meth:`grey` is part of the sent bytes."""
+        """True if the sent bytes contain the brightness, which :meth:`grey` returns."""
         return True
 
     @abstractmethod
@@ -114,7 +114,7 @@ class SampleLayout(PixelLayout):
         colours: conversions of the samples.
         size_of: number of bytes of a sample, after unpacking if it is packed.
         channels: samples of a pixel.
-        packing: places of packed samples in shared bytes; None if they are not packed.
+        packing: positions of packed samples in shared bytes; None: the samples are not packed.
     """
 
     colours: Colours
@@ -155,9 +155,9 @@ class SampleLayout(PixelLayout):
             strides = (stride, self.channels * self.size_of, self.size_of)
             view = _view(picture, f"<u{self.size_of}", shape, strides)
             return view if self.channels > 1 else view[..., 0]
-        rows, row = (height, width) if stride else (1, width * height)
-        bytes_of = _view(picture, "u1", (rows, self.least_stride(row)), (stride, 1))
-        unpacked = unpack(bytes_of, row, self.packing).reshape(height, width)
+        row_count, row_width = (height, width) if stride else (1, width * height)
+        packed = _view(picture, "u1", (row_count, self.least_stride(row_width)), (stride, 1))
+        unpacked = unpack(packed, row_width, self.packing).reshape(height, width)
         unpacked.flags.writeable = False
         return unpacked
 
@@ -176,7 +176,7 @@ class SampleLayout(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class YuvPairs(PixelLayout):
-    """Two pixels in four bytes with a Y each, and common U and V.
+    """Two pixels in four bytes: each pixel has its own Y, and both share U and V.
 
     Attributes:
         y: index of Y in a pixel's two bytes; the other is U or V.
@@ -206,7 +206,7 @@ class YuvPairs(PixelLayout):
         _, _, width, height, stride = picture
         pairs = (height, (width + 1) // 2)
         y = _view(picture, "u1", (height, width), (stride, 2), self.y)
-        u, v = (_view(picture, "u1", pairs, (stride, 4), 1 - self.y + more) for more in (0, 2))
+        u, v = (_view(picture, "u1", pairs, (stride, 4), 1 - self.y + shift) for shift in (0, 2))
         return y, u, v
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
@@ -216,10 +216,10 @@ class YuvPairs(PixelLayout):
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
         pairs = self.array(picture)
-        usual = self.matrix == "601" and picture.width % 2 == 0
-        made = pairs_to_rgb(pairs, self.y) if usual else None
-        if made is not None:
-            return made
+        is_convertible = self.matrix == "601" and picture.width % 2 == 0
+        colours = pairs_to_rgb(pairs, self.y) if is_convertible else None
+        if colours is not None:
+            return colours
         y, *_ = self.planes(picture)
         _, _, width, height, stride = picture
         shape = (height, (width + 1) // 2, 2)
@@ -229,7 +229,7 @@ class YuvPairs(PixelLayout):
 
 @dataclass(frozen=True, slots=True)
 class Planes(PixelLayout):
-    """Planes of Y, U and V; up to four pixels share U and V; Y's stride gives all strides.
+    """Planes of Y, U and V; up to four pixels share U and V. All strides follow from Y's stride.
 
     Attributes:
         across: pixels along a row that share a U and a V.
@@ -237,7 +237,7 @@ class Planes(PixelLayout):
         interleaved: whether U and V alternate in one plane with the stride of Y; else they have
             separate planes.
         matrix: name of the matrix in ``MATRICES``.
-        depth: bits of a sample; more than 8 take two bytes, the low one first.
+        depth: bits of a sample; a sample of more than 8 bits takes two bytes, the low byte first.
     """
 
     across: int
@@ -255,7 +255,7 @@ class Planes(PixelLayout):
         """Return the number of bytes of a row of Y, or of U and V if that is larger."""
         return self.size_of * (-(-width // self.across) * 2 if self.interleaved else width)
 
-    def _chroma(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
+    def _chroma_shape(self, width: int, height: int, stride: int) -> tuple[int, int, int]:
         """Return the width, height and stride of U and V."""
         return -(-width // self.across), -(-height // self.down), self.chroma_stride(stride)
 
@@ -266,7 +266,7 @@ class Planes(PixelLayout):
 
     def size(self, width: int, height: int, stride: int) -> int:
         """Return the bytes of all planes."""
-        _, rows, chroma_stride = self._chroma(width, height, stride)
+        _, rows, chroma_stride = self._chroma_shape(width, height, stride)
         return stride * height + chroma_stride * rows * (1 if self.interleaved else 2)
 
     def array(self, picture: RawPicture) -> NDArray[Any]:
@@ -279,20 +279,20 @@ class Planes(PixelLayout):
         """Return Y, U and V, views."""
         self.check(picture)
         _, _, width, height, stride = picture
-        across, down, chroma_stride = self._chroma(width, height, stride)
-        size, kind = self.size_of, f"<u{self.size_of}"
-        y = _view(picture, kind, (height, width), (stride, size))
+        columns, rows, chroma_stride = self._chroma_shape(width, height, stride)
+        size, dtype = self.size_of, f"<u{self.size_of}"
+        y = _view(picture, dtype, (height, width), (stride, size))
         begin, step = stride * height, size * (2 if self.interleaved else 1)
-        apart = size if self.interleaved else chroma_stride * down
+        v_offset = size if self.interleaved else chroma_stride * rows
         u, v = (
-            _view(picture, kind, (down, across), (chroma_stride, step), begin + place)
-            for place in (0, apart)
+            _view(picture, dtype, (rows, columns), (chroma_stride, step), begin + offset)
+            for offset in (0, v_offset)
         )
         return y, u, v
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
-        if isinstance(picture.data, PlanesApart):  # a decoder's planes are complete
+        if isinstance(picture.data, SeparatePlanes):  # a decoder's planes are complete
             picture = picture._replace(data=picture.data.first)
         else:
             self.check(picture)

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class PixelBits(NamedTuple):
-    """Bits of a pixel in one byte: ``(byte >> right & mask) << left``."""
+    """Bits of a pixel in one byte: ``(byte >> right_shift & mask) << left_shift``."""
 
     byte: int
-    right: int
+    right_shift: int
     mask: int
-    left: int
+    left_shift: int
 
 
 class Packing(NamedTuple):
@@ -78,7 +78,7 @@ def unpack(rows: NDArray[np.uint8], width: int, packing: Packing) -> NDArray[np.
     Args:
         rows: (H, N), at least the bytes of ``width`` pixels in each row.
         width: number of pixels in a row.
-        packing: places of the pixels' bits.
+        packing: positions of the pixels' bits.
 
     Returns:
         (H, width).
@@ -89,9 +89,9 @@ def unpack(rows: NDArray[np.uint8], width: int, packing: Packing) -> NDArray[np.
     if missing > 0:  # the row ends within a group
         rows = np.pad(rows, ((0, 0), (0, missing)))
     grouped = rows[:, : groups * packing.size].reshape(height, groups, packing.size)
-    taken = np.zeros((height, groups, pixels), np.uint16)
-    for place, parts in enumerate(packing.pixels):
+    unpacked = np.zeros((height, groups, pixels), np.uint16)
+    for index, parts in enumerate(packing.pixels):
         for part in parts:
-            bits = (grouped[..., part.byte] >> part.right) & part.mask
-            taken[..., place] |= bits.astype(np.uint16) << part.left
-    return taken.reshape(height, -1)[:, :width]
+            bits = (grouped[..., part.byte] >> part.right_shift) & part.mask
+            unpacked[..., index] |= bits.astype(np.uint16) << part.left_shift
+    return unpacked.reshape(height, -1)[:, :width]

@@ -1,4 +1,4 @@
-"""Choose JPEG quality and frame rate for a wanted bit rate or latency."""
+"""Choose JPEG quality and frame rate so that a bit rate or latency is kept."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ MIN_DEVIATION_SHARE: Final = 0.03
 """Share of a value below which a deviation is not corrected."""
 
 BUSY_SHARE: Final = 0.7
-"""Share of the time with frames on the way, above which the link limits the frame rate."""
+"""Share of the time in which a frame is in transit, above which the link limits the frame rate."""
 
 SLOW_SOURCE_FACTOR: Final = 1.15
 """The source limits the frame rate if the measured rate is below the allowed one by this factor."""
 
 MAX_BUSY_SHARE_WHEN_FREE: Final = 0.5
-"""Share of the time with frames on the way, below which a lower frame rate does not reduce
+"""Share of the time in which a frame is in transit, below which a lower frame rate does not reduce
 latency."""
 
 LOGGED_CHANGE_FACTOR: Final = 1.25
@@ -79,26 +79,26 @@ class _Mean:
         self.value = self._weight = 0.0
 
     def add(self, value: float, seconds: float) -> None:
-        alike = self.value / CHANGE_FACTOR < value < self.value * CHANGE_FACTOR
-        over = STEADY_AVERAGING_TIME if alike else CHANGE_AVERAGING_TIME
-        keeps = self._weight * math.exp(-seconds / over)
-        new = -math.expm1(-seconds / over)
-        self._weight = keeps + new
+        is_steady = self.value / CHANGE_FACTOR < value < self.value * CHANGE_FACTOR
+        averaging_time = STEADY_AVERAGING_TIME if is_steady else CHANGE_AVERAGING_TIME
+        old_weight = self._weight * math.exp(-seconds / averaging_time)
+        new_weight = -math.expm1(-seconds / averaging_time)
+        self._weight = old_weight + new_weight
         if self._weight:
-            self.value += (value - self.value) * new / self._weight
+            self.value += (value - self.value) * new_weight / self._weight
 
 
-class _Flow:
-    """Number of recent frames and bytes, and their duration in seconds."""
+class _RecentCounts:
+    """Numbers of recent frames and bytes, and the duration in which they were sent, in seconds."""
 
     def __init__(self) -> None:
         self.frames = self.bytes = self.seconds = 0.0
 
     def add(self, size: int, seconds: float) -> None:
-        keeps = math.exp(-seconds / COUNTED_SECONDS)
-        self.frames = self.frames * keeps + 1
-        self.bytes = self.bytes * keeps + size
-        self.seconds = self.seconds * keeps + seconds
+        decay = math.exp(-seconds / COUNTED_SECONDS)
+        self.frames = self.frames * decay + 1
+        self.bytes = self.bytes * decay + size
+        self.seconds = self.seconds * decay + seconds
 
 
 class RateControl:
@@ -135,15 +135,15 @@ class RateControl:
         self._bitrate, self._latency = bitrate, latency
         self._qualities, self._rates = quality, fps
         self._quality, self._fps = float(quality[0]), float(fps[1])
-        self._rise = MAX_FIRST_RISE_PER_SECOND
+        self._max_rise = MAX_FIRST_RISE_PER_SECOND
         self._why: str = ""
         self._logged_fps = self._fps
         self._last_sent_at: float | None = None
         # frame rate of the source, frames per second; 0: unknown
         self._source_fps = 0.0
-        self._flow = _Flow()
-        self._unit_size = _Mean()  # size of a frame with quantization steps of 1, bytes
-        self._time_per_byte = _Mean()  # seconds per byte on the way
+        self._recent = _RecentCounts()
+        self._normalized_size = _Mean()  # size of a frame with quantization steps of 1, in bytes
+        self._time_per_byte = _Mean()  # transit time per byte, seconds
         self._age, self._transit_time = _Mean(), _Mean()
 
     @property
@@ -163,12 +163,12 @@ class RateControl:
 
     def statistics(self) -> RateStatistics:
         """Return the current quality and rates, with the reason."""
-        flow = self._flow
+        recent = self._recent
         return RateStatistics(
             self.quality,
             self._fps,
             self._why,
-            8 * flow.bytes / flow.seconds if flow.seconds else 0.0,
+            8 * recent.bytes / recent.seconds if recent.seconds else 0.0,
             self._age.value + self._transit_time.value,
         )
 
@@ -195,54 +195,54 @@ class RateControl:
             seconds = self.pause
         else:
             seconds = sent_at - self._last_sent_at
-            self._flow.add(size, seconds)
-            self._learn(transit_time / seconds)
+            self._recent.add(size, seconds)
+            self._estimate_source_rate(transit_time / seconds)
         self._last_sent_at = sent_at
         frame_quality = self.quality if quality is None else quality
         # a frame counts for the time since the last one, or for its transit if that is longer
         duration = max(seconds, transit_time)
-        self._unit_size.add(size * _steps(frame_quality) ** SIZE_EXPONENT, duration)
+        self._normalized_size.add(size * _step_scale(frame_quality) ** SIZE_EXPONENT, duration)
         self._time_per_byte.add(transit_time / size, duration)
         self._age.add(age, duration)
         self._transit_time.add(transit_time, duration)
-        self._follow(seconds)
+        self._adjust(seconds)
 
-    def _learn(self, busy: float) -> None:
+    def _estimate_source_rate(self, busy_share: float) -> None:
         """Estimate the source's frame rate if neither the link nor this control limits it."""
-        rate = self._flow.frames / self._flow.seconds
-        if busy < BUSY_SHARE and (
+        rate = self._recent.frames / self._recent.seconds
+        if busy_share < BUSY_SHARE and (
             self._fps >= self._rates[1] or rate * SLOW_SOURCE_FACTOR < self._fps
         ):
             self._source_fps = rate
 
-    def _follow(self, seconds: float) -> None:
-        """Move towards the target values: down at once, up slowly."""
+    def _adjust(self, seconds: float) -> None:
+        """Lower the quality and the frame rate to their targets at once; raise them slowly."""
         least, best = self._qualities
-        wanted_size, wanted_fps, why = self._wanted()
-        quality = min(best, max(least, _quality(self._unit_size.value / wanted_size)))
-        grows = self._rise ** min(seconds, STEADY_AVERAGING_TIME)
-        if wanted_fps < self._fps * (1 - MIN_DEVIATION_SHARE):
-            self._fps, self._rise = wanted_fps, MAX_RISE_PER_SECOND
-        elif wanted_fps > self._fps:
-            self._fps = min(wanted_fps, self._fps * grows)
-        current_size = self._bytes(self._quality)
-        if wanted_size < current_size * (1 - MIN_DEVIATION_SHARE) and quality < self._quality:
-            self._quality, self._rise = quality, MAX_RISE_PER_SECOND
-        elif wanted_size > current_size * (1 + MIN_DEVIATION_SHARE) and self._fps >= self._rates[1]:
-            slowly = _quality(self._unit_size.value / (current_size * grows))
-            self._quality = max(self._quality, min(quality, slowly))
-        if why in {"bit rate", "latency"}:
+        target_size, target_fps, reason = self._target()
+        quality = min(best, max(least, _quality_for(self._normalized_size.value / target_size)))
+        max_growth = self._max_rise ** min(seconds, STEADY_AVERAGING_TIME)
+        if target_fps < self._fps * (1 - MIN_DEVIATION_SHARE):
+            self._fps, self._max_rise = target_fps, MAX_RISE_PER_SECOND
+        elif target_fps > self._fps:
+            self._fps = min(target_fps, self._fps * max_growth)
+        current_size = self._frame_bytes(self._quality)
+        if target_size < current_size * (1 - MIN_DEVIATION_SHARE) and quality < self._quality:
+            self._quality, self._max_rise = quality, MAX_RISE_PER_SECOND
+        elif target_size > current_size * (1 + MIN_DEVIATION_SHARE) and self._fps >= self._rates[1]:
+            reachable = _quality_for(self._normalized_size.value / (current_size * max_growth))
+            self._quality = max(self._quality, min(quality, reachable))
+        if reason in {"bit rate", "latency"}:
             if self._fps < self._rates[1]:  # while the frame rate recovers
-                why = f"{why}, at the lowest quality"
+                reason = f"{reason}, at the lowest quality"
             elif self._quality >= best:
-                why = "at the highest quality"
-        self._why = why
+                reason = "at the highest quality"
+        self._why = reason
         self._log_change()
 
-    def _wanted(self) -> tuple[float, float, str]:
+    def _target(self) -> tuple[float, float, str]:
         """Return the target size of a frame, bytes, the frame rate, and the reason."""
         fewest, most = self._rates
-        smallest = self._bytes(self._qualities[0])
+        smallest = self._frame_bytes(self._qualities[0])
         limits: list[tuple[float, float, str]] = []
         if self._bitrate is not None:
             source_fps = min(most, max(fewest, self._source_fps or most))
@@ -268,8 +268,8 @@ class RateControl:
             return size, fewest, f"{name}, at the lowest quality and frame rate"
         return size, min(most, fps), f"{name}, at the lowest quality"
 
-    def _bytes(self, quality: float) -> float:
-        return self._unit_size.value / float(_steps(quality) ** SIZE_EXPONENT)
+    def _frame_bytes(self, quality: float) -> float:
+        return self._normalized_size.value / float(_step_scale(quality) ** SIZE_EXPONENT)
 
     def _log_change(self) -> None:
         recovered = self._fps == self._rates[1] != self._logged_fps
@@ -279,12 +279,12 @@ class RateControl:
             logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
 
 
-def _steps(quality: float) -> float:
+def _step_scale(quality: float) -> float:
     """Return the scale of a JPEG's quantization steps, 1 at quality 50 (libjpeg's definition)."""
     return 50 / quality if quality < 50 else max(0.02, (100 - quality) / 50)
 
 
-def _quality(size_ratio: float) -> float:
+def _quality_for(size_ratio: float) -> float:
     """Return the quality whose frames are smaller than those with steps of 1 by this ratio."""
     steps = float(max(1e-3, size_ratio) ** (1 / SIZE_EXPONENT))
     return 50 / steps if steps > 1 else 100 - 50 * steps

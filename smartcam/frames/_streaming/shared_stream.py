@@ -33,11 +33,11 @@ MAX_FAILURES: Final = 3
 class StreamViewer(Protocol):
     """A viewer that receives encoded frames; its methods must not wait or raise."""
 
-    def take(self, unit: Frame, key: bool) -> None:
+    def on_frame(self, unit: Frame, is_key_frame: bool) -> None:
         """Receive an encoded frame, without blocking."""
         ...
 
-    def ended(self, error: FrameSourceError) -> None:
+    def on_stream_end(self, error: FrameSourceError) -> None:
         """Receive the error that ended the stream; the viewer is then removed."""
         ...
 
@@ -47,15 +47,15 @@ class EncodedCounts:
     """Counts of encoded frames, of key frames among them, and of failed frames."""
 
     encoded: int = 0
-    keys: int = 0
+    key_frames: int = 0
     failed: int = 0
 
 
 class SharedH264:
     """Read a source while there are viewers, and encode it once for all.
 
-    The newest frame is encoded after the one before; other frames are skipped. When the source
-    ends, its viewers are removed; the next viewer restarts the source.
+    When a frame is encoded, the newest frame is encoded next; frames in between are skipped. When
+    the source ends, all viewers are removed; the next viewer restarts the source.
 
     Args:
         source: open source, which must stay open while this object is used.
@@ -67,40 +67,40 @@ class SharedH264:
         self.counts = EncodedCounts()
         self._encoder = encoder
         self._viewers: dict[StreamViewer, None] = {}
-        self._asking: set[asyncio.Future[Frame]] = set()
+        self._key_frame_futures: set[asyncio.Future[Frame]] = set()
         self._task: asyncio.Task[FrameSourceError] | None = None
         self._ending: set[asyncio.Task[FrameSourceError]] = set()
-        self._resting: asyncio.TimerHandle | None = None
-        self._key: Frame | None = None  # last key frame since reading began
-        self._key_wanted = False
-        self._key_came = -KEY_FRAME_INTERVAL
+        self._linger_timer: asyncio.TimerHandle | None = None
+        self._last_key_frame: Frame | None = None  # last key frame since reading began
+        self._key_frame_wanted = False
+        self._last_key_frame_at = -KEY_FRAME_INTERVAL
 
     @property
-    def viewers(self) -> int:
+    def viewer_count(self) -> int:
         """Number of viewers."""
         return len(self._viewers)
 
-    def join(self, viewer: StreamViewer) -> None:
+    def add_viewer(self, viewer: StreamViewer) -> None:
         """Add a viewer, which receives all frames from now on.
 
         A key frame comes soon; for the first viewer at once.
         """
         if not self._viewers:
-            self._key_came = -KEY_FRAME_INTERVAL
+            self._last_key_frame_at = -KEY_FRAME_INTERVAL
         self._viewers[viewer] = None
-        self._key_wanted = True
+        self._key_frame_wanted = True
         self._start()
 
-    def leave(self, viewer: StreamViewer) -> None:
+    def remove_viewer(self, viewer: StreamViewer) -> None:
         """Remove a viewer; an unknown viewer is ignored."""
         self._viewers.pop(viewer, None)
         self._stop_if_idle()
 
-    def key_frame(self) -> None:
+    def request_key_frame(self) -> None:
         """Request a key frame, at most one per :data:`KEY_FRAME_INTERVAL` for all viewers."""
-        self._key_wanted = True
+        self._key_frame_wanted = True
 
-    async def first(self, timeout: float) -> Frame:
+    async def first_key_frame(self, timeout: float) -> Frame:
         """Return a key frame of the stream, which is started if needed.
 
         Raises:
@@ -108,22 +108,22 @@ class SharedH264:
 
         Cancellation: safe.
         """
-        if self._task is not None and self._key is not None:
+        if self._task is not None and self._last_key_frame is not None:
             self._stop_if_idle()
-            return self._key
-        asking: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
-        self._asking.add(asking)
-        self._key_wanted = True
+            return self._last_key_frame
+        future: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
+        self._key_frame_futures.add(future)
+        self._key_frame_wanted = True
         self._start()
         try:
             async with asyncio.timeout(timeout):
-                return await asking
+                return await future
         except TimeoutError:
             raise FrameTimeoutError(
                 f"{self.source.name}: no frame came within {timeout:g} s", source=self.source.name
             ) from None
         finally:
-            self._asking.discard(asking)
+            self._key_frame_futures.discard(future)
             self._stop_if_idle()
 
     async def close(self) -> None:
@@ -132,49 +132,49 @@ class SharedH264:
         Cancellation: takes effect after the task has ended, without delay.
         """
         self._viewers.clear()
-        closed = FrameSourceError(f"{self.source.name}: its stream was closed")
+        error = FrameSourceError(f"{self.source.name}: its stream was closed")
         self._stop_reading()
-        self._answer(closed)
+        self._resolve_futures(error)
         while self._ending:
             await asyncio.wait(set(self._ending))
 
     def _start(self) -> None:
-        if self._resting is not None:
-            self._resting.cancel()
-            self._resting = None
+        if self._linger_timer is not None:
+            self._linger_timer.cancel()
+            self._linger_timer = None
         if self._task is None:
             name = f"stream of {self.source.name}"
-            self._task = asyncio.get_running_loop().create_task(self._run(), name=name)
-            self._task.add_done_callback(self._ended)
+            self._task = asyncio.get_running_loop().create_task(self._read_source(), name=name)
+            self._task.add_done_callback(self._on_task_done)
 
     def _stop_if_idle(self) -> None:
-        if self._viewers or self._asking or self._task is None:
+        if self._viewers or self._key_frame_futures or self._task is None:
             return
-        if self._resting is not None:
-            self._resting.cancel()
-        self._resting = asyncio.get_running_loop().call_later(LINGER, self._stop_reading)
+        if self._linger_timer is not None:
+            self._linger_timer.cancel()
+        self._linger_timer = asyncio.get_running_loop().call_later(LINGER, self._stop_reading)
 
     def _stop_reading(self) -> None:
         """Stop reading; a new viewer restarts it."""
         task, self._task = self._task, None
-        self._key = None
-        if self._resting is not None:
-            self._resting.cancel()
-            self._resting = None
+        self._last_key_frame = None
+        if self._linger_timer is not None:
+            self._linger_timer.cancel()
+            self._linger_timer = None
         if task is not None:
             self._ending.add(task)
             task.add_done_callback(self._ending.discard)
             task.cancel()
 
-    def _ended(self, task: asyncio.Task[FrameSourceError]) -> None:
+    def _on_task_done(self, task: asyncio.Task[FrameSourceError]) -> None:
         """Report the error of the ended task to all viewers; a new viewer restarts it."""
         if task is not self._task:
             return
         name = self.source.name
         cancelled = FrameSourceError(f"{name}: its stream was cancelled", source=name)
-        self._end(cancelled if task.cancelled() else task.result())
+        self._end_stream(cancelled if task.cancelled() else task.result())
 
-    async def _run(self) -> FrameSourceError:
+    async def _read_source(self) -> FrameSourceError:
         """Encode until the source ends; return its error."""
         name = self.source.name
         try:
@@ -190,32 +190,32 @@ class SharedH264:
             error = FrameSourceError(f"{name}: {exc!r}", source=name)
         return error
 
-    def _end(self, error: FrameSourceError) -> None:
-        self._task = self._key = None
+    def _end_stream(self, error: FrameSourceError) -> None:
+        self._task = self._last_key_frame = None
         viewers, self._viewers = list(self._viewers), {}
         for viewer in viewers:
-            viewer.ended(error)
-        self._answer(error)
+            viewer.on_stream_end(error)
+        self._resolve_futures(error)
 
-    def _answer(self, answer: Frame | FrameSourceError) -> None:
-        for asking in self._asking:
-            if asking.done():
+    def _resolve_futures(self, outcome: Frame | FrameSourceError) -> None:
+        for future in self._key_frame_futures:
+            if future.done():
                 continue
-            if isinstance(answer, FrameSourceError):
-                asking.set_exception(answer)
+            if isinstance(outcome, FrameSourceError):
+                future.set_exception(outcome)
             else:
-                asking.set_result(answer)
+                future.set_result(outcome)
 
     async def _encode(self, reader: FrameReader) -> None:
         now = asyncio.get_running_loop().time
         self._encoder.begin_anew()
         failures = 0
         async for frame in reader:
-            if not self._viewers and not self._asking:
+            if not self._viewers and not self._key_frame_futures:
                 continue  # no viewers during the linger
-            if self._key_wanted and now() - self._key_came >= KEY_FRAME_INTERVAL:
+            if self._key_frame_wanted and now() - self._last_key_frame_at >= KEY_FRAME_INTERVAL:
                 self._encoder.begin_anew()
-                self._key_came = now()
+                self._last_key_frame_at = now()
             try:
                 unit = await self._encoder.encode(frame)
             except FrameFormatError:
@@ -225,16 +225,16 @@ class SharedH264:
                     raise
                 continue
             failures = 0
-            await self._hand_out(unit, entry_point(bytes(unit.data))[0])
+            await self._send_to_viewers(unit, entry_point(bytes(unit.data))[0])
 
-    async def _hand_out(self, unit: Frame, key: bool) -> None:
-        if key:
-            self.counts.keys += 1
-            self._key, self._key_wanted = unit, False
-            self._key_came = asyncio.get_running_loop().time()
-            self._answer(unit)
+    async def _send_to_viewers(self, unit: Frame, is_key_frame: bool) -> None:
+        if is_key_frame:
+            self.counts.key_frames += 1
+            self._last_key_frame, self._key_frame_wanted = unit, False
+            self._last_key_frame_at = asyncio.get_running_loop().time()
+            self._resolve_futures(unit)
         for viewer in list(self._viewers):
             if viewer in self._viewers:
-                viewer.take(unit, key)
+                viewer.on_frame(unit, is_key_frame)
                 await asyncio.sleep(0)  # many viewers must not block the loop
         self.counts.encoded += 1

@@ -30,7 +30,7 @@ class Ioctl(NamedTuple):
     layout: Struct
 
 
-def _request(name: str, number: int, direction: int, layout: Struct) -> Ioctl:
+def _ioctl(name: str, number: int, direction: int, layout: Struct) -> Ioctl:
     return Ioctl(name, direction << 30 | layout.size << 16 | ord("V") << 8 | number, layout)
 
 
@@ -49,24 +49,24 @@ _QUERY_MENU = Struct("=II32s4x")
 _FRAME_SIZE = Struct("III6I8x")
 _FRAME_INTERVAL = Struct("IIIII6I8x")
 
-QUERYCAP: Final = _request("QUERYCAP", 0, READ, _CAPABILITY)
-ENUM_FMT: Final = _request("ENUM_FMT", 2, READ | WRITE, _FORMAT_DESCRIPTION)
-G_FMT: Final = _request("G_FMT", 4, READ | WRITE, _FORMAT)
-S_FMT: Final = _request("S_FMT", 5, READ | WRITE, _FORMAT)
-REQBUFS: Final = _request("REQBUFS", 8, READ | WRITE, _REQUEST_BUFFERS)
-QUERYBUF: Final = _request("QUERYBUF", 9, READ | WRITE, _BUFFER)
-QBUF: Final = _request("QBUF", 15, READ | WRITE, _BUFFER)
-DQBUF: Final = _request("DQBUF", 17, READ | WRITE, _BUFFER)
-STREAMON: Final = _request("STREAMON", 18, WRITE, _INTEGER)
-STREAMOFF: Final = _request("STREAMOFF", 19, WRITE, _INTEGER)
-G_PARM: Final = _request("G_PARM", 21, READ | WRITE, _PARAMETERS)
-S_PARM: Final = _request("S_PARM", 22, READ | WRITE, _PARAMETERS)
-G_CTRL: Final = _request("G_CTRL", 27, READ | WRITE, _CONTROL)
-S_CTRL: Final = _request("S_CTRL", 28, READ | WRITE, _CONTROL)
-QUERYMENU: Final = _request("QUERYMENU", 37, READ | WRITE, _QUERY_MENU)
-ENUM_FRAMESIZES: Final = _request("ENUM_FRAMESIZES", 74, READ | WRITE, _FRAME_SIZE)
-ENUM_FRAMEINTERVALS: Final = _request("ENUM_FRAMEINTERVALS", 75, READ | WRITE, _FRAME_INTERVAL)
-QUERY_EXT_CTRL: Final = _request("QUERY_EXT_CTRL", 103, READ | WRITE, _QUERY_CONTROL)
+QUERYCAP: Final = _ioctl("QUERYCAP", 0, READ, _CAPABILITY)
+ENUM_FMT: Final = _ioctl("ENUM_FMT", 2, READ | WRITE, _FORMAT_DESCRIPTION)
+G_FMT: Final = _ioctl("G_FMT", 4, READ | WRITE, _FORMAT)
+S_FMT: Final = _ioctl("S_FMT", 5, READ | WRITE, _FORMAT)
+REQBUFS: Final = _ioctl("REQBUFS", 8, READ | WRITE, _REQUEST_BUFFERS)
+QUERYBUF: Final = _ioctl("QUERYBUF", 9, READ | WRITE, _BUFFER)
+QBUF: Final = _ioctl("QBUF", 15, READ | WRITE, _BUFFER)
+DQBUF: Final = _ioctl("DQBUF", 17, READ | WRITE, _BUFFER)
+STREAMON: Final = _ioctl("STREAMON", 18, WRITE, _INTEGER)
+STREAMOFF: Final = _ioctl("STREAMOFF", 19, WRITE, _INTEGER)
+G_PARM: Final = _ioctl("G_PARM", 21, READ | WRITE, _PARAMETERS)
+S_PARM: Final = _ioctl("S_PARM", 22, READ | WRITE, _PARAMETERS)
+G_CTRL: Final = _ioctl("G_CTRL", 27, READ | WRITE, _CONTROL)
+S_CTRL: Final = _ioctl("S_CTRL", 28, READ | WRITE, _CONTROL)
+QUERYMENU: Final = _ioctl("QUERYMENU", 37, READ | WRITE, _QUERY_MENU)
+ENUM_FRAMESIZES: Final = _ioctl("ENUM_FRAMESIZES", 74, READ | WRITE, _FRAME_SIZE)
+ENUM_FRAMEINTERVALS: Final = _ioctl("ENUM_FRAMEINTERVALS", 75, READ | WRITE, _FRAME_INTERVAL)
+QUERY_EXT_CTRL: Final = _ioctl("QUERY_EXT_CTRL", 103, READ | WRITE, _QUERY_CONTROL)
 
 CAPTURE: Final = 1
 """V4L2_BUF_TYPE_VIDEO_CAPTURE."""
@@ -84,7 +84,7 @@ CAP_TIMEPERFRAME: Final = 0x1000
 
 FIELD_NONE: Final = 1
 WHOLE_FIELDS: Final = frozenset((0, FIELD_NONE, 4, 8, 9))
-"""Kinds of ``enum v4l2_field`` whose buffers have all rows in order: any, none, interlaced."""
+"""Values of ``enum v4l2_field`` whose buffers have all rows in order: any, none, interlaced."""
 
 DISCRETE: Final = 1
 """V4L2_FRMSIZE_TYPE_DISCRETE and V4L2_FRMIVAL_TYPE_DISCRETE."""
@@ -158,20 +158,20 @@ FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
 
 
 def new_buffer(index: int) -> bytearray:
-    """Return the argument of ioctls about a buffer."""
+    """Return an argument for the ioctls that concern a buffer."""
     argument = bytearray(_BUFFER.size)
     _BUFFER.pack_into(argument, 0, index, CAPTURE, 0, 0, 0, 0, 0, 0, MEMORY_MMAP, 0, 0)
     return argument
 
 
 def offset_and_length(argument: bytearray) -> tuple[int, int]:
-    """Return the offset at which a buffer is mapped, and its length in bytes."""
+    """Return a buffer's offset for mmap and its length, in bytes."""
     offset, length = _BUFFER.unpack(argument)[9:11]
     return offset, length
 
 
-def text(raw: bytes) -> str:
-    """Return a text from the kernel up to its first zero."""
+def decode_text(raw: bytes) -> str:
+    """Return a text from the kernel, which ends at its first zero byte."""
     return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
@@ -183,5 +183,5 @@ def fourcc(name: str) -> int:
 def fourcc_text(code: int) -> str:
     """Return a format's four characters without spaces at the end; ``-BE`` is big endian."""
     name = (code & 0x7FFFFFFF).to_bytes(4, "little").decode("latin-1").rstrip()
-    shown = "".join(character if character.isprintable() else "?" for character in name)
-    return shown + ("-BE" if code >> 31 else "")
+    printable = "".join(character if character.isprintable() else "?" for character in name)
+    return printable + ("-BE" if code >> 31 else "")

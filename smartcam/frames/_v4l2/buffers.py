@@ -25,21 +25,21 @@ class FilledBuffer(NamedTuple):
 
     Attributes:
         data: copy of the bytes; empty for a buffer with an error.
-        used: number of bytes that the driver reports as written.
+        used_bytes: number of bytes that the driver reports as written.
         flags: flags of V4L2.
-        seconds: seconds of its time stamp.
+        stamp: time stamp, seconds.
         sequence: the driver's number of the frame.
     """
 
     data: bytes
-    used: int
+    used_bytes: int
     flags: int
-    seconds: float
+    stamp: float
     sequence: int
 
 
 class Buffers:
-    """The buffers of a streaming device; making them starts the stream.
+    """The buffers of a device, whose stream starts when this object is made.
 
     Args:
         device: device with its format set.
@@ -51,59 +51,59 @@ class Buffers:
 
     def __init__(self, device: CaptureDevice, count: int) -> None:
         self._device = device
-        self._pages: list[mmap.mmap] = []
+        self._maps: list[mmap.mmap] = []
         self._argument = abi.new_buffer(0)  # reused by all calls
         try:
-            given = device.ask(
-                abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, tried="asking for buffers"
+            actual_count = device.checked_ioctl(
+                abi.REQBUFS, count, abi.CAPTURE, abi.MEMORY_MMAP, action="asking for buffers"
             )[0]
-            if given < MIN_BUFFERS:
+            if actual_count < MIN_BUFFERS:
                 raise FrameSourceError(
-                    f"{device.path}: expected {MIN_BUFFERS} buffers or more, got {given}",
+                    f"{device.path}: expected {MIN_BUFFERS} buffers or more, got {actual_count}",
                     source=device.path,
                 )
-            for index in range(given):
-                self._prepare(index)
-            device.ask(abi.STREAMON, abi.CAPTURE, tried="starting the stream")
+            for index in range(actual_count):
+                self._map_and_queue(index)
+            device.checked_ioctl(abi.STREAMON, abi.CAPTURE, action="starting the stream")
         except BaseException:
             self.release()
             raise
 
     def __len__(self) -> int:
-        return len(self._pages)
+        return len(self._maps)
 
-    def take(self) -> FilledBuffer:
-        """Return the oldest picture, and give its buffer back to the driver.
+    def take_picture(self) -> FilledBuffer:
+        """Return a copy of the oldest picture, and give its buffer back to the driver.
 
         Raises:
             BlockingIOError: there is no picture.
             OSError: the device is gone, or its driver gave up.
         """
-        argument, number, ioctl = self._argument, self._device.number, system.ioctl
-        ioctl(number, abi.DQBUF, argument)
-        place, used, flags, seconds, microseconds, sequence = _unpack(argument)
-        data = b"" if flags & abi.BUF_ERROR else self._pages[place][:used]
-        ioctl(number, abi.QBUF, argument)
-        return FilledBuffer(data, used, flags, seconds + microseconds / 1e6, sequence)
+        argument, descriptor, ioctl = self._argument, self._device.descriptor, system.ioctl
+        ioctl(descriptor, abi.DQBUF, argument)
+        index, used_bytes, flags, seconds, microseconds, sequence = _unpack(argument)
+        data = b"" if flags & abi.BUF_ERROR else self._maps[index][:used_bytes]
+        ioctl(descriptor, abi.QBUF, argument)
+        return FilledBuffer(data, used_bytes, flags, seconds + microseconds / 1e6, sequence)
 
     def release(self) -> None:
         """Stop the stream and release the buffers, so that other programs can use the device."""
         with suppress(FrameSourceError):  # the device may be gone
-            self._device.ask(abi.STREAMOFF, abi.CAPTURE)
-        while self._pages:
-            self._pages.pop().close()
+            self._device.checked_ioctl(abi.STREAMOFF, abi.CAPTURE)
+        while self._maps:
+            self._maps.pop().close()
         with suppress(FrameSourceError):
-            self._device.ask(abi.REQBUFS, 0, abi.CAPTURE, abi.MEMORY_MMAP)
+            self._device.checked_ioctl(abi.REQBUFS, 0, abi.CAPTURE, abi.MEMORY_MMAP)
 
-    def _prepare(self, index: int) -> None:
+    def _map_and_queue(self, index: int) -> None:
         """Map and queue a buffer."""
         device = self._device
         argument = abi.new_buffer(index)
         try:
-            system.ioctl(device.number, abi.QUERYBUF, argument)
+            system.ioctl(device.descriptor, abi.QUERYBUF, argument)
             offset, length = abi.offset_and_length(argument)
-            self._pages.append(system.pages(device.number, length, offset))
-            system.ioctl(device.number, abi.QBUF, argument)
+            self._maps.append(system.pages(device.descriptor, length, offset))
+            system.ioctl(device.descriptor, abi.QBUF, argument)
         except (OSError, ValueError) as exc:
             raise FrameSourceError(
                 f"{device.path}: buffer {index}: {exc}", source=device.path

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames._v4l2.device import CaptureDevice
 
-KINDS: Final = {
+CONTROL_TYPES: Final = {
     abi.CTRL_INTEGER: "integer",
     abi.CTRL_BOOLEAN: "boolean",
     abi.CTRL_MENU: "menu",
@@ -28,7 +28,7 @@ KINDS: Final = {
 }
 """Supported types of controls; 64-bit numbers, texts and structures are not supported."""
 
-SWITCHES: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
+BOOLEAN_WORDS: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,29 +75,30 @@ class DeviceControl:
 
     def __str__(self) -> str:
         """Return the control as a line of lists and error texts."""
-        now = "" if self.value is None else f", now {self.value}"
-        return f"{self.name}: {self.range}; default {self.default}{now}"
+        current = "" if self.value is None else f", now {self.value}"
+        return f"{self.name}: {self.range}; default {self.default}{current}"
 
-    def number_of(self, value: int | str) -> int | None:
-        """Return the number of a value; None if the device does not accept it."""
-        number = self._read(value)
+    def parse_value(self, value: int | str) -> int | None:
+        """Return the number for a value; None if the device does not accept the value."""
+        number = self._parse(value)
         if number is None or self.kind == "button":
             return number
         if self.menu:
             return number if number in self.menu else None
         if self.kind == "bitmask":
             return number if 0 <= number <= self.most & 0xFFFFFFFF else None
-        fits = self.least <= number <= self.most and (number - self.least) % max(1, self.step) == 0
-        return number if fits else None
+        is_in_range = self.least <= number <= self.most
+        is_on_step = (number - self.least) % max(1, self.step) == 0
+        return number if is_in_range and is_on_step else None
 
-    def _read(self, value: int | str) -> int | None:
+    def _parse(self, value: int | str) -> int | None:
         if not isinstance(value, str):
             return int(value)
         text = value.strip()
-        if self.kind == "boolean" and text.lower() in SWITCHES:
-            return SWITCHES[text.lower()]
+        if self.kind == "boolean" and text.lower() in BOOLEAN_WORDS:
+            return BOOLEAN_WORDS[text.lower()]
         for number, label in self.menu.items():
-            if simple(label) == simple(text) and not text.isdigit():
+            if normalized_name(label) == normalized_name(text) and not text.isdigit():
                 return number
         try:
             return int(text, 0)
@@ -105,14 +106,14 @@ class DeviceControl:
             return None
 
 
-def simple(label: str) -> str:
+def normalized_name(label: str) -> str:
     """Return a label in lower case, with underscores for blanks and punctuation."""
     return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
 
 
 def list_controls(device: CaptureDevice) -> dict[str, DeviceControl]:
     """Return the controls by their names, in the driver's order."""
-    return {name: _control(device, answer) for name, answer in _described(device).items()}
+    return {name: _read_control(device, answer) for name, answer in _query_controls(device).items()}
 
 
 def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
@@ -125,19 +126,19 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
         FrameFeatureError: there is no control of that name, it cannot be set, or does not accept
             the value; the text lists the controls or the range.
     """
-    answer = _described(device).get(simple(name))
+    answer = _query_controls(device).get(normalized_name(name))
     if answer is None:
         raise _unknown_control_error(device, name)
-    control = _control(device, answer)
-    number = control.number_of(value)
+    control = _read_control(device, answer)
+    number = control.parse_value(value)
     if number is None or control.flags & abi.CTRL_READ_ONLY:
         expected = control.range if number is None else "nothing, since it is read-only"
         raise _refused_error(device, control, f"expected {expected}, got {value!r}")
     try:
-        device.try_to(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
+        device.ioctl(abi.S_CTRL, control.number, number & 0xFFFFFFFF)
     except OSError as exc:
         raise device_error(device.path, f"setting {control.name} to {value!r}", exc) from exc
-    actual = _value(device, control.number, control.flags)
+    actual = _read_value(device, control.number, control.flags)
     if actual is None or control.kind == "button":
         return number
     if actual != number and not control.flags & (abi.CTRL_VOLATILE | abi.CTRL_EXECUTE_ON_WRITE):
@@ -145,29 +146,29 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
     return actual
 
 
-def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
-    """Return the driver's descriptions by name, without values, which may be slow to read."""
-    described: dict[str, tuple[Any, ...]] = {}
+def _query_controls(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
+    """Return the driver's description of each control, without its value, which may be slow."""
+    descriptions: dict[str, tuple[Any, ...]] = {}
     number = 0
     while True:
         try:
-            answer = device.try_to(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
+            answer = device.ioctl(abi.QUERY_EXT_CTRL, number | abi.CTRL_NEXT)
         except OSError as exc:
             if exc.errno in (errno.EINVAL, errno.ENOTTY):  # end of the list
-                return described
+                return descriptions
             raise device_error(device.path, "listing its controls", exc) from exc
         if answer[0] <= number:  # the driver repeats controls
-            return described
+            return descriptions
         number = answer[0]
-        if answer[1] in KINDS and not answer[7] & abi.CTRL_DISABLED:
-            described.setdefault(simple(abi.text(answer[2])), answer)
+        if answer[1] in CONTROL_TYPES and not answer[7] & abi.CTRL_DISABLED:
+            descriptions.setdefault(normalized_name(abi.decode_text(answer[2])), answer)
 
 
 def _unknown_control_error(device: CaptureDevice, name: str) -> FrameFeatureError:
     controls = list_controls(device)
     return FrameFeatureError(
         f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
-        f"{did_you_mean(simple(name), list(controls))}",
+        f"{did_you_mean(normalized_name(name), list(controls))}",
         source=device.path,
         available=tuple(map(str, controls.values())),
     )
@@ -181,44 +182,44 @@ def _refused_error(device: CaptureDevice, control: DeviceControl, text: str) -> 
     )
 
 
-def _control(device: CaptureDevice, answer: tuple[Any, ...]) -> DeviceControl:
+def _read_control(device: CaptureDevice, answer: tuple[Any, ...]) -> DeviceControl:
     number, kind, label, least, most, step, default, flags = answer[:8]
     menu: dict[int, str] = {}
-    if KINDS[kind] == "menu":
-        menu = _menu(device, number, kind, range(least, min(most, least + 255) + 1))
+    if CONTROL_TYPES[kind] == "menu":
+        menu = _read_menu(device, number, kind, range(least, min(most, least + 255) + 1))
     return DeviceControl(
-        simple(abi.text(label)),
+        normalized_name(abi.decode_text(label)),
         number,
-        KINDS[kind],
+        CONTROL_TYPES[kind],
         least,
         most,
         step,
         default,
-        _value(device, number, flags),
+        _read_value(device, number, flags),
         menu,
         flags,
     )
 
 
-def _menu(device: CaptureDevice, number: int, kind: int, places: range) -> dict[int, str]:
+def _read_menu(device: CaptureDevice, number: int, kind: int, values: range) -> dict[int, str]:
     items: dict[int, str] = {}
-    for place in places:
+    for index in values:
         try:
-            _, _, raw = device.try_to(abi.QUERYMENU, number, place)
+            _, _, raw = device.ioctl(abi.QUERYMENU, number, index)
         except OSError as exc:
             if exc.errno == errno.EINVAL:  # a menu may have gaps
                 continue
             raise device_error(device.path, "listing a menu", exc) from exc
-        value = int.from_bytes(raw[:8], sys.byteorder, signed=True)
-        items[place] = abi.text(raw) if kind == abi.CTRL_MENU else str(value)
+        integer = int.from_bytes(raw[:8], sys.byteorder, signed=True)
+        items[index] = abi.decode_text(raw) if kind == abi.CTRL_MENU else str(integer)
     return items
 
 
-def _value(device: CaptureDevice, number: int, flags: int) -> int | None:
+def _read_value(device: CaptureDevice, number: int, flags: int) -> int | None:
     if flags & abi.CTRL_WRITE_ONLY:
         return None
     try:
-        value: int = device.try_to(abi.G_CTRL, number)[1]
+        value: int = device.ioctl(abi.G_CTRL, number)[1]
     except OSError as exc:
         if exc.errno == errno.ENODEV:
             raise device_error(device.path, "reading a control", exc) from exc

@@ -1,4 +1,4 @@
-"""An open device: its identity, formats and settings, with the driver's errors as smartcam's."""
+"""An open device: its identity, formats and settings. Errors of the driver become smartcam's."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FORMATS: Final = {
 }
 """The supported formats of V4L2."""
 
-MAX_ANSWERS: Final = 512
+MAX_ENTRIES: Final = 512
 """Largest number of entries of one enumeration; a driver with more is broken."""
 
 MAX_RATE_DEVIATION: Final = 0.01
@@ -48,14 +48,14 @@ REASONS: Final = {
 }
 
 
-def device_error(path: str, tried: str, error: OSError) -> FrameSourceError:
+def device_error(path: str, action: str, error: OSError) -> FrameSourceError:
     """Return the error for a failed system call; its text lists the existing devices."""
     number = error.errno or 0
     devices = tuple(f"{path} ({name})" for path, name in system.nodes().items())
     reason = REASONS.get(number, os.strerror(number))
     shown = f"; here are {', '.join(devices)}" if devices else "; no video device is here"
     return FrameSourceError(
-        f"{path}: {tried}: {errno.errorcode.get(number, number)}, {reason}{shown}",
+        f"{path}: {action}: {errno.errorcode.get(number, number)}, {reason}{shown}",
         source=path,
         available=devices,
     )
@@ -86,10 +86,10 @@ class Setting(NamedTuple):
 class CaptureDevice:
     """An open capture device. Its methods block while the device works."""
 
-    def __init__(self, path: str, number: int) -> None:
+    def __init__(self, path: str, descriptor: int) -> None:
         self.path = path
-        self.number = number  # the file descriptor
-        self.capability = abi.Capability(*self.ask(abi.QUERYCAP))
+        self.descriptor = descriptor  # of the open file
+        self.capability = abi.Capability(*self.checked_ioctl(abi.QUERYCAP))
 
     @classmethod
     def open(cls, path: str) -> Self:
@@ -99,51 +99,51 @@ class CaptureDevice:
             FrameSourceError: there is no such file, it is no V4L2 device, or access is denied.
         """
         try:
-            number = system.open(path)
+            descriptor = system.open(path)
         except OSError as exc:
             raise device_error(path, "opening it", exc) from exc
         try:
-            device = cls(path, number)
-            device._check()
+            device = cls(path, descriptor)
+            device._check_capabilities()
         except BaseException:
-            system.close(number)
+            system.close(descriptor)
             raise
         return device
 
     def close(self) -> None:
         """Close the device."""
-        system.close(self.number)
+        system.close(self.descriptor)
 
     @property
     def identity(self) -> tuple[str, str]:
         """Name and bus address of the device, which identify it."""
-        return abi.text(self.capability.card), abi.text(self.capability.bus_info)
+        return abi.decode_text(self.capability.card), abi.decode_text(self.capability.bus_info)
 
-    def ask(self, request: Ioctl, *fields: object, tried: str = "") -> tuple[Any, ...]:
-        """Return the driver's answer; omitted fields are 0.
+    def checked_ioctl(self, request: Ioctl, *fields: object, action: str = "") -> tuple[Any, ...]:
+        """Return the driver's answer to an ioctl; omitted fields are 0.
 
         Raises:
             FrameSourceError: the driver refuses.
         """
         try:
-            return self.try_to(request, *fields)
+            return self.ioctl(request, *fields)
         except OSError as exc:
-            raise device_error(self.path, tried or request.name, exc) from exc
+            raise device_error(self.path, action or request.name, exc) from exc
 
-    def try_to(self, request: Ioctl, *fields: object) -> tuple[Any, ...]:
-        """Return the driver's answer, or raise its OSError."""
+    def ioctl(self, request: Ioctl, *fields: object) -> tuple[Any, ...]:
+        """Return the driver's answer to an ioctl, or raise its OSError; omitted fields are 0."""
         layout = request.layout
         argument = bytearray(layout.size)
         # the input fields come first, each of 32 bits
         struct.pack_into(f"{len(fields)}I", argument, 0, *fields)
-        system.ioctl(self.number, request, argument)
+        system.ioctl(self.descriptor, request, argument)
         return layout.unpack(argument)
 
     def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
         """Yield the entries of the driver's enumeration, if it has one."""
-        for index in range(MAX_ANSWERS):
+        for index in range(MAX_ENTRIES):
             try:
-                yield self.try_to(request, index, *fields)
+                yield self.ioctl(request, index, *fields)
             except OSError as exc:
                 if exc.errno in (errno.EINVAL, errno.ENOTTY):
                     return
@@ -158,8 +158,8 @@ class CaptureDevice:
     def sizes(self, code: int) -> list[tuple[int, int]]:
         """Return the sizes of a format; for a range, the smallest and the largest."""
         sizes: list[tuple[int, int]] = []
-        for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
-            if kind == abi.DISCRETE:
+        for _, _, size_type, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
+            if size_type == abi.DISCRETE:
                 sizes.append((numbers[0], numbers[1]))
             else:
                 return [(numbers[0], numbers[3]), (numbers[1], numbers[4])]
@@ -167,8 +167,8 @@ class CaptureDevice:
 
     def size_texts(self, code: int) -> list[str]:
         """Return the sizes of a format as texts."""
-        for _, _, kind, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
-            if kind != abi.DISCRETE:
+        for _, _, size_type, *numbers in self.enumerate(abi.ENUM_FRAMESIZES, code):
+            if size_type != abi.DISCRETE:
                 least, most = f"{numbers[0]}x{numbers[3]}", f"{numbers[1]}x{numbers[4]}"
                 return [f"{least} to {most} in steps of {numbers[2]}x{numbers[5]}"]
             break
@@ -178,20 +178,20 @@ class CaptureDevice:
         """Return the frame rates, fastest first; for a range, the fastest and the slowest."""
         rates: list[float] = []
         answers = self.enumerate(abi.ENUM_FRAMEINTERVALS, code, width, height)
-        for _, _, _, _, kind, *numbers in answers:
-            last = 2 if kind == abi.DISCRETE else 4
+        for _, _, _, _, interval_type, *numbers in answers:
+            count = 2 if interval_type == abi.DISCRETE else 4
             rates += [
-                numbers[place + 1] / numbers[place]
-                for place in range(0, last, 2)
-                if numbers[place] and numbers[place + 1]
+                numbers[index + 1] / numbers[index]
+                for index in range(0, count, 2)
+                if numbers[index] and numbers[index + 1]
             ]
-            if kind != abi.DISCRETE:
+            if interval_type != abi.DISCRETE:
                 break
         return sorted(rates, reverse=True)
 
     # settings
 
-    def set(self, wanted: WantedSetting) -> Setting:
+    def apply(self, wanted: WantedSetting) -> Setting:
         """Apply a setting, and check the result.
 
         Raises:
@@ -199,20 +199,24 @@ class CaptureDevice:
                 supported ones.
             FrameSourceError: the device is in use.
         """
-        current = self._layout(self.ask(abi.G_FMT, abi.CAPTURE, tried="reading its format"))
-        code = self._code(wanted.format, current.fourcc)
+        current = self._layout(
+            self.checked_ioctl(abi.G_FMT, abi.CAPTURE, action="reading its format")
+        )
+        code = self._choose_format(wanted.format, current.fourcc)
         width, height = wanted.size or (current.width, current.height)
         layout = self._layout(
-            self.ask(
+            self.checked_ioctl(
                 abi.S_FMT, abi.CAPTURE, *self._padding(), width, height, code, abi.FIELD_NONE,
-                tried="setting its format",
+                action="setting its format",
             )
         )  # fmt: skip
-        self._compare(code, wanted.size, layout)
-        pixel_format = self._coloured(FORMATS[code], layout)
-        return Setting(pixel_format, layout, self._rate(wanted.rate, layout))
+        self._check_applied(code, wanted.size, layout)
+        pixel_format = self._with_matrix_and_range(FORMATS[code], layout)
+        return Setting(pixel_format, layout, self._apply_rate(wanted.rate, layout))
 
-    def _coloured(self, pixel_format: PixelFormat, layout: BufferLayout) -> PixelFormat:
+    def _with_matrix_and_range(
+        self, pixel_format: PixelFormat, layout: BufferLayout
+    ) -> PixelFormat:
         """Return the format with the device's matrix and range.
 
         Raises:
@@ -225,10 +229,10 @@ class CaptureDevice:
             return find_format(f"{pixel_format.name}_limited") if limited else pixel_format
         if not isinstance(pixel_format.layout, YuvPairs | Planes):
             return pixel_format
-        by_default = abi.MATRIX_OF_COLORSPACE.get(layout.colorspace, "601")
-        matrix = abi.MATRIX_OF_ENCODING.get(encoding, by_default)
-        jpeg = quantization == 0 and layout.colorspace == abi.COLORSPACE_JPEG
-        full = " full" if jpeg or quantization == abi.FULL_RANGE else ""
+        default_matrix = abi.MATRIX_OF_COLORSPACE.get(layout.colorspace, "601")
+        matrix = abi.MATRIX_OF_ENCODING.get(encoding, default_matrix)
+        is_jpeg = quantization == 0 and layout.colorspace == abi.COLORSPACE_JPEG
+        full = " full" if is_jpeg or quantization == abi.FULL_RANGE else ""
         if matrix not in MATRICES:
             raise FrameFormatError(
                 f"{self.path}: expected Y, U and V by BT.601, BT.709 or BT.2020, the device has "
@@ -237,15 +241,15 @@ class CaptureDevice:
             )
         return with_matrix(pixel_format, matrix + full)
 
-    def _check(self) -> None:
+    def _check_capabilities(self) -> None:
         """Check that the device captures pictures in a supported way."""
-        has = self.capability
-        by_device = has.capabilities & abi.CAP_DEVICE_CAPS
-        does = has.device_caps if by_device else has.capabilities
-        if does & abi.CAP_VIDEO_CAPTURE and does & abi.CAP_STREAMING:
+        reported = self.capability
+        has_device_caps = reported.capabilities & abi.CAP_DEVICE_CAPS
+        flags = reported.device_caps if has_device_caps else reported.capabilities
+        if flags & abi.CAP_VIDEO_CAPTURE and flags & abi.CAP_STREAMING:
             return
         kind = next(
-            (name for bit, name in _OTHER_KINDS.items() if does & bit),
+            (name for bit, name in _OTHER_DEVICES.items() if flags & bit),
             "no camera: it captures no pictures, or does not stream them",
         )
         devices = tuple(f"{path} ({name})" for path, name in system.nodes().items())
@@ -264,32 +268,32 @@ class CaptureDevice:
     def _layout(answer: tuple[Any, ...]) -> BufferLayout:
         return abi.BufferLayout(*answer[1:12])
 
-    def _code(self, wanted: PixelFormat | None, current: int) -> int:
-        """Return the fourcc to stream."""
+    def _choose_format(self, wanted: PixelFormat | None, current: int) -> int:
+        """Return the fourcc of the format to stream."""
         if wanted is None:
-            known = [code for code in (current, *self.formats()) if code in FORMATS]
+            codes = [code for code in (current, *self.formats()) if code in FORMATS]
         else:
-            known = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
-        if not known:
+            codes = [abi.fourcc(wanted.fourcc)] if wanted.fourcc else []
+        if not codes:
             raise self._no_format_error("a supported format" if wanted is None else wanted.name)
-        return known[0]
+        return codes[0]
 
     def _no_format_error(self, expected: str) -> FrameFormatError:
-        offered = tuple(_named(code) for code in self.formats())
+        offered = tuple(_format_name(code) for code in self.formats())
         return FrameFormatError(
             f"{self.path}: expected {expected}, it has {', '.join(offered) or 'none'}",
             source=self.path,
             available=offered,
         )
 
-    def _compare(self, code: int, size: tuple[int, int] | None, actual: BufferLayout) -> None:
-        """Check that the device applied the setting."""
+    def _check_applied(self, code: int, size: tuple[int, int] | None, actual: BufferLayout) -> None:
+        """Check that the device applied the format and the size."""
         if actual.fourcc != code:
-            raise self._no_format_error(_named(code))
+            raise self._no_format_error(_format_name(code))
         if size is not None and size != (actual.width, actual.height):
             offered = tuple(self.size_texts(code))
             raise FrameFormatError(
-                f"{self.path}: expected {_named(code)} {size[0]}x{size[1]}, the device took "
+                f"{self.path}: expected {_format_name(code)} {size[0]}x{size[1]}, the device took "
                 f"{actual.width}x{actual.height}; it has "
                 f"{', '.join(offered) or 'no list of sizes'}",
                 source=self.path,
@@ -302,20 +306,24 @@ class CaptureDevice:
                 source=self.path,
             )
 
-    def _rate(self, wanted: float | None, layout: BufferLayout) -> float | None:
-        """Set the rate if one is wanted; return the device's rate."""
+    def _apply_rate(self, wanted: float | None, layout: BufferLayout) -> float | None:
+        """Set the rate if one is requested; return the device's rate."""
         try:
-            _, can, _, over, under, *_ = self.try_to(abi.G_PARM, abi.CAPTURE)
-            if wanted is not None and can & abi.CAP_TIMEPERFRAME:
+            _, flags, _, numerator, denominator, *_ = self.ioctl(abi.G_PARM, abi.CAPTURE)
+            if wanted is not None and flags & abi.CAP_TIMEPERFRAME:
                 period = 1 / Fraction(wanted).limit_denominator(1001)
-                _, can, _, over, under, *_ = self.try_to(
+                _, flags, _, numerator, denominator, *_ = self.ioctl(
                     abi.S_PARM, abi.CAPTURE, 0, 0, period.numerator, period.denominator
                 )
         except OSError as exc:
             if exc.errno not in (errno.ENOTTY, errno.EINVAL):
                 raise device_error(self.path, "setting its rate", exc) from exc
-            can = over = under = 0
-        actual = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
+            flags = numerator = denominator = 0
+        actual = (
+            denominator / numerator
+            if flags & abi.CAP_TIMEPERFRAME and numerator and denominator
+            else None
+        )
         if wanted is not None and (
             actual is None or abs(actual - wanted) > wanted * MAX_RATE_DEVIATION
         ):
@@ -323,7 +331,7 @@ class CaptureDevice:
                 f"{rate:g}/s" for rate in self.rates(layout.fourcc, layout.width, layout.height)
             )
             raise FrameFormatError(
-                f"{self.path}: expected {wanted:g} frames/s of {_named(layout.fourcc)} "
+                f"{self.path}: expected {wanted:g} frames/s of {_format_name(layout.fourcc)} "
                 f"{layout.width}x{layout.height}, the device took "
                 f"{'an unknown rate' if actual is None else f'{actual:g}'}; it has "
                 f"{', '.join(offered) or 'no list of rates'}",
@@ -333,7 +341,7 @@ class CaptureDevice:
         return actual
 
 
-_OTHER_KINDS: Final = {
+_OTHER_DEVICES: Final = {
     abi.CAP_VIDEO_M2M: "a codec",
     abi.CAP_VIDEO_M2M_MPLANE: "a codec",
     abi.CAP_VIDEO_CAPTURE_MPLANE: "a camera with pictures of several planes in as many buffers, "
@@ -342,7 +350,9 @@ _OTHER_KINDS: Final = {
 }
 
 
-def _named(code: int) -> str:
-    known = FORMATS.get(code)
+def _format_name(code: int) -> str:
+    pixel_format = FORMATS.get(code)
     name = abi.fourcc_text(code)
-    return name if known is None or known.name == name else f"{known.name} ({name})"
+    if pixel_format is None or pixel_format.name == name:
+        return name
+    return f"{pixel_format.name} ({name})"

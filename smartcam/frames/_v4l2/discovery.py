@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-def find() -> list[FoundSource]:
+def find_cameras() -> list[FoundSource]:
     """Return a source for each video device; a remark says why a device cannot be opened.
 
     Devices of metadata or codecs are left out, since they capture no pictures.
     """
-    devices = [_look(path, name) for path, name in system.nodes().items()]
+    devices = [_probe(path, name) for path, name in system.nodes().items()]
     return [device for device in devices if device is not None]
 
 
-def _look(path: str, name: str) -> FoundSource | None:
+def _probe(path: str, name: str) -> FoundSource | None:
     url = f"v4l2://{path}"
     try:
         device = CaptureDevice.open(path)
@@ -35,16 +35,17 @@ def _look(path: str, name: str) -> FoundSource | None:
     with closing(device):
         try:
             formats = device.formats()
-            known = tuple(format_ for code in formats for format_ in _formats(device, code))
+            supported = tuple(format_ for code in formats for format_ in _formats(device, code))
         except FrameSourceError as exc:
             return FoundSource(url, name, remark=str(exc))
     others = [abi.fourcc_text(code) for code in formats if code not in FORMATS]
     remark = f"also has {', '.join(others)}, not supported" if others else ""
-    return FoundSource(url, device.identity[0], known, remark)
+    return FoundSource(url, device.identity[0], supported, remark)
 
 
 def _formats(device: CaptureDevice, code: int) -> Iterator[StreamFormat]:
-    known = FORMATS.get(code)
-    if known is not None:
+    pixel_format = FORMATS.get(code)
+    if pixel_format is not None:
         for width, height in device.sizes(code):
-            yield StreamFormat(known, width, height, tuple(device.rates(code, width, height)))
+            rates = tuple(device.rates(code, width, height))
+            yield StreamFormat(pixel_format, width, height, rates)

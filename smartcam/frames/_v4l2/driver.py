@@ -13,7 +13,7 @@ from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._v4l2.controls import list_controls, set_control
 from smartcam.frames._v4l2.device import FORMATS, CaptureDevice, WantedSetting
-from smartcam.frames._v4l2.discovery import find
+from smartcam.frames._v4l2.discovery import find_cameras
 from smartcam.frames._v4l2.features import V4L2Features
 from smartcam.frames._v4l2.stream import CaptureStream
 
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 
 DEVICE_TIMEOUT: Final = 10.0
-"""Seconds for opening, setting and starting a device; the slowest cameras take one or two."""
+"""Longest time for one call to a device, seconds; the slowest cameras take one or two seconds."""
 
-CONTROL: Final = "control."
+CONTROL_PREFIX: Final = "control."
 """Prefix of the parameters that set a control."""
 
 
 class V4L2Driver(FrameDriver):
     """A camera of the Linux kernel: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``.
 
-    Settings that are not in the URL keep the device's values. An unsupported setting raises a
-    :exc:`~smartcam.FrameFormatError` that lists the supported ones.
+    A setting that is not in the URL keeps the device's value. An unsupported setting raises a
+    :exc:`~smartcam.FrameFormatError` that lists the supported values.
 
     - the path: path of the device; ``/dev/v4l/by-id/...`` finds the camera at any port.
     - ``format``: pixel format, by its name in PFNC or V4L2.
@@ -64,28 +64,32 @@ class V4L2Driver(FrameDriver):
         controls = [
             name
             for name, _ in parse_qsl(address.query, keep_blank_values=True)
-            if name.startswith(CONTROL) and name != CONTROL
+            if name.startswith(CONTROL_PREFIX) and name != CONTROL_PREFIX
         ]
-        known = ["format", "size", "fps", "buffers"]
-        given = address.parameters([*known, *(controls or [f"{CONTROL}NAME"])])
+        names = ["format", "size", "fps", "buffers"]
+        parameters = address.parameters([*names, *(controls or [f"{CONTROL_PREFIX}NAME"])])
         self._path = address.path
         if address.host or self._path in ("", "/"):
             raise address.wrong("path", "a device, as in v4l2:///dev/video0", address.shown)
-        self._wanted = WantedSetting(
-            find_format(given["format"]) if "format" in given else None,
-            address.size(given["size"]) if "size" in given else None,
-            address.number("fps", given["fps"], 0.001, 100_000) if "fps" in given else None,
+        self._wanted_setting = WantedSetting(
+            find_format(parameters["format"]) if "format" in parameters else None,
+            address.size(parameters["size"]) if "size" in parameters else None,
+            address.number("fps", parameters["fps"], 0.001, 100_000)
+            if "fps" in parameters
+            else None,
         )
-        buffers = address.number("buffers", given.get("buffers", "4"), 2, 32)
+        buffers = address.number("buffers", parameters.get("buffers", "4"), 2, 32)
         if buffers != int(buffers):
-            raise address.wrong("buffers", "a whole number", given["buffers"])
+            raise address.wrong("buffers", "a whole number", parameters["buffers"])
         self._buffers = int(buffers)
         self._controls = {
-            name.removeprefix(CONTROL): given[name] for name in controls if name in given
+            name.removeprefix(CONTROL_PREFIX): parameters[name]
+            for name in controls
+            if name in parameters
         }
         self._identity: tuple[str, str] | None = None
         self._stream: CaptureStream | None = None  # used by the thread; the loop reads frames
-        self._watched: int | None = None
+        self._watched_descriptor: int | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     @classmethod
@@ -93,26 +97,28 @@ class V4L2Driver(FrameDriver):
         """Return this machine's cameras with their formats."""
         thread = ThreadPoolExecutor(1, "v4l2")
         try:
-            return await asyncio.get_running_loop().run_in_executor(thread, find)
+            return await asyncio.get_running_loop().run_in_executor(thread, find_cameras)
         finally:
             thread.shutdown(wait=False)
 
     async def open(self) -> StreamFormat:
         """Open the device, check the URL's settings, and close it again."""
         self._thread = ThreadPoolExecutor(1, f"v4l2 {self._path}")
-        return await self._do(self._try, "be opened")
+        return await self._run_in_thread(self._check_device, "be opened")
 
     async def start(self, sink: FrameSink) -> None:
         """Open the device and start its stream."""
-        stream = await self._do(self._begin, "start")
-        self._watched = stream.device.number
-        asyncio.get_running_loop().add_reader(self._watched, self._ready, stream, sink)
+        stream = await self._run_in_thread(self._start_stream, "start")
+        self._watched_descriptor = stream.device.descriptor
+        asyncio.get_running_loop().add_reader(
+            self._watched_descriptor, self._on_readable, stream, sink
+        )
 
     async def stop(self) -> None:
         """Stop the stream and close the device."""
-        self._unwatch()
+        self._stop_watching()
         if self._thread is not None:
-            await self._do(self._end, "stop")
+            await self._run_in_thread(self._stop_stream, "stop")
 
     async def close(self) -> None:
         """Close the device, and end the thread."""
@@ -134,7 +140,9 @@ class V4L2Driver(FrameDriver):
         Raises:
             FrameSourceError: the device is missing.
         """
-        return await self._do(lambda: self._with_device(list_controls), "list its controls")
+        return await self._run_in_thread(
+            lambda: self._with_device(list_controls), "list its controls"
+        )
 
     async def set_control(self, name: str, value: int | str) -> int:
         """Set a control now; the URL's controls are set again at the next start.
@@ -146,76 +154,76 @@ class V4L2Driver(FrameDriver):
             FrameSourceError: there is no control of that name, or it does not accept the value; the
                 text lists the controls or the range.
         """
-        return await self._do(
+        return await self._run_in_thread(
             lambda: self._with_device(lambda device: set_control(device, name, value)),
             f"set {name}",
         )
 
     # in the event loop
 
-    def _ready(self, stream: CaptureStream, sink: FrameSink) -> None:
+    def _on_readable(self, stream: CaptureStream, sink: FrameSink) -> None:
         try:
             stream.drain(sink)
         except FrameSourceError as exc:
-            self._unwatch()
+            self._stop_watching()
             sink.ended(exc)
 
-    def _unwatch(self) -> None:
-        watched, self._watched = self._watched, None
-        if watched is not None:
-            asyncio.get_running_loop().remove_reader(watched)
+    def _stop_watching(self) -> None:
+        descriptor, self._watched_descriptor = self._watched_descriptor, None
+        if descriptor is not None:
+            asyncio.get_running_loop().remove_reader(descriptor)
 
-    async def _do(self, job: Callable[[], Value], action: str) -> Value:
+    async def _run_in_thread(self, job: Callable[[], Value], action: str) -> Value:
         """Run a job in the thread, in the order of the calls.
 
         Cancellation: the job runs nevertheless, and the next :meth:`stop` cleans up.
         """
         if self._thread is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`")
-        done = asyncio.get_running_loop().run_in_executor(self._thread, job)
-        done.add_done_callback(_retrieve_error)
-        finished, _ = await asyncio.wait([done], timeout=DEVICE_TIMEOUT)
+        future = asyncio.get_running_loop().run_in_executor(self._thread, job)
+        future.add_done_callback(_retrieve_error)
+        finished, _ = await asyncio.wait([future], timeout=DEVICE_TIMEOUT)
         if not finished:
             raise FrameSourceError(
                 f"{self.name}: the device did not {action} within {DEVICE_TIMEOUT:g} s",
                 source=self.name,
             )
-        return done.result()
+        return future.result()
 
     # in the thread
 
-    def _try(self) -> StreamFormat:
+    def _check_device(self) -> StreamFormat:
         with closing(CaptureDevice.open(self._path)) as device:
-            setting = self._set(device)
+            setting = self._apply_setting(device)
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        asked_format = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
+        v4l2_format = FORMATS[setting.layout.fourcc]  # V4L2's format, without matrix and range
         # keep the device's choice
-        self._wanted = WantedSetting(asked_format, size, self._wanted.rate)
+        self._wanted_setting = WantedSetting(v4l2_format, size, self._wanted_setting.rate)
         return StreamFormat(setting.format, *size, rates)
 
-    def _begin(self) -> CaptureStream:
+    def _start_stream(self) -> CaptureStream:
         device = CaptureDevice.open(self._path)
         try:
             if device.identity != self._identity:
                 raise self._other_device_error(device)
-            setting = self._set(device)
+            setting = self._apply_setting(device)
             self._stream = CaptureStream(device, setting, self._buffers, self.name)
         except BaseException:
             device.close()
             raise
         return self._stream
 
-    def _end(self) -> None:
+    def _stop_stream(self) -> None:
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
 
-    def _set(self, device: CaptureDevice) -> Setting:
+    def _apply_setting(self, device: CaptureDevice) -> Setting:
         for name, value in self._controls.items():
             set_control(device, name, value)
-        return device.set(self._wanted)
+        return device.apply(self._wanted_setting)
 
     def _with_device(self, job: Callable[[CaptureDevice], Value]) -> Value:
         if self._stream is not None:
@@ -235,7 +243,7 @@ class V4L2Driver(FrameDriver):
         )
 
 
-def _retrieve_error(done: asyncio.Future[Value]) -> None:
+def _retrieve_error(future: asyncio.Future[Value]) -> None:
     """Mark the error of an abandoned job as retrieved."""
-    if not done.cancelled():
-        done.exception()
+    if not future.cancelled():
+        future.exception()

@@ -1,7 +1,7 @@
 """A V4L2 device's controls as features, by SFNC's names and units if it has them.
 
-A control that SFNC lacks keeps its own name, its label in lower case with underscores. Both names
-of a control work.
+A control that SFNC lacks has its own name: its label in lower case with underscores. A control that
+SFNC has is found by both names.
 
 Source: V4L2 documentation, user, camera and image process control classes (numbers and units:
 ``V4L2_CID_EXPOSURE_ABSOLUTE`` counts 100 us); SFNC 2.7 (names; entries of ``...Auto``).
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import FrameFeatureError
-from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, spelled
+from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, spelling_key
 from smartcam.frames._v4l2 import abi
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ SFNC: Final = {
     0x00980915: SfncFeature("ReverseY"),
     0x009F0903: SfncFeature("TestPattern"),
 }
-"""Features by the number of the control."""
+"""Features of SFNC by the id of the control in V4L2."""
 
 APERTURE_PRIORITY: Final = 3
 """V4L2_EXPOSURE_APERTURE_PRIORITY: automatic exposure time with manual iris, which most webcams use
@@ -77,8 +77,7 @@ class ControlFeature:
 
     def __init__(self, control: DeviceControl) -> None:
         self.control = control
-        known = SFNC.get(control.number)
-        self._sfnc = known or SfncFeature(control.name)
+        self._sfnc = SFNC.get(control.number) or SfncFeature(control.name)
         entries = dict(self._sfnc.entries)
         if self.name == "ExposureAuto" and 0 not in control.menu:
             entries[APERTURE_PRIORITY] = entries.pop(0)
@@ -92,10 +91,10 @@ class ControlFeature:
 
     @property
     def spellings(self) -> set[str]:
-        """Letters and digits of all names of the feature."""
-        return {spelled(self.name), spelled(self.control.name)}
+        """Names by which the feature is found, reduced to letters and digits."""
+        return {spelling_key(self.name), spelling_key(self.control.name)}
 
-    def value(self, number: int | None) -> FeatureValue | None:
+    def to_value(self, number: int | None) -> FeatureValue | None:
         """Return the feature's value for a number of the control."""
         if number is None or self.control.kind == "button":
             return None
@@ -105,25 +104,26 @@ class ControlFeature:
             return bool(number)
         return number if self._sfnc.factor == 1 else float(number * self._sfnc.factor)
 
-    def number(self, value: FeatureValue) -> int | None:
+    def to_number(self, value: FeatureValue) -> int | None:
         """Return the control's number for a value; None: the device has no such value."""
         if self._entries:
-            wanted = spelled(str(value))
+            wanted = spelling_key(str(value))
             names = self._entries.items()
-            return next((number for number, name in names if spelled(name) == wanted), None)
+            return next((number for number, name in names if spelling_key(name) == wanted), None)
         if isinstance(value, float) and self._sfnc.factor == 1:
-            return self.control.number_of(int(value)) if value.is_integer() else None
+            return self.control.parse_value(int(value)) if value.is_integer() else None
         if not isinstance(value, float) and self._sfnc.factor == 1:
-            return self.control.number_of(value)
+            return self.control.parse_value(value)
         try:
             number = round(float(value) / self._sfnc.factor)
         except (ValueError, OverflowError):
             return None
-        inside = self.control.least <= number <= self.control.most
-        step = max(1, self.control.step)
-        return self.control.least + (number - self.control.least) // step * step if inside else None
+        least, step = self.control.least, max(1, self.control.step)
+        if not least <= number <= self.control.most:
+            return None
+        return least + (number - least) // step * step
 
-    def described(self) -> Feature:
+    def to_feature(self) -> Feature:
         """Return the feature with its range and its present value."""
         control = self.control
         access: Literal["rw", "ro", "wo"] = "rw"
@@ -135,15 +135,15 @@ class ControlFeature:
         factor = self._sfnc.factor
         if factor != 1:
             kind = "float"
-        ranged = kind in ("integer", "float") and control.kind != "bitmask"
+        has_range = kind in ("integer", "float") and control.kind != "bitmask"
         return Feature(
             self.name,
             kind,
             access,
-            value=self.value(control.value),
-            minimum=control.least * factor if ranged else None,
-            maximum=control.most * factor if ranged else None,
-            step=max(1, control.step) * factor if ranged else None,
+            value=self.to_value(control.value),
+            minimum=control.least * factor if has_range else None,
+            maximum=control.most * factor if has_range else None,
+            step=max(1, control.step) * factor if has_range else None,
             unit=self._sfnc.unit,
             entries=tuple(self._entries.values()),
             description=f"V4L2 control {control.name}",
@@ -160,25 +160,25 @@ class V4L2Features(DeviceFeatures):
     def __init__(self, driver: V4L2Driver) -> None:
         self._driver = driver
 
-    async def _all(self) -> list[ControlFeature]:
+    async def _control_features(self) -> list[ControlFeature]:
         return [ControlFeature(control) for control in (await self._driver.controls()).values()]
 
     async def names(self) -> list[str]:
         """Return the names of all features."""
-        return [feature.name for feature in await self._all()]
+        return [feature.name for feature in await self._control_features()]
 
     async def describe_all(self) -> dict[str, Feature]:
         """Return all features with their current values and ranges."""
-        return {feature.name: feature.described() for feature in await self._all()}
+        return {feature.name: feature.to_feature() for feature in await self._control_features()}
 
     async def describe(self, name: str) -> Feature:
         """Return a feature with its current value and range."""
-        return (await self._feature_named(name)).described()
+        return (await self._feature_named(name)).to_feature()
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a feature."""
         feature = await self._feature_named(name)
-        value = feature.value(feature.control.value)
+        value = feature.to_value(feature.control.value)
         if value is None:
             raise self._feature_error(feature, "it has no value that can be read")
         return value
@@ -188,13 +188,13 @@ class V4L2Features(DeviceFeatures):
         feature = await self._feature_named(name)
         if feature.control.kind == "button":
             raise self._feature_error(feature, "it is a command: it is executed")
-        number = feature.number(value)
+        number = feature.to_number(value)
         if number is None:
             raise self._feature_error(
-                feature, f"expected {feature.described().range}, got {value!r}"
+                feature, f"expected {feature.to_feature().range}, got {value!r}"
             )
-        has = await self._driver.set_control(feature.control.name, number)
-        actual = feature.value(has)
+        new_number = await self._driver.set_control(feature.control.name, number)
+        actual = feature.to_value(new_number)
         return value if actual is None else actual
 
     async def execute(self, name: str) -> None:
@@ -205,8 +205,8 @@ class V4L2Features(DeviceFeatures):
         await self._driver.set_control(feature.control.name, 1)
 
     async def _feature_named(self, name: str) -> ControlFeature:
-        features = await self._all()
-        wanted = spelled(name)
+        features = await self._control_features()
+        wanted = spelling_key(name)
         for feature in features:
             if wanted in feature.spellings:
                 return feature
@@ -222,5 +222,5 @@ class V4L2Features(DeviceFeatures):
         return FrameFeatureError(
             f"{self._driver.name}: feature {feature.name}: {text}",
             source=self._driver.name,
-            available=(str(feature.described()),),
+            available=(str(feature.to_feature()),),
         )

@@ -1,4 +1,4 @@
-"""Interpret a driver's time stamps: their moment of the frame, and whether they are plausible."""
+"""Interpret a driver's time stamps: the moment that they mean, and whether they are plausible."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ class BufferStamps:
     """The time stamps of one stream.
 
     A stamp of the monotonic clock is the start of the exposure or the end of the frame, depending
-    on its flags. With the end stamped, the exposure began at most two periods before: one of
-    exposure, one of readout. Other and implausible stamps are not used: such a frame began at most
-    two periods before the queue of filled buffers was last empty.
+    on its flags. If it is the end, the exposure began at most two periods earlier: one of exposure
+    and one of readout. Stamps of other clocks and implausible stamps are not used. Such a frame
+    began at most two periods before the queue of filled buffers was last empty.
 
     Args:
         name: name of the camera, for the log.
         period: period of a frame, seconds; None: unknown. If frames come slower, as in the dark,
             their measured period is used.
-        began: when the device began to stream, seconds of ``time.monotonic()``.
+        started_at: when the device began to stream, seconds of ``time.monotonic()``.
 
     Source: V4L2 documentation, buffer flags (published); two periods: derived.
     """
 
-    def __init__(self, name: str, period: float | None, began: float) -> None:
+    def __init__(self, name: str, period: float | None, started_at: float) -> None:
         self._name = name
-        self._given_period = period
-        self._began = self._empty = began
-        # stamp and number of the frame before; at first, from before the stream
-        self._last: tuple[float, int | None] = (began - 2 * (period or DEFAULT_DURATION), None)
-        self.is_newest = False  # whether the last frame is so young that no later one can wait
-        self._doubted = False
+        self._nominal_period = period
+        self._last_empty_at = started_at  # when the queue of filled buffers was last empty
+        # stamp and number of the last frame; before the first frame, a time before the stream
+        self._last: tuple[float, int | None] = (started_at - 2 * (period or DEFAULT_DURATION), None)
+        self.is_queue_empty = False  # whether the last frame is too new for another to wait
+        self._has_warned = False
 
-    def note_queue_empty(self, now: float) -> None:
-        """Note that no filled buffer waits."""
-        self._empty = now
+    def set_queue_empty(self, now: float) -> None:
+        """Record that no filled buffer waits now."""
+        self._last_empty_at = now
 
-    def read(self, seconds: float, flags: int, number: int, now: float) -> BufferStamp:
+    def frame_stamp(self, seconds: float, flags: int, number: int, now: float) -> BufferStamp:
         """Return the time of a frame.
 
         Args:
@@ -62,36 +62,37 @@ class BufferStamps:
             number: number of the frame, lost frames included.
             now: present time, seconds of ``time.monotonic()``.
         """
-        self.is_newest = False
-        kind = flags & abi.TIMESTAMP_MASK
-        if kind != abi.TIMESTAMP_MONOTONIC:
-            return self._arrived(now, seconds if kind == abi.TIMESTAMP_COPY else None)
-        starts = flags & abi.TSTAMP_SRC_MASK == abi.TSTAMP_SRC_SOE
-        period = self._given_period or DEFAULT_DURATION
-        last, then = self._last
-        if not last < seconds <= (now if starts else now + period):
-            self._doubt(seconds, now)
-            return self._arrived(now, seconds)
+        self.is_queue_empty = False
+        clock = flags & abi.TIMESTAMP_MASK
+        if clock != abi.TIMESTAMP_MONOTONIC:
+            return self._arrival_stamp(now, seconds if clock == abi.TIMESTAMP_COPY else None)
+        is_start = flags & abi.TSTAMP_SRC_MASK == abi.TSTAMP_SRC_SOE
+        period = self._nominal_period or DEFAULT_DURATION
+        last, last_number = self._last
+        if not last < seconds <= (now if is_start else now + period):
+            self._warn_implausible(seconds, now)
+            return self._arrival_stamp(now, seconds)
         self._last = (seconds, number)
-        self.is_newest = now - seconds < (self._given_period or 0.0)
-        if self.is_newest:
-            self._empty = now
-        if starts:
+        self.is_queue_empty = now - seconds < (self._nominal_period or 0.0)
+        if self.is_queue_empty:
+            self._last_empty_at = now
+        if is_start:
             return BufferStamp(seconds, Moment.EXPOSURE_START, 0.0, None)
-        if then is not None:
-            period = max(self._given_period or 0.0, (seconds - last) / max(1, number - then))
+        if last_number is not None:
+            measured = (seconds - last) / max(1, number - last_number)
+            period = max(self._nominal_period or 0.0, measured)
         # some drivers stamp with the expected end; a received frame has ended
         return BufferStamp(min(seconds, now), Moment.FRAME_END, 2 * period, None)
 
-    def _arrived(self, now: float, device_time: float | None) -> BufferStamp:
-        duration = now - self._empty + 2 * (self._given_period or DEFAULT_DURATION)
+    def _arrival_stamp(self, now: float, device_time: float | None) -> BufferStamp:
+        duration = now - self._last_empty_at + 2 * (self._nominal_period or DEFAULT_DURATION)
         return BufferStamp(now, Moment.ARRIVAL, duration, device_time)
 
-    def _doubt(self, seconds: float, now: float) -> None:
-        if not self._doubted:
+    def _warn_implausible(self, seconds: float, now: float) -> None:
+        if not self._has_warned:
             _log.warning(
                 "%s: a time stamp is %+.3f s from now, which is not plausible; using the arrival",
                 self._name,
                 seconds - now,
             )
-        self._doubted = True
+        self._has_warned = True

@@ -1,4 +1,4 @@
-"""Stream from a device: turn full buffers into frames, and count broken ones."""
+"""Stream from a device: convert filled buffers to frames, and count buffers without a picture."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ if TYPE_CHECKING:
     from smartcam.frames._v4l2.buffers import FilledBuffer
     from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
-MAX_BAD_IN_A_ROW: Final = 30
-"""Number of buffers in a row without a picture, after which the stream fails."""
+MAX_CONSECUTIVE_BAD: Final = 30
+"""Number of consecutive buffers without a picture after which the stream fails."""
 
-MAX_EMPTY_IN_A_ROW: Final = 1000
-"""Number of times that the system may report a filled buffer without having one."""
+MAX_CONSECUTIVE_EMPTY: Final = 1000
+"""Largest number of consecutive times that the system reports a filled buffer without having one.
+"""
 
-HALF_OF_NUMBERS: Final = 1 << 31
+HALF_SEQUENCE_RANGE: Final = 1 << 31
 """Half of the range of 32-bit frame numbers: a larger step forwards is a step backwards."""
 
 
@@ -56,6 +57,7 @@ class CaptureStream:
         self._buffers = Buffers(device, buffers)
         self._sequence: int | None = None  # driver's number of the last frame
         self._unwrapped_sequence = 0
+        # consecutive buffers without a picture, and consecutive calls without a filled buffer
         self._bad = self._empty = 0
 
     def close(self) -> None:
@@ -71,34 +73,34 @@ class CaptureStream:
         """
         for _ in range(len(self._buffers)):
             try:
-                full = self._buffers.take()
+                filled = self._buffers.take_picture()
             except BlockingIOError:
-                self._stamps.note_queue_empty(system.now())
-                self._none_was_there()
+                self._stamps.set_queue_empty(system.now())
+                self._count_empty()
                 return
             except OSError as exc:
                 raise device_error(self._name, "taking a picture", exc) from exc
             self._empty = 0
-            frame = self._frame(full, sink)
+            frame = self._to_frame(filled, sink)
             if frame is not None:
                 sink.frame(frame)
-                if self._stamps.is_newest:
+                if self._stamps.is_queue_empty:
                     return
 
-    def _frame(self, full: FilledBuffer, sink: FrameSink) -> Frame | None:
+    def _to_frame(self, filled: FilledBuffer, sink: FrameSink) -> Frame | None:
         """Return the frame in a buffer; count a buffer without a whole picture as lost."""
-        steps = self._steps(full.sequence)
-        if len(full.data) < self._min_bytes:
-            sink.lost(steps)
+        step = self._advance_sequence(filled.sequence)
+        if len(filled.data) < self._min_bytes:
+            sink.lost(step)
             self._bad += 1
-            if self._bad >= MAX_BAD_IN_A_ROW:
-                raise self._no_pictures_error(full)
+            if self._bad >= MAX_CONSECUTIVE_BAD:
+                raise self._no_pictures_error(filled)
             return None
         self._bad = 0
         now, utc = system.now(), time.time()
-        stamp = self._stamps.read(full.seconds, full.flags, self._unwrapped_sequence, now)
+        stamp = self._stamps.frame_stamp(filled.stamp, filled.flags, self._unwrapped_sequence, now)
         return Frame(
-            data=full.data,
+            data=filled.data,
             format=self._format,
             width=self._width,
             height=self._height,
@@ -109,31 +111,35 @@ class CaptureStream:
             duration=stamp.duration,
             device_time=stamp.device_time,
             sequence=self._unwrapped_sequence,
-            lost=steps - 1,
+            lost=step - 1,
             source=self._name,
         )
 
-    def _none_was_there(self) -> None:
+    def _count_empty(self) -> None:
         self._empty += 1
-        if self._empty > MAX_EMPTY_IN_A_ROW:
+        if self._empty > MAX_CONSECUTIVE_EMPTY:
             raise FrameSourceError(
                 f"{self._name}: the driver reports a picture, but has none",
                 source=self._name,
             )
 
-    def _steps(self, sequence: int) -> int:
-        """Return the step of the frame number; 1 for a driver that does not count."""
+    def _advance_sequence(self, sequence: int) -> int:
+        """Record a frame's number; return its step, which is 1 for a driver that does not count."""
         last, self._sequence = self._sequence, sequence
         if last is None:
             self._unwrapped_sequence = sequence
             return 1
-        steps = (sequence - last) % (2 * HALF_OF_NUMBERS)
-        steps = steps if 0 < steps < HALF_OF_NUMBERS else 1
-        self._unwrapped_sequence += steps
-        return steps
+        step = (sequence - last) % (2 * HALF_SEQUENCE_RANGE)
+        step = step if 0 < step < HALF_SEQUENCE_RANGE else 1
+        self._unwrapped_sequence += step
+        return step
 
-    def _no_pictures_error(self, full: FilledBuffer) -> FrameFormatError:
-        content = "an error of the device" if full.flags & abi.BUF_ERROR else f"{full.used} bytes"
+    def _no_pictures_error(self, filled: FilledBuffer) -> FrameFormatError:
+        content = (
+            "an error of the device"
+            if filled.flags & abi.BUF_ERROR
+            else f"{filled.used_bytes} bytes"
+        )
         return FrameFormatError(
             f"{self._name}: expected {self._format.name} {self._width}x{self._height}, "
             f"{self._min_bytes} bytes or more, got {content} {self._bad} times in a row",

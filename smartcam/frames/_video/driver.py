@@ -50,11 +50,11 @@ LIVE_OPTIONS: Final = {"fpsprobesize": "0", "probesize": "32768", "analyzedurati
 """FFmpeg's options for a live stream, which it otherwise analyses and delays by a second."""
 
 _COMMON: Final = ("delay", "elsewhere", "format", "name", "timeout")
-_RECORDED: Final = ("fps", "pace")
-_KNOWN: Final = {
-    "file": ("format", "mixed", "name", "timeout", *_RECORDED),
-    "http": (*_COMMON, *_RECORDED),
-    "https": (*_COMMON, *_RECORDED, "ca", "verify"),
+_FOR_RECORDINGS: Final = ("fps", "pace")
+_PARAMETERS: Final = {
+    "file": ("format", "mixed", "name", "timeout", *_FOR_RECORDINGS),
+    "http": (*_COMMON, *_FOR_RECORDINGS),
+    "https": (*_COMMON, *_FOR_RECORDINGS, "ca", "verify"),
     "rtsp": (*_COMMON, "transport"),
     "rtsps": (*_COMMON, "ca", "transport", "verify"),
 }
@@ -92,30 +92,30 @@ class VideoDriver(FrameDriver):
     ================= =============================================================================
 
     A live stream's frames have the time of their arrival; frames that FFmpeg received during its
-    analysis have the time of the stream's begin. Only RTSP has a clock, ``device_time``. Frames
-    have no numbers, so ``sequence`` counts received pictures, and ``lost`` damaged ones. Damaged
-    pictures, and pictures that depend on them as far as the decoder reports it, are dropped.
+    analysis have the time at which the stream began. Only RTSP has a clock, ``device_time``. Frames
+    have no numbers, so ``sequence`` counts received pictures, and ``lost`` damaged pictures. Both
+    damaged pictures and those that the decoder reports as depending on them are dropped.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        self._path, fragment = _split(address)
-        given = address.parameters(_KNOWN[address.scheme], fragment)
+        self._path, fragment = _split_fragment(address)
+        parameters = address.parameters(_PARAMETERS[address.scheme], fragment)
         number = address.number
-        self._name = given.get("name") or _name(address, self._path)
-        self._timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
-        self._delay = number("delay", given.get("delay", "1"), 0, 600)
-        self._fps = number("fps", given["fps"], 0.01, 10_000) if "fps" in given else None
-        self._paced = one_of(address, "pace", given, ("real", "none")) == "real"
-        self._format = wanted_format(address, given.get("format"))
-        self._options = _options(address, given)
-        self._mixed = one_of(address, "mixed", given, ("no", "yes")) == "yes"
-        self._elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
-        self._tls = tls_of(address, given)
+        self._name = parameters.get("name") or _name(address, self._path)
+        self._timeout = number("timeout", parameters.get("timeout", "5"), 0.1, 600)
+        self._delay = number("delay", parameters.get("delay", "1"), 0, 600)
+        self._fps = number("fps", parameters["fps"], 0.01, 10_000) if "fps" in parameters else None
+        self._keeps_pace = one_of(address, "pace", parameters, ("real", "none")) == "real"
+        self._format = wanted_format(address, parameters.get("format"))
+        self._options = _options(address, parameters)
+        self._allows_mixed = one_of(address, "mixed", parameters, ("no", "yes")) == "yes"
+        self._allows_elsewhere = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
+        self._tls = tls_context(address, parameters)
         self._thread: _ReadingThread | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: StreamFormat | None = None
-        self._number = 0
+        self._sequence = 0
 
     @property
     def name(self) -> str:
@@ -131,7 +131,7 @@ class VideoDriver(FrameDriver):
             MissingExtraError: the extra ``video`` is not installed.
         """
         try:
-            reading, first = await self._begin()
+            reading, first = await self._open_and_read()
         finally:
             await self.stop()
         rate, pixels = self._fps or reading.rate, first.pixels
@@ -146,12 +146,12 @@ class VideoDriver(FrameDriver):
             FrameSourceError: the source is gone, or does not answer.
         """
         try:
-            reading, first = await self._begin()
+            reading, first = await self._open_and_read()
         except BaseException:
             await self.stop()
             raise
-        pumping = self._pump(sink, reading, first)
-        self._task = asyncio.create_task(pumping, name=f"frames of {self.name}")
+        name = f"frames of {self.name}"
+        self._task = asyncio.create_task(self._pass_frames(sink, reading, first), name=name)
 
     async def stop(self) -> None:
         """Stop reading; wait for a hanging read at most until its timeout."""
@@ -162,76 +162,78 @@ class VideoDriver(FrameDriver):
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
-        if thread is not None and not await thread.ended(self._timeout + THREAD_GRACE):
+        if thread is not None and not await thread.close(self._timeout + THREAD_GRACE):
             _log.warning("! %s: the reading thread hangs, and is abandoned", self.name)
 
     async def close(self) -> None:
         """Release everything. Idempotent."""
         await self.stop()
 
-    async def _begin(self) -> tuple[PictureReading, ReadPicture]:
+    async def _open_and_read(self) -> tuple[PictureReading, ReadPicture]:
         """Open the video and read the first picture."""
         await self.stop()
         thread = self._thread = _ReadingThread(self.name)
-        reading = await thread.open(self._opened)
-        first = await thread.do(reading.read)
+        reading = await thread.open(self._open_reading)
+        first = await thread.run(reading.read)
         if first is None:
             raise FrameFormatError(f"{self.name}: expected a picture, got none", source=self.name)
-        if self._fps and reading.live:
+        if self._fps and reading.is_live:
             raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
         return reading, first
 
-    def _opened(self) -> PictureReading:
+    def _open_reading(self) -> PictureReading:
         address = self.address
-        network = address.scheme != "file"
-        url = address.url.partition("#")[0] if network else f"file:{self._path}"
-        pictures = not network and is_pictures(self._path)
+        is_network = address.scheme != "file"
+        url = address.url.partition("#")[0] if is_network else f"file:{self._path}"
+        pictures = not is_network and is_pictures(self._path)
         plan = VideoPlan(
             name=self.name,
             url=self._path if pictures else url,
             options=self._options,
             timeout=self._timeout,
             format=self._format,
-            network=network,
-            elsewhere=self._elsewhere,
+            is_network=is_network,
+            allows_elsewhere=self._allows_elsewhere,
             tls=self._tls,
-            skips_damaged=self._mixed,
+            skips_damaged=self._allows_mixed,
         )
         return PictureFiles(plan) if pictures else VideoReading(plan)
 
-    async def _pump(self, sink: FrameSink, reading: PictureReading, first: ReadPicture) -> None:
-        rate, live, thread = reading.rate, reading.live, self._thread
-        clock = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
-        read: ReadPicture | None = first
+    async def _pass_frames(
+        self, sink: FrameSink, reading: PictureReading, first: ReadPicture
+    ) -> None:
+        rate, is_live, thread = reading.rate, reading.is_live, self._thread
+        playback = _Playback(self._fps or (None if rate else PICTURE_RATE), rate)
+        picture: ReadPicture | None = first
         try:
-            while read is not None and thread is not None:
-                if self._paced and not live:
-                    await clock.wait_for(read.time)
-                sink.frame(self._frame(read, live))
-                if not self._paced and not live:
+            while picture is not None and thread is not None:
+                if self._keeps_pace and not is_live:
+                    await playback.wait_until_due(picture.time)
+                sink.frame(self._to_frame(picture, is_live))
+                if not self._keeps_pace and not is_live:
                     await sink.wait_taken()
-                read = await thread.do(reading.read)
-        except FrameSourceError as error:
-            sink.ended(error)
+                picture = await thread.run(reading.read)
+        except FrameSourceError as exc:
+            sink.ended(exc)
         except Exception as exc:  # noqa: BLE001 - passed on to readers
-            failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
-            failed.__cause__ = exc
-            sink.ended(failed)
+            error = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
+            error.__cause__ = exc
+            sink.ended(error)
         else:
             sink.ended(None)
 
-    def _frame(self, read: ReadPicture, live: bool) -> Frame:
-        pixels, now = read.pixels, time.monotonic()
-        comes = (pixels.format, pixels.width, pixels.height)
-        if self._stream is not None and comes != self._stream[:3] and not self._mixed:
+    def _to_frame(self, picture: ReadPicture, is_live: bool) -> Frame:
+        pixels, now = picture.pixels, time.monotonic()
+        actual = (pixels.format, pixels.width, pixels.height)
+        if self._stream is not None and actual != self._stream[:3] and not self._allows_mixed:
             raise FrameFormatError(
                 f"{self.name}: expected {StreamFormat(*self._stream[:3])}, as it was opened, got "
-                f"{StreamFormat(*comes)}: open it again",
+                f"{StreamFormat(*actual)}: open it again",
                 source=self.name,
-                available=(str(StreamFormat(*comes)),),
+                available=(str(StreamFormat(*actual)),),
             )
-        captured = read.arrived if live else now
-        self._number += 1 + read.lost
+        captured = picture.arrived_at if is_live else now
+        self._sequence += 1 + picture.lost
         return Frame(
             data=pixels.data,
             format=pixels.format,
@@ -241,10 +243,10 @@ class VideoDriver(FrameDriver):
             captured=captured,
             utc=time.time() - (now - captured),
             moment=Moment.ARRIVAL,
-            duration=self._delay if live else 0.0,
-            device_time=read.time if read.clock else None,
-            sequence=self._number,
-            lost=read.lost,
+            duration=self._delay if is_live else 0.0,
+            device_time=picture.time if picture.is_device_time else None,
+            sequence=self._sequence,
+            lost=picture.lost,
             source=self.name,
         )
 
@@ -259,30 +261,30 @@ class _ReadingThread:
     async def open(self, make: Callable[[], PictureReading]) -> PictureReading:
         """Return the opened reading; the thread keeps it even if the caller is cancelled."""
 
-        def opened() -> PictureReading:
-            self._reading = made = make()
-            return made
+        def open_reading() -> PictureReading:
+            self._reading = reading = make()
+            return reading
 
-        return await self.do(opened)
+        return await self.run(open_reading)
 
-    async def do(self, work: Callable[[], T]) -> T:
+    async def run(self, work: Callable[[], T]) -> T:
         """Run a function in the thread; cancelled calls run nevertheless."""
-        doing = asyncio.get_running_loop().run_in_executor(self._pool, work)
-        doing.add_done_callback(_retrieve_error)
-        return await asyncio.shield(doing)
+        future = asyncio.get_running_loop().run_in_executor(self._pool, work)
+        future.add_done_callback(_retrieve_error)
+        return await asyncio.shield(future)
 
     def stop(self) -> None:
         """Abort the search for the next picture."""
         if self._reading is not None:
             self._reading.stopped.set()
 
-    async def ended(self, within: float) -> bool:
-        """Close the source in the thread; return whether it was closed in time."""
-        last = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reading)
-        last.add_done_callback(_retrieve_error)
+    async def close(self, timeout: float) -> bool:
+        """Close the source in the thread; return False if the thread did not do so in time."""
+        closing = asyncio.get_running_loop().run_in_executor(self._pool, self._close_reading)
+        closing.add_done_callback(_retrieve_error)
         self._pool.shutdown(wait=False)
-        _, late = await asyncio.wait([last], timeout=within)
-        return not late
+        _, pending = await asyncio.wait([closing], timeout=timeout)
+        return not pending
 
     def _close_reading(self) -> None:
         reading, self._reading = self._reading, None
@@ -299,31 +301,31 @@ class _Playback:
     """The schedule of a recording's pictures.
 
     Args:
-        fps: pictures per second; None: by time stamps.
-        rate: rate of frames without time stamps.
+        fps: pictures per second; None: the time stamps set the pace.
+        rate: pictures per second if they have no time stamps.
     """
 
     def __init__(self, fps: float | None, rate: float | None) -> None:
         self._fps, self._rate = fps, rate or PICTURE_RATE
-        self._began: float | None = None
+        self._started_at: float | None = None
         self._count = 0
-        self._last = 0.0
+        self._last_due = 0.0
 
-    async def wait_for(self, stamp: float | None) -> None:
+    async def wait_until_due(self, stamp: float | None) -> None:
         """Wait until a picture is due, by its time stamp in seconds."""
         if self._fps is not None:
-            at = self._count / self._fps
+            due = self._count / self._fps
         else:
-            at = self._last + 1 / self._rate if stamp is None else stamp
+            due = self._last_due + 1 / self._rate if stamp is None else stamp
         self._count += 1
-        self._last = at
+        self._last_due = due
         now = asyncio.get_running_loop().time()
-        if self._began is None or now > self._began + at + MAX_PLAYBACK_DELAY:
-            self._began = now - at
-        await asyncio.sleep(self._began + at - now)
+        if self._started_at is None or now > self._started_at + due + MAX_PLAYBACK_DELAY:
+            self._started_at = now - due
+        await asyncio.sleep(self._started_at + due - now)
 
 
-def _split(address: FrameAddress) -> tuple[str, str]:
+def _split_fragment(address: FrameAddress) -> tuple[str, str]:
     """Split a URL into path and parameters; a # without parameters belongs to the path."""
     if address.scheme != "file":
         return address.path, address.fragment
@@ -341,57 +343,62 @@ def _name(address: FrameAddress, path: str) -> str:
     return address.shown.partition("#")[0].partition("?")[0]
 
 
-def wanted_format(address: FrameAddress, given: str | None) -> PixelFormat | None:
-    known = [*CONVERTIBLE, "MJPEG", "H264"]
-    if given is None:
+def wanted_format(address: FrameAddress, name: str | None) -> PixelFormat | None:
+    """Return the format that a parameter names; None without the parameter."""
+    choices = [*CONVERTIBLE, "MJPEG", "H264"]
+    if name is None:
         return None
     try:
-        pixel_format = find_format(given)
+        pixel_format = find_format(name)
     except FrameFormatError:
         pixel_format = None
-    if pixel_format is None or pixel_format.name not in known:
-        raise address.wrong("format", f"one of {', '.join(known)}", given)
+    if pixel_format is None or pixel_format.name not in choices:
+        raise address.wrong("format", f"one of {', '.join(choices)}", name)
     return pixel_format
 
 
-def one_of(address: FrameAddress, name: str, given: dict[str, str], known: tuple[str, ...]) -> str:
-    """Return a parameter's value, by default the first of the known values."""
-    value = given.get(name, known[0])
-    if value not in known:
-        raise address.wrong(name, " or ".join(known), value)
+def one_of(
+    address: FrameAddress, name: str, parameters: dict[str, str], choices: tuple[str, ...]
+) -> str:
+    """Return a parameter's value, by default the first of the choices."""
+    value = parameters.get(name, choices[0])
+    if value not in choices:
+        raise address.wrong(name, " or ".join(choices), value)
     return value
 
 
-def _options(address: FrameAddress, given: dict[str, str]) -> dict[str, str]:
+def _options(address: FrameAddress, parameters: dict[str, str]) -> dict[str, str]:
     """Return FFmpeg's options."""
     options: dict[str, str] = {}
     if address.scheme.startswith("rtsp"):
         options |= LIVE_OPTIONS | {
-            "rtsp_transport": one_of(address, "transport", given, ("tcp", "udp"))
+            "rtsp_transport": one_of(address, "transport", parameters, ("tcp", "udp"))
         }
     if address.scheme in ("https", "rtsps"):
-        verified = one_of(address, "verify", given, ("yes", "no")) == "yes"
+        verifies = one_of(address, "verify", parameters, ("yes", "no")) == "yes"
         options |= (
-            {"tls_verify": "1", "ca_file": _trusted(given)} if verified else {"tls_verify": "0"}
+            {"tls_verify": "1", "ca_file": _trusted_certificates(parameters)}
+            if verifies
+            else {"tls_verify": "0"}
         )
     return options
 
 
-def _trusted(given: dict[str, str]) -> str:
+def _trusted_certificates(parameters: dict[str, str]) -> str:
     """Return the file of trusted certificates."""
     paths = ssl.get_default_verify_paths()
-    return given.get("ca") or paths.cafile or paths.openssl_cafile
+    return parameters.get("ca") or paths.cafile or paths.openssl_cafile
 
 
-def tls_of(address: FrameAddress, given: dict[str, str]) -> ssl.SSLContext | None:
+def tls_context(address: FrameAddress, parameters: dict[str, str]) -> ssl.SSLContext | None:
     """Return the TLS context of a URL's settings; None without TLS."""
     if address.scheme not in ("https", "rtsps"):
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    if one_of(address, "verify", given, ("yes", "no")) == "no":
+    if one_of(address, "verify", parameters, ("yes", "no")) == "no":
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
-    elif trusted := _trusted(given):
+    elif trusted := _trusted_certificates(parameters):
         with contextlib.suppress(OSError, ssl.SSLError):  # connecting reports the error
             context.load_verify_locations(trusted)
     return context

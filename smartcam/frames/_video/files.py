@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from smartcam._extras import load
 from smartcam._natural import natural
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._video.frames import CONVERTIBLE, Pixels, converted, from_video
+from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_video, reformatted
 from smartcam.frames._video.jpegxl import is_jpegxl, read_jpegxl
 from smartcam.frames._video.redirects import follow_redirects
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger("smartcam.frames")
 
-PICTURES: Final = frozenset(
+PICTURE_SUFFIXES: Final = frozenset(
     {".bmp", ".jpeg", ".jpg", ".jxl", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 )
-"""Suffixes of picture files in a folder."""
+"""Suffixes by which picture files in a folder are found."""
 
 MIN_REDIRECT_VERSION: Final = (62, 0, 0)
 """First version of libavformat with an option against redirects."""
@@ -43,12 +43,14 @@ UNBUFFERED_WAIT_TIME: Final = 0.01
 _PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
 """Codecs whose bytes can be passed on unchanged, with smartcam's formats."""
 
-_ONE_BY_ONE: Final = frozenset({"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"})
+_INDEPENDENT_PICTURES: Final = frozenset(
+    {"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"}
+)
 """Codecs with independent pictures, so damage does not spread."""
 
-_EXPLODES_AT_TAGS: Final = frozenset({"tiff"})
-"""Codecs that treat unknown tags as damage in strict mode; without it, cut pictures are still
-errors."""
+_STRICT_ABOUT_TAGS: Final = frozenset({"tiff"})
+"""Codecs that report unknown tags as damage in FFmpeg's strict mode. Even without that mode, they
+report cut pictures."""
 
 FORMATS: Final = (
     "asf,avi,dv,flv,gif,h264,hevc,ivf,m4v,matroska,mjpeg,mov,mpeg,mpegts,mpegvideo,mpjpeg,mxf,nut,"
@@ -80,9 +82,10 @@ class VideoPlan:
         url: URL for FFmpeg.
         options: options for FFmpeg.
         timeout: seconds for connecting, and for every wait after that.
-        format: format to convert pixels to, or of bytes passed on; None: the decoder's format.
-        network: True if the video comes from a server; without a known length it is a live stream.
-        elsewhere: whether FFmpeg may follow redirects and playlists to other hosts.
+        format: pixel format to convert to, or format of encoded bytes that are passed on; None: the
+            decoder's format.
+        is_network: whether the video comes from a server; if its length is unknown, it is live.
+        allows_elsewhere: whether FFmpeg may follow redirects and playlists to other hosts.
         tls: context that checks the server's certificate; None: the default check.
         skips_damaged: whether damaged files of a folder are left out and counted as lost.
     """
@@ -92,8 +95,8 @@ class VideoPlan:
     options: Mapping[str, str] = field(default_factory=dict)
     timeout: float = 5.0
     format: PixelFormat | None = None
-    network: bool = False
-    elsewhere: bool = False
+    is_network: bool = False
+    allows_elsewhere: bool = False
     tls: ssl.SSLContext | None = None
     skips_damaged: bool = False
 
@@ -108,16 +111,16 @@ class ReadPicture(NamedTuple):
     Attributes:
         pixels: pixels of the picture.
         time: time stamp, seconds of the stream's clock; None: no time stamp.
-        arrived: time of arrival or earlier, seconds of ``time.monotonic()``.
-        lost: number of damaged pictures before.
-        clock: whether ``time`` is from the camera's clock.
+        arrived_at: time of arrival or earlier, seconds of ``time.monotonic()``.
+        lost: number of damaged pictures since the last one that was returned.
+        is_device_time: whether ``time`` is from the camera's clock.
     """
 
     pixels: Pixels
     time: float | None
-    arrived: float
+    arrived_at: float
     lost: int
-    clock: bool = False
+    is_device_time: bool = False
 
 
 class PictureReading(ABC):
@@ -133,7 +136,7 @@ class PictureReading(ABC):
 
     @property
     @abstractmethod
-    def live(self) -> bool:
+    def is_live(self) -> bool:
         """True for a live stream, whose pictures cannot wait."""
 
     @property
@@ -165,29 +168,29 @@ class VideoReading(PictureReading):
 
     def __init__(self, plan: VideoPlan) -> None:
         super().__init__(plan)
-        self._given_any = False
+        self._has_returned = False
         self._start_codes: Any = None
-        self._began = time.monotonic()
-        self._container = self._opened()
-        self._open_from = time.monotonic()
+        self._started_at = time.monotonic()
+        self._container = self._open_container()
+        self._opened_at = time.monotonic()
         self._is_buffered = True  # whether packets have waited during FFmpeg's analysis
         try:
             self._stream = self._first_stream()
             self._packets = self._container.demux(self._stream)
             rate = self._stream.average_rate  # not readable after closing
             self._rate = float(rate) if rate else None
-            self._live = self.plan.network and self._container.duration is None
+            self._is_live = self.plan.is_network and self._container.duration is None
         except BaseException:
             self.close()
             raise
         self._pictures: deque[tuple[Any, float]] = deque()
         self._lost = 0
-        self._failed = ""  # error of the last undecodable picture
+        self._decode_error = ""  # error of the last undecodable picture
 
-    def _opened(self) -> Any:
+    def _open_container(self) -> Any:
         """Return FFmpeg's container for the URL, without access to other places."""
         plan, scheme = self.plan, self.plan.url.partition(":")[0]
-        if plan.elsewhere:
+        if plan.allows_elsewhere:
             return self._open(plan.url, {"protocol_whitelist": REMOTE_PROTOCOLS})
         formats = {"file": f"{FORMATS},image2", "rtsp": "rtsp", "rtsps": "rtsp"}
         bounds = {
@@ -195,24 +198,24 @@ class VideoReading(PictureReading):
             "format_whitelist": formats.get(scheme, FORMATS),
         }
         if scheme.startswith("rtsp"):
-            return self._open(self._followed(), bounds)
+            return self._open(self._redirected_url(), bounds)
         if scheme == "file":
             return self._open(plan.url, bounds)
         bounds["max_redirects"] = "0"
         if load("av").library_versions["libavformat"] < MIN_REDIRECT_VERSION:
-            return self._open(self._followed(), bounds)
+            return self._open(self._redirected_url(), bounds)
         try:
             return self._open(plan.url, bounds)
         except FrameSourceError as error:
             cause = error.__cause__
             if not isinstance(cause, OSError) or cause.errno != errno.EIO:
                 raise
-            url = self._followed()
+            url = self._redirected_url()
             if url == plan.url:
                 raise
         return self._open(url, bounds)
 
-    def _followed(self) -> str:
+    def _redirected_url(self) -> str:
         plan = self.plan
         return follow_redirects(plan.url, name=plan.name, timeout=plan.timeout, tls=plan.tls)
 
@@ -220,30 +223,30 @@ class VideoReading(PictureReading):
         options = {**self.plan.options, **bounds}
         limits = (self.plan.timeout, self.plan.timeout)
         try:
-            return self._tried(lambda: load("av").open(url, options=options, timeout=limits))
+            return self._call_ffmpeg(lambda: load("av").open(url, options=options, timeout=limits))
         except FrameFormatError as error:
             cause = error.__cause__
             if isinstance(cause, OSError) and cause.errno == errno.EINVAL:
-                cure = "; #elsewhere=yes follows a playlist" if self.plan.network else ""
+                hint = "; #elsewhere=yes follows a playlist" if self.plan.is_network else ""
                 raise self.plan.format_error(
                     "expected a format with the pictures in it, got one that is not supported, or "
-                    f"a playlist{cure}"
+                    f"a playlist{hint}"
                 ) from cause
             raise
 
-    def _tried(self, do: Callable[[], Any]) -> Any:
+    def _call_ffmpeg(self, call: Callable[[], Any]) -> Any:
         """Return the result of a call to FFmpeg; None at the end of the video."""
-        begun = time.monotonic()
+        started_at = time.monotonic()
         try:
-            return do()
+            return call()
         except EOFError as exc:
             failure: Exception = exc
         except load("av").FFmpegError as exc:
             failure = exc
-        if isinstance(failure, EOFError) and self._given_any:
+        if isinstance(failure, EOFError) and self._has_returned:
             return None
         # raised outside of the handler, since FFmpeg's error text has the URL with the password
-        raise self._error(failure, time.monotonic() - begun) from _plain_error(failure)
+        raise self._error(failure, time.monotonic() - started_at) from _plain_error(failure)
 
     def _first_stream(self) -> Any:
         streams = self._container.streams.video
@@ -254,22 +257,22 @@ class VideoReading(PictureReading):
             actual = self._container.format.long_name
             raise self.plan.format_error(f"expected video that FFmpeg decodes here, got {actual}")
         stream.codec_context.thread_count = 1  # more threads delay frames
-        if stream.codec_context.name not in _EXPLODES_AT_TAGS:
+        if stream.codec_context.name not in _STRICT_ABOUT_TAGS:
             stream.codec_context.options = {"err_detect": "explode"}  # refuse incomplete pictures
         wanted = self.plan.format
         if wanted is not None and wanted.compressed:
-            comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
-            if comes != wanted.name:
-                raise self.plan.format_error(f"expected {wanted.name}, got {comes}")
-            if comes == "H264":  # files have lengths in place of start codes
+            actual = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
+            if actual != wanted.name:
+                raise self.plan.format_error(f"expected {wanted.name}, got {actual}")
+            if actual == "H264":  # files have lengths in place of start codes
                 bitstream = load("av.bitstream").BitStreamFilterContext
                 self._start_codes = bitstream("h264_mp4toannexb", stream)
         return stream
 
     @property
-    def live(self) -> bool:
+    def is_live(self) -> bool:
         """True if a server sends pictures without a known end."""
-        return self._live
+        return self._is_live
 
     @property
     def rate(self) -> float | None:
@@ -278,66 +281,71 @@ class VideoReading(PictureReading):
 
     def read(self) -> ReadPicture | None:
         """Return the next picture."""
-        begun = time.monotonic()
+        started_at = time.monotonic()
         while not self._pictures and not self.stopped.is_set():
-            if self.plan.network and time.monotonic() - begun > self.plan.timeout:
+            if self.plan.is_network and time.monotonic() - started_at > self.plan.timeout:
                 raise self.plan.format_error(
                     "expected a picture, got bytes that make no picture for "
                     f"{self.plan.timeout:g} s"
                 )
             asked_at = time.monotonic()
-            packet = self._tried(lambda: next(self._packets, None))
+            packet = self._call_ffmpeg(lambda: next(self._packets, None))
             if packet is None:
-                self._end()
+                self._check_end()
                 return None
-            self._take(packet, self._arrival(asked_at, time.monotonic()))
+            self._decode_packet(packet, self._arrival_time(asked_at, time.monotonic()))
         if not self._pictures or self.stopped.is_set():
             return None
-        picture, arrived = self._pictures.popleft()
+        picture, arrived_at = self._pictures.popleft()
         lost, self._lost = self._lost, 0
-        self._given_any = True
+        self._has_returned = True
         base = picture.time_base or self._stream.time_base
         at = None if picture.pts is None else float(picture.pts * base)
-        clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
-        return ReadPicture(self._pixels(picture), at, arrived, lost, clock)
+        is_device_time = (
+            at is not None
+            and self._container.format.name == "rtsp"
+            and arrived_at > self._started_at
+        )
+        return ReadPicture(self._pixels(picture), at, arrived_at, lost, is_device_time)
 
-    def _arrival(self, asked_at: float, now: float) -> float:
+    def _arrival_time(self, asked_at: float, now: float) -> float:
         """Return a packet's arrival, or the earliest possible time if FFmpeg buffered it."""
         if self._is_buffered:
-            drained = now - self._open_from > self._open_from - self._began
+            drained = now - self._opened_at > self._opened_at - self._started_at
             self._is_buffered = not drained and now - asked_at < UNBUFFERED_WAIT_TIME
-        return self._began if self._is_buffered else now
+        return self._started_at if self._is_buffered else now
 
-    def _end(self) -> None:
-        if self.live:
+    def _check_end(self) -> None:
+        """Raise if a live stream has ended, or if the video had no picture."""
+        if self.is_live:
             raise FrameSourceError(
                 f"{self.plan.name}: the server ended the stream", source=self.plan.name
             )
-        if not self._given_any:
-            why = f": {self._failed}" if self._failed else ""
-            raise self.plan.format_error(f"expected pictures, the video ended without one{why}")
+        if not self._has_returned:
+            cause = f": {self._decode_error}" if self._decode_error else ""
+            raise self.plan.format_error(f"expected pictures, the video ended without one{cause}")
 
-    def _take(self, packet: Any, arrived: float) -> None:
+    def _decode_packet(self, packet: Any, arrived_at: float) -> None:
         """Decode a packet, or pass it on."""
         if self.plan.format is not None and self.plan.format.compressed:
             if packet.is_corrupt:
-                self._lost += self._given_any
+                self._lost += self._has_returned
             elif packet.size:
                 filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
-                self._pictures.extend((picture, arrived) for picture in filtered)
+                self._pictures.extend((picture, arrived_at) for picture in filtered)
             return
-        damaged = bool(packet.is_corrupt)
+        is_damaged = bool(packet.is_corrupt)
         try:
             pictures = packet.decode()
         except load("av").FFmpegError as exc:
-            damaged, pictures, self._failed = True, [], _reason(exc)
+            is_damaged, pictures, self._decode_error = True, [], _reason(exc)
         intact = [picture for picture in pictures if not picture.is_corrupt]
-        if damaged or len(intact) < len(pictures):
-            self._lost += self._given_any  # a stream may begin midway
-            if self._stream.codec_context.name not in _ONE_BY_ONE:
+        if is_damaged or len(intact) < len(pictures):
+            self._lost += self._has_returned  # a stream may begin midway
+            if self._stream.codec_context.name not in _INDEPENDENT_PICTURES:
                 intact = []
                 self._stream.codec_context.flush_buffers()  # dependent pictures are dropped
-        self._pictures.extend((picture, arrived) for picture in intact)
+        self._pictures.extend((picture, arrived_at) for picture in intact)
 
     def _pixels(self, picture: Any) -> Pixels:
         wanted = self.plan.format
@@ -346,7 +354,7 @@ class VideoReading(PictureReading):
             return Pixels(wanted, context.width, context.height, 0, bytes(picture))
         try:
             if wanted is not None:
-                picture = converted(picture, CONVERTIBLE[wanted.name])
+                picture = reformatted(picture, CONVERTIBLE[wanted.name])
             return from_video(picture)
         except FrameFormatError as exc:
             raise self.plan.format_error(f"{exc}; #format=RGB8 converts") from exc
@@ -355,15 +363,15 @@ class VideoReading(PictureReading):
         """Close the video."""
         self._container.close()
 
-    def _error(self, failure: Exception, took: float) -> FrameSourceError:
+    def _error(self, failure: Exception, duration: float) -> FrameSourceError:
         """Return the error for a failure of FFmpeg, without its text, which has the password."""
         name, limit = self.plan.name, self.plan.timeout
-        late = self.plan.network and took >= limit and isinstance(failure, ValueError)
-        if late or isinstance(failure, load("av").ExitError):  # RTSP's own timeout
+        timed_out = self.plan.is_network and duration >= limit and isinstance(failure, ValueError)
+        if timed_out or isinstance(failure, load("av").ExitError):  # RTSP's own timeout
             text = f"{name}: expected an answer, got none within {limit:g} s"
             return FrameSourceError(text, source=name)
-        kind = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
-        return kind(f"{name}: cannot be read: {_reason(failure)}", source=name)
+        error_class = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
+        return error_class(f"{name}: cannot be read: {_reason(failure)}", source=name)
 
 
 def _reason(failure: Exception) -> str:
@@ -385,7 +393,7 @@ class PictureFiles(PictureReading):
             raise FrameSourceError(f"{plan.name}: there is no picture file", source=plan.name)
 
     @property
-    def live(self) -> bool:
+    def is_live(self) -> bool:
         """Always False."""
         return False
 
@@ -400,26 +408,26 @@ class PictureFiles(PictureReading):
         while self._files and not self.stopped.is_set():
             path = self._files.popleft()
             try:
-                read = self._read(path)
+                picture = self._read_file(path)
             except FrameSourceError as exc:
                 if not (self.plan.skips_damaged and self._files):
                     raise
                 _log.warning("! %s: left out: %s", self.plan.name, exc)
                 lost += 1
             else:
-                return None if read is None else read._replace(lost=lost)
+                return None if picture is None else picture._replace(lost=lost)
         return None
 
-    def _read(self, path: str) -> ReadPicture | None:
+    def _read_file(self, path: str) -> ReadPicture | None:
         if is_jpegxl(path):
             return ReadPicture(read_jpegxl(path, self.plan.format), None, time.monotonic(), 0)
         plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
         reading = VideoReading(plan)
         try:
-            read = reading.read()
+            picture = reading.read()
         finally:
             reading.close()
-        return None if read is None else read._replace(time=None)
+        return None if picture is None else picture._replace(time=None)
 
     def close(self) -> None:
         """Release everything."""
@@ -427,11 +435,13 @@ class PictureFiles(PictureReading):
 
 
 def picture_files(path: str) -> list[str]:
-    """Return the sorted picture files of a folder or a pattern; for a file the file."""
+    """Return the sorted picture files of a folder or pattern; for a file only this file."""
     if Path(path).is_file():
         return [path]
     if Path(path).is_dir():
-        paths = [str(path) for path in Path(path).iterdir() if path.suffix.lower() in PICTURES]
+        paths = [
+            str(path) for path in Path(path).iterdir() if path.suffix.lower() in PICTURE_SUFFIXES
+        ]
         return sorted(paths, key=natural)
     return sorted(glob.glob(path), key=natural)  # noqa: PTH207 - a pattern with its folder in one string
 

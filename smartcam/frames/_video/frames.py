@@ -9,7 +9,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
-from smartcam.frames._pixels.apart import PlanesApart
+from smartcam.frames._pixels.apart import SeparatePlanes
 from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, find_format, with_matrix
 from smartcam.frames._pixels.layouts import Planes, YuvPairs
@@ -46,9 +46,9 @@ _SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
 """Names of chroma subsampling, by pixels along a row and rows with common U and V."""
 
 _YUV: Final = {
-    f"{begin}{digits}p{end}": f"I{digits}{ours}"
+    f"{prefix}{digits}p{suffix}": f"I{digits}{our_suffix}"
     for digits in _SUBSAMPLING.values()
-    for begin, end, ours in (
+    for prefix, suffix, our_suffix in (
         ("yuv", "", ""),
         ("yuvj", "", "_full"),
         *(("yuv", f"{depth}le", f"_{depth}") for depth in (10, 12, 16)),
@@ -60,7 +60,7 @@ _TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p":
 """FFmpeg's formats with alpha after Y, U and V, and the same formats without alpha."""
 
 CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
-"""Formats of conversion on request, with FFmpeg's names."""
+"""Formats to which pixels are converted on request, with FFmpeg's names."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 _RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # PyAV's names
@@ -123,7 +123,7 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     return with_matrix(base, f"{matrix} full" if full else matrix)
 
 
-def from_video(video: Any, *, apart: bool = False) -> Pixels:
+def from_video(video: Any, *, keep_planes: bool = False) -> Pixels:
     """Return a decoded frame's pixels in their own format, or in one without loss.
 
     A palette is converted to colours, planes of red, green and blue to samples, and unsupported
@@ -131,16 +131,17 @@ def from_video(video: Any, *, apart: bool = False) -> Pixels:
 
     Args:
         video: frame of FFmpeg.
-        apart: whether planes may stay in the decoder's buffers, as :class:`PlanesApart`.
+        keep_planes: whether the planes may stay in the decoder's buffers without a copy, as
+            :class:`SeparatePlanes`.
 
     Raises:
         FrameFormatError: no format holds the pixels without loss; the text names the loss.
     """
     name = video.format.name
-    if name in _TRANSPARENT and not _opaque(video):
-        return _with_alpha(video)
+    if name in _TRANSPARENT and not _is_opaque(video):
+        return _to_rgba(video)
     if name not in _SAMPLES and name not in _YUV:
-        video = _repacked(video)
+        video = _with_supported_format(video)
     pixel_format = format_of(video.format.name, video.color_range, video.colorspace)
     planes = video.planes
     stride = planes[0].line_size
@@ -152,57 +153,63 @@ def from_video(video: Any, *, apart: bool = False) -> Pixels:
         plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
     )
     if fits:
-        joined: Any = PlanesApart(planes) if apart else b"".join(planes)
+        joined: Any = SeparatePlanes(planes) if keep_planes else b"".join(planes)
         return Pixels(pixel_format, video.width, video.height, stride, joined)
-    joined = b"".join(_tight(plane, pixel_format) for plane in planes)
+    joined = b"".join(_without_padding(plane, pixel_format) for plane in planes)
     return Pixels(pixel_format, video.width, video.height, pixel_format.stride(video.width), joined)
 
 
-def _repacked(video: Any) -> Any:
-    """Return the frame in a supported format without loss, or unchanged."""
+def _with_supported_format(video: Any) -> Any:
+    """Return the frame in a supported format without loss, or unchanged if there is none."""
     kind = video.format
-    parts = kind.components
-    deep = max(part.bits for part in parts)
-    alpha = any(part.is_alpha for part in parts)
-    if deep > 16 or kind.name.startswith(("xyz", "bayer")):
+    components = kind.components
+    depth = max(component.bits for component in components)
+    has_alpha = any(component.is_alpha for component in components)
+    if depth > 16 or kind.name.startswith(("xyz", "bayer")):
         return video
-    if kind.has_palette or kind.is_rgb or len(parts) == 2:
-        to = ("rgba" if alpha or kind.has_palette else "rgb24", "rgba64le" if alpha else "rgb48le")
-        return converted(video, to[deep > 8])
-    if len(parts) == 1:
-        return converted(video, _wider_grey(kind.name, deep))
-    return _with_supported_subsampling(video, deep, alpha=alpha)
+    if kind.has_palette or kind.is_rgb or len(components) == 2:
+        if depth > 8:
+            return reformatted(video, "rgba64le" if has_alpha else "rgb48le")
+        return reformatted(video, "rgba" if has_alpha or kind.has_palette else "rgb24")
+    if len(components) == 1:
+        return reformatted(video, _supported_grey(kind.name, depth))
+    return _with_supported_subsampling(video, depth, has_alpha=has_alpha)
 
 
-def _wider_grey(name: str, deep: int) -> str:
-    little = f"{name.removesuffix('be')}le"
-    return "gray" if deep <= 8 else little if little in _SAMPLES else "gray16le"
+def _supported_grey(name: str, depth: int) -> str:
+    little_endian = f"{name.removesuffix('be')}le"
+    if depth <= 8:
+        return "gray"
+    return little_endian if little_endian in _SAMPLES else "gray16le"
 
 
-def _with_supported_subsampling(video: Any, deep: int, *, alpha: bool) -> Any:
+def _with_supported_subsampling(video: Any, depth: int, *, has_alpha: bool) -> Any:
     """Return the frame with a supported chroma subsampling."""
     kind, size = video.format, (video.width, video.height)
-    across, down = (round(side / part) for side, part in zip(size, _chroma(video), strict=True))
-    bits = next(bits for bits in (8, 10, 12, 16) if deep <= bits)
-    end = "" if bits == 8 else f"{bits}le"
+    across, down = (
+        round(length / chroma_length)
+        for length, chroma_length in zip(size, _chroma_size(video), strict=True)
+    )
+    bits = next(bits for bits in (8, 10, 12, 16) if depth <= bits)
+    suffix = "" if bits == 8 else f"{bits}le"
     digits = _SUBSAMPLING.get((across, down))
-    if alpha and kind.name not in _TRANSPARENT:
+    if has_alpha and kind.name not in _TRANSPARENT:
         return video
     if digits is not None:
-        return _same_colours(video, f"yuv{digits}p{end}")
+        return _reformatted_yuv(video, f"yuv{digits}p{suffix}")
     if bits > 8 or not kind.is_planar or len(video.planes) < 3:
         return video
-    made = _new(*size, "yuv444p")
-    for to, plane in zip(made.planes, video.planes, strict=False):
+    expanded = _new_video(*size, "yuv444p")
+    for target, plane in zip(expanded.planes, video.planes, strict=False):
         rows = _rows(plane)
         for axis, times in enumerate((-(-size[1] // plane.height), -(-size[0] // plane.width))):
             rows = np.repeat(rows, times, axis=axis)
-        _fill(to, rows[: size[1], : size[0]])
-    return _with_colour_properties(made, video, full=kind.name.startswith("yuvj"))
+        _fill_plane(target, rows[: size[1], : size[0]])
+    return _with_colour_properties(expanded, video, full=kind.name.startswith("yuvj"))
 
 
-def _chroma(video: Any) -> tuple[float, float]:
-    """Return the ratios of the sizes of U and V to Y, measured on a large picture."""
+def _chroma_size(video: Any) -> tuple[float, float]:
+    """Return width and height of U and V before rounding, by the ratios in a large picture."""
     kind, side = video.format, 1 << 10
     return (
         video.width * kind.chroma_width(side) / side,
@@ -210,19 +217,20 @@ def _chroma(video: Any) -> tuple[float, float]:
     )
 
 
-def _same_colours(video: Any, name: str) -> Any:
-    """Return a frame with the same samples in another layout."""
+def _reformatted_yuv(video: Any, name: str) -> Any:
+    """Return a frame of Y, U and V with the same samples in another layout."""
     full = video.format.name.startswith("yuvj")
-    return _with_colour_properties(converted(video, name), video, full=full)
+    return _with_colour_properties(reformatted(video, name), video, full=full)
 
 
-def _with_colour_properties(made: Any, video: Any, *, full: bool) -> Any:
-    made.color_range = FULL if full else video.color_range
-    made.colorspace = video.colorspace
-    return made
+def _with_colour_properties(target: Any, video: Any, *, full: bool) -> Any:
+    """Copy range and colour space of a frame to another, which is returned."""
+    target.color_range = FULL if full else video.color_range
+    target.colorspace = video.colorspace
+    return target
 
 
-def converted(video: Any, name: str) -> Any:
+def reformatted(video: Any, name: str) -> Any:
     """Return a frame in another pixel format of FFmpeg.
 
     Args:
@@ -233,42 +241,42 @@ def converted(video: Any, name: str) -> Any:
         FrameFormatError: FFmpeg does not convert between these formats.
     """
     kind, width = video.format, video.width
-    wide = -(-width // RIGHT_WIDTH) * RIGHT_WIDTH
-    padded = (
-        wide != width and not kind.has_palette and max(part.bits for part in kind.components) > 8
-    )
+    padded_width = -(-width // CORRECT_WIDTH_MULTIPLE) * CORRECT_WIDTH_MULTIPLE
+    depth = max(component.bits for component in kind.components)
+    must_pad = padded_width != width and not kind.has_palette and depth > 8
     try:
-        made = (_resized(video, wide) if padded else video).reformat(format=name)
+        result = (_resized(video, padded_width) if must_pad else video).reformat(format=name)
     except (OSError, ValueError) as exc:
         raise FrameFormatError(
             f"FFmpeg's pixel format {kind.name}: no conversion to {name}: {exc}"
         ) from exc
-    return _resized(made, width) if padded else made
+    return _resized(result, width) if must_pad else result
 
 
-RIGHT_WIDTH: Final = 32
-"""Multiple of pixels at which FFmpeg converts wide rows of more than 8 bits right. In other widths
-it writes 8 samples of colour into Y, as measured with p010le of 641 x 481 in FFmpeg 8 (PyAV 18)."""
+CORRECT_WIDTH_MULTIPLE: Final = 32
+"""FFmpeg converts samples of more than 8 bits correctly if the width is a multiple of this number
+of pixels. In other widths it writes 8 samples of colour into Y, as measured with p010le of 641 x
+481 in FFmpeg 8 (PyAV 18)."""
 
 
 def _resized(video: Any, width: int) -> Any:
     """Return a copy with the rows cut off or filled up with zeros on the right."""
-    made = _new(width, video.height, video.format.name)
-    for to, plane in zip(made.planes, video.planes, strict=True):
+    resized = _new_video(width, video.height, video.format.name)
+    for target, plane in zip(resized.planes, video.planes, strict=True):
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-        _fill(to, rows[:, : min(to.line_size, plane.line_size)])
-    return _with_colour_properties(made, video, full=False)
+        _fill_plane(target, rows[:, : min(target.line_size, plane.line_size)])
+    return _with_colour_properties(resized, video, full=False)
 
 
-def _opaque(video: Any) -> bool:
+def _is_opaque(video: Any) -> bool:
     """Return True if the last plane, alpha, is fully opaque."""
     return bool((_rows(video.planes[3]) == 255).all())
 
 
-def _with_alpha(video: Any) -> Pixels:
+def _to_rgba(video: Any) -> Pixels:
     """Return Y, U, V and alpha as red, green, blue and alpha."""
-    meant = format_of(_TRANSPARENT[video.format.name], video.color_range, video.colorspace)
-    matrix = MATRICES[cast("Planes", meant.layout).matrix]
+    without_alpha = format_of(_TRANSPARENT[video.format.name], video.color_range, video.colorspace)
+    matrix = MATRICES[cast("Planes", without_alpha.layout).matrix]
     y, u, v, alpha = (_rows(plane) for plane in video.planes)
     data = np.dstack([yuv_to_rgb(y, (u, v), matrix), alpha]).tobytes()
     return Pixels(find_format("RGBa8"), video.width, video.height, 4 * video.width, data)
@@ -280,7 +288,7 @@ def _rows(plane: Any) -> NDArray[np.uint8]:
     return rows[:, : plane.width]
 
 
-def _tight(plane: Any, pixel_format: PixelFormat) -> bytes:
+def _without_padding(plane: Any, pixel_format: PixelFormat) -> bytes:
     """Return the rows of a plane without padding."""
     layout: Any = pixel_format.layout
     size = layout.size_of * (2 if layout.interleaved and plane.index else 1)
@@ -296,25 +304,25 @@ def colour_properties(pixel_format: PixelFormat) -> tuple[int, int]:
     return FULL if matrix.endswith("full") else LIMITED, space
 
 
-def to_video(frame: Frame, before: Any = None) -> Any:
+def to_video(frame: Frame, reusable: Any = None) -> Any:
     """Return a frame for an encoder of 4:2:0, with Y unchanged and U and V averaged.
 
     Grey gets neutral U and V. RGB is converted to BT.601 with limited range.
 
     Args:
         frame: frame to encode.
-        before: earlier returned frame that the encoder no longer uses; it is reused for grey of the
-            same size.
+        reusable: earlier returned frame that the encoder no longer uses; it is reused for grey of
+            the same size.
 
     Raises:
         FrameFormatError: this format cannot be converted, or the size is odd.
     """
-    name = _encodable(frame.format)
+    name = _encodable_name(frame.format)
     if name is None:
         known = tuple(
             pixel_format.name
             for pixel_format in PIXEL_FORMATS
-            if _encodable(pixel_format) is not None
+            if _encodable_name(pixel_format) is not None
         )
         raise FrameFormatError(
             f"{frame.source}: {frame.format.name} cannot become video as it is; what can: "
@@ -329,17 +337,17 @@ def to_video(frame: Frame, before: Any = None) -> Any:
             source=frame.source,
         )
     if name == "gray":
-        return _from_grey(frame, before)
-    video = _filled(frame, name)
+        return _video_from_grey(frame, reusable)
+    video = _to_video_frame(frame, name)
     if name in ("yuv420p", "nv12"):
         return video
     range_, space = colour_properties(frame.format)
-    to = LIMITED if name in ("rgb24", "bgr24") else range_
-    made = video.reformat(
-        format="yuv420p", src_color_range=_RANGES[range_], dst_color_range=_RANGES[to]
+    new_range = LIMITED if name in ("rgb24", "bgr24") else range_
+    result = video.reformat(
+        format="yuv420p", src_color_range=_RANGES[range_], dst_color_range=_RANGES[new_range]
     )
-    made.color_range, made.colorspace = to, space
-    return made
+    result.color_range, result.colorspace = new_range, space
+    return result
 
 
 def to_lossless_video(frame: Frame) -> Any:
@@ -351,12 +359,12 @@ def to_lossless_video(frame: Frame) -> Any:
         FrameFormatError: a video cannot express the format: a Bayer pattern, distances, or
             compressed bytes.
     """
-    name = _lossless(frame.format)
+    name = _lossless_name(frame.format)
     if name is None:
         known = tuple(
             pixel_format.name
             for pixel_format in PIXEL_FORMATS
-            if _lossless(pixel_format) is not None
+            if _lossless_name(pixel_format) is not None
         )
         raise FrameFormatError(
             f"{frame.source}: {frame.format.name} cannot become a video without loss; what can: "
@@ -364,16 +372,16 @@ def to_lossless_video(frame: Frame) -> Any:
             source=frame.source,
             available=known,
         )
-    video = _filled(frame, name)
-    to = _REPACKED.get(name, name)
-    if to == name:
+    video = _to_video_frame(frame, name)
+    ffv1_name = _FFV1_FORMATS.get(name, name)
+    if ffv1_name == name:
         return video
-    made = video.reformat(format=to)
-    made.color_range, made.colorspace = colour_properties(frame.format)
-    return made
+    result = video.reformat(format=ffv1_name)
+    result.color_range, result.colorspace = colour_properties(frame.format)
+    return result
 
 
-_REPACKED: Final = {
+_FFV1_FORMATS: Final = {
     "rgb24": "bgr0",
     "bgr24": "bgr0",
     "rgba": "bgra",
@@ -381,10 +389,10 @@ _REPACKED: Final = {
     "yuyv422": "yuv422p",
     "uyvy422": "yuv422p",
 }
-"""Formats of FFV1 that hold the same values in another order."""
+"""Formats that FFV1 needs instead; they hold the same values in another order."""
 
 
-def _lossless(pixel_format: PixelFormat) -> str | None:
+def _lossless_name(pixel_format: PixelFormat) -> str | None:
     """Return FFmpeg's name for the unpacked values of a format, if a video can express them."""
     layout = pixel_format.layout
     if pixel_format.name.startswith("Mono"):
@@ -394,14 +402,14 @@ def _lossless(pixel_format: PixelFormat) -> str | None:
         return f"yuv{digits}p{layout.depth}le"
     if pixel_format.name in ("RGBa8", "BGRa8"):
         return "rgba" if pixel_format.name == "RGBa8" else "bgra"
-    return _encodable(pixel_format)
+    return _encodable_name(pixel_format)
 
 
 _DEPTHS: Final = {10: 10, 12: 12, 14: 16, 16: 16}
 """Bits of FFV1's grey format, by bits of a sample."""
 
 
-def _encodable(pixel_format: PixelFormat) -> str | None:
+def _encodable_name(pixel_format: PixelFormat) -> str | None:
     """Return FFmpeg's name for the bytes of a format that can become video, or None."""
     layout = pixel_format.layout
     if isinstance(layout, YuvPairs):
@@ -411,47 +419,51 @@ def _encodable(pixel_format: PixelFormat) -> str | None:
     return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(pixel_format.name)
 
 
-def _new(width: int, height: int, name: str) -> Any:
+def _new_video(width: int, height: int, name: str) -> Any:
     return load("av").VideoFrame(width, height, name)
 
 
-def _from_grey(frame: Frame, before: Any) -> Any:
+def _video_from_grey(frame: Frame, reusable: Any) -> Any:
     size = frame.width, frame.height, *colour_properties(frame.format)
-    if before is not None and size == (
-        *(before.width, before.height),
-        *(before.color_range, before.colorspace),
+    if reusable is not None and size == (
+        *(reusable.width, reusable.height),
+        *(reusable.color_range, reusable.colorspace),
     ):
-        _fill(before.planes[0], frame.array())  # a new array would cost a page fault per 4 kB
-        return before
-    video = _new(frame.width, frame.height, "yuv420p")
-    _fill(video.planes[0], frame.array())
+        _fill_plane(
+            reusable.planes[0], frame.array()
+        )  # a new array would cost a page fault per 4 kB
+        return reusable
+    video = _new_video(frame.width, frame.height, "yuv420p")
+    _fill_plane(video.planes[0], frame.array())
     for plane in video.planes[1:]:
-        plane.update(_without_colour(plane.buffer_size))
+        plane.update(_neutral_chroma(plane.buffer_size))
     video.color_range, video.colorspace = colour_properties(frame.format)
     return video
 
 
 @lru_cache(maxsize=16)
-def _without_colour(size: int) -> bytes:
+def _neutral_chroma(size: int) -> bytes:
     return b"\x80" * size
 
 
-def _filled(frame: Frame, name: str) -> Any:
-    video = _new(frame.width, frame.height, name)
+def _to_video_frame(frame: Frame, name: str) -> Any:
+    video = _new_video(frame.width, frame.height, name)
     layout = frame.format.layout
     if isinstance(layout, Planes):
         y, u, v = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
-        parts = [y, np.stack((u, v), axis=-1)] if layout.interleaved else [y, u, v]
+        arrays = [y, np.stack((u, v), axis=-1)] if layout.interleaved else [y, u, v]
     else:
-        parts = [frame.array()]
-    for plane, part in zip(video.planes, parts, strict=True):
-        rows = part.reshape(part.shape[0], -1)
-        _fill(plane, rows if rows.itemsize == 1 else np.ascontiguousarray(rows).view(np.uint8))
+        arrays = [frame.array()]
+    for plane, array in zip(video.planes, arrays, strict=True):
+        rows = array.reshape(array.shape[0], -1)
+        _fill_plane(
+            plane, rows if rows.itemsize == 1 else np.ascontiguousarray(rows).view(np.uint8)
+        )
     video.color_range, video.colorspace = colour_properties(frame.format)
     return video
 
 
-def _fill(plane: Any, rows: Any) -> None:
+def _fill_plane(plane: Any, rows: Any) -> None:
     if rows.flags.c_contiguous and rows.nbytes == plane.buffer_size:
         plane.update(rows)  # a single copy
         return

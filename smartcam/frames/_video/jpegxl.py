@@ -62,18 +62,18 @@ def read_jpegxl(path: str, wanted: PixelFormat | None) -> Pixels:
             f"{path}: expected {MAX_PICTURE_PIXELS} pixels at most, got {width}x{height}",
             source=path,
         )
-    shown = decoded(amend(frame, width=width, height=height), "")
-    if wanted is not None and wanted is not shown.format:
-        shown = _as(shown, wanted)
-    return Pixels(shown.format, width, height, shown.stride, bytes(shown.data))
+    picture = decoded(amend(frame, width=width, height=height), "")
+    if wanted is not None and wanted is not picture.format:
+        picture = _convert_to(picture, wanted)
+    return Pixels(picture.format, width, height, picture.stride, bytes(picture.data))
 
 
-def _as(frame: Frame, wanted: PixelFormat) -> Frame:
+def _convert_to(frame: Frame, wanted: PixelFormat) -> Frame:
     if wanted.compressed:
         raise FrameFormatError(
             f"{frame.source}: expected {wanted.name}, got JPEGXL", source=frame.source
         )
     if wanted.name == "BGR8":
-        shown = converted(frame, "RGB8")
-        return amend(shown, data=shown.array()[..., ::-1].tobytes(), format=wanted)
+        picture = converted(frame, "RGB8")
+        return amend(picture, data=picture.array()[..., ::-1].tobytes(), format=wanted)
     return converted(frame, wanted.name)

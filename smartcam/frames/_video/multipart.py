@@ -1,8 +1,8 @@
 """Cut JPEGs from a web camera's multipart stream, each as soon as its last byte has come.
 
-A picture's own markers give its end. Boundaries and lengths are not reliable: cameras put
-boundaries before or after a part, omit them, or announce another one. A length is used if a picture
-has no end marker.
+The markers in a JPEG show where it ends. Boundaries and lengths are not reliable: cameras put a
+boundary before or after a part, omit it, or announce another boundary. A length is used if a
+picture has no end marker.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 MAX_PICTURE_BYTES: Final = 32 << 20
 
-MAX_BETWEEN_BYTES: Final = 1 << 20
-"""Largest number of bytes in a row outside of pictures."""
+MAX_BYTES_BETWEEN: Final = 1 << 20
+"""Largest number of consecutive bytes outside of pictures."""
 
 MAX_HEAD_BYTES: Final = 8 << 10
 """Number of bytes before a picture that are searched for its length."""
@@ -33,8 +33,8 @@ PICTURE_START: Final = START + b"\xff"
 SCAN, MIN_SEGMENT = 0xDA, 0xC0
 """Marker of a scan, and the first marker of a segment."""
 
-BOUNDARY_BEGINS: Final = (b"\r\n", b"--", b"\n-")
-"""Possible bytes after a picture."""
+AFTER_PICTURE: Final = (b"\r\n", b"--", b"\n-")
+"""First two bytes that may follow a picture: of a boundary."""
 
 MARKERS_WITHOUT_SEGMENT: Final = frozenset((0x01, *range(0xD0, 0xD8)))
 """Markers without a segment."""
@@ -53,9 +53,9 @@ class PictureCutter:
     def __init__(self) -> None:
         self.damaged = 0
         self._data = bytearray()
-        self._searched = 0  # number of examined bytes
-        self._between = 0
-        self._begun = self._in_scan = self._over = False
+        self._searched_bytes = 0  # number of bytes that were examined
+        self._bytes_between = 0
+        self._has_start = self._in_scan = self._at_end_marker = False
         self._length: int | None = None  # length of the current picture from the header of its part
 
     def feed(self, data: bytes) -> Iterator[bytes]:
@@ -65,53 +65,53 @@ class PictureCutter:
             MessageError: a picture has no end, or too many bytes lie between two.
         """
         self._data += data
-        while self._begun or self._begins():
-            end = self._end()
+        while self._has_start or self._find_start():
+            end = self._find_end()
             if end is None:
                 return
-            self._begun = False
+            self._has_start = False
             if end > 0:
                 picture = bytes(self._data[:end])
                 del self._data[:end]
-                self._between = 0
+                self._bytes_between = 0
                 yield picture
             else:
                 self.damaged += 1
                 del self._data[: max(-end, len(START))]
-            self._searched = 0
+            self._searched_bytes = 0
 
-    def _begins(self) -> bool:
-        """Find the next picture; bytes before it are dropped."""
-        place = self._data.find(START, self._searched)
-        if place < 0:
-            self._searched = max(0, len(self._data) - 1)
-            surplus = max(0, self._searched - MAX_HEAD_BYTES)
+    def _find_start(self) -> bool:
+        """Find the next picture, and drop the bytes before it; return False if none has come."""
+        start = self._data.find(START, self._searched_bytes)
+        if start < 0:
+            self._searched_bytes = max(0, len(self._data) - 1)
+            surplus = max(0, self._searched_bytes - MAX_HEAD_BYTES)
             self._drop(surplus)
-            self._searched -= surplus
+            self._searched_bytes -= surplus
             return False
-        lengths = _LENGTH.findall(self._data[max(0, place - MAX_HEAD_BYTES) : place])
+        lengths = _LENGTH.findall(self._data[max(0, start - MAX_HEAD_BYTES) : start])
         self._length = int(lengths[-1]) if lengths else None
-        self._drop(place)
-        self._begun, self._in_scan, self._searched = True, False, len(START)
+        self._drop(start)
+        self._has_start, self._in_scan, self._searched_bytes = True, False, len(START)
         return True
 
     def _drop(self, count: int) -> None:
-        self._between += count
+        self._bytes_between += count
         del self._data[:count]
-        if self._between > MAX_BETWEEN_BYTES:
-            raise MessageError(f"{self._between} bytes came that belong to no picture")
+        if self._bytes_between > MAX_BYTES_BETWEEN:
+            raise MessageError(f"{self._bytes_between} bytes came that belong to no picture")
 
-    def _end(self) -> int | None:
+    def _find_end(self) -> int | None:
         """Return the end of the picture; None: the end has not come yet.
 
-        A negative number means that it is no picture, and that the next may begin at its magnitude.
+        Negative: this is no picture, and the next picture may begin at the number without its sign.
         """
-        while (after := self._segment()) is not None:
-            if self._length is not None and abs(after) > self._length and self._ends_at_length():
+        while (end := self._next_segment_end()) is not None:
+            if self._length is not None and abs(end) > self._length and self._ends_at_length():
                 return self._length
-            if after < 0 or self._over:
-                return after
-            self._searched = after
+            if end < 0 or self._at_end_marker:
+                return end
+            self._searched_bytes = end
         if self._length is not None and self._ends_at_length():
             return self._length
         if len(self._data) > MAX_PICTURE_BYTES:
@@ -120,43 +120,46 @@ class PictureCutter:
 
     def _ends_at_length(self) -> bool:
         """Return True if a boundary follows the picture's end by its length."""
-        place = self._length or 0
-        return place > len(START) and bytes(self._data[place : place + 2]) in BOUNDARY_BEGINS
+        end = self._length or 0
+        return end > len(START) and bytes(self._data[end : end + 2]) in AFTER_PICTURE
 
-    def _segment(self) -> int | None:
-        """Return the end of the next segment; None: the end has not come yet; negative: no segment.
+    def _next_segment_end(self) -> int | None:
+        """Return the end of the next segment; None: the end has not come yet.
 
-        Encoded data after the header of a scan are skipped.
+        Negative: there is no segment at the number without its sign. Encoded data after the header
+        of a scan are skipped.
         """
-        data, at = self._data, self._searched
+        data, offset = self._data, self._searched_bytes
         if self._in_scan:
-            match = _NEXT_MARKER.search(data, at)
-            self._searched = at = match.start() if match else max(at, len(data) - 1)
+            match = _NEXT_MARKER.search(data, offset)
+            self._searched_bytes = offset = match.start() if match else max(offset, len(data) - 1)
             self._in_scan = match is None
             if match is None:
                 return None
-        while data[at : at + 2] == b"\xff\xff":
-            at += 1
-        if len(data) > at + 1 and (data[at] != 0xFF or not data[at + 1]):  # as some webcams send
-            if data.find(PICTURE_START, len(START), at + len(PICTURE_START) - 1) >= 0:
-                return -at  # a cut segment ran into another picture
-            match = _NEXT_MARKER.search(data, at, at + MAX_STRAY_BYTES)
+        while data[offset : offset + 2] == b"\xff\xff":
+            offset += 1
+        if len(data) > offset + 1 and (
+            data[offset] != 0xFF or not data[offset + 1]
+        ):  # as some webcams send
+            if data.find(PICTURE_START, len(START), offset + len(PICTURE_START) - 1) >= 0:
+                return -offset  # a cut segment ran into another picture
+            match = _NEXT_MARKER.search(data, offset, offset + MAX_STRAY_BYTES)
             if match is None:
-                return None if len(data) < at + MAX_STRAY_BYTES else -at
-            at = match.start()
-        self._searched = at
-        self._over = data[at : at + 2] == END
-        if self._over:
-            return at + 2
-        if len(data) < at + 4:
+                return None if len(data) < offset + MAX_STRAY_BYTES else -offset
+            offset = match.start()
+        self._searched_bytes = offset
+        self._at_end_marker = data[offset : offset + 2] == END
+        if self._at_end_marker:
+            return offset + 2
+        if len(data) < offset + 4:
             return None
-        kind = data[at + 1]
-        if kind in MARKERS_WITHOUT_SEGMENT:
-            return at + 2
-        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at] != 0xFF or kind < MIN_SEGMENT or kind == 0xD8 or end < at + 4:
-            return -at
+        marker = data[offset + 1]
+        if marker in MARKERS_WITHOUT_SEGMENT:
+            return offset + 2
+        end = offset + 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
+        if data[offset] != 0xFF or marker < MIN_SEGMENT or marker == 0xD8 or end < offset + 4:
+            return -offset
         if len(data) < end:
             return None
-        self._in_scan = kind == SCAN
+        self._in_scan = marker == SCAN
         return end

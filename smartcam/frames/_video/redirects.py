@@ -57,24 +57,26 @@ def follow_redirects(
         FrameSourceError: a redirect leads to another host or port, there are too many, or there is
             no answer.
     """
-    end = time.monotonic() + timeout
+    deadline = time.monotonic() + timeout
     for _ in range(MAX_REDIRECTS):
         try:
-            answer = _ask(urlsplit(url), end, tls)
+            answer = _request(urlsplit(url), deadline, tls)
         except TimeoutError:
             text = f"{name}: expected an answer, got none within {timeout:g} s"
             raise FrameSourceError(text, source=name) from None
         except (OSError, ValueError) as exc:
             # without the error as the cause, whose text may have a URL with a password
-            raise FrameSourceError(f"{name}: cannot be read: {why(exc)}", source=name) from None
+            raise FrameSourceError(
+                f"{name}: cannot be read: {failure_reason(exc)}", source=name
+            ) from None
         location = next(iter(answer.headers.get("location", ())), "")
         if answer.status not in REDIRECTS or not location:
             return url
-        url = followed(url, location, answer.peer, name)
+        url = checked_redirect(url, location, answer.peer, name)
     raise FrameSourceError(f"{name}: more than {MAX_REDIRECTS} redirects", source=name)
 
 
-def why(failure: Exception) -> str:
+def failure_reason(failure: Exception) -> str:
     """Return the reason of a failure in the system's words, without a URL."""
     number = getattr(failure, "errno", None)
     if number is not None and number > 0:
@@ -83,8 +85,8 @@ def why(failure: Exception) -> str:
     return str(text or "the answer is not readable")
 
 
-def followed(url: str, location: str, peer: str, name: str) -> str:
-    """Return a redirect's URL, with the user of the requested URL.
+def checked_redirect(url: str, location: str, peer: str, name: str) -> str:
+    """Return the URL of a redirect on the same host and port, with the user of the requested URL.
 
     Args:
         url: requested URL.
@@ -95,12 +97,12 @@ def followed(url: str, location: str, peer: str, name: str) -> str:
     Raises:
         FrameSourceError: the redirect leads to another host or port.
     """
-    before = urlsplit(url)
+    requested = urlsplit(url)
     try:
-        after = urlsplit(urljoin(url, location))
-        target, source = _place(after), _place(before)
+        redirected = urlsplit(urljoin(url, location))
+        target, source = _origin(redirected), _origin(requested)
     except ValueError:
-        after, target, source = before, None, None
+        redirected, target, source = requested, None, None
     hosts = {source[1], peer} if source is not None else set[str]()
     if target is None or source is None or target[::2] != source[::2] or target[1] not in hosts:
         raise FrameSourceError(
@@ -108,64 +110,65 @@ def followed(url: str, location: str, peer: str, name: str) -> str:
             f"{re.sub('//[^/]*@', '//***@', location)[:200]!r}; #elsewhere=yes follows it",
             source=name,
         )
-    user, at, _ = before.netloc.rpartition("@")
-    return after._replace(netloc=f"{user}{at}{after.netloc.rpartition('@')[2]}").geturl()
+    user, at_sign, _ = requested.netloc.rpartition("@")
+    host = redirected.netloc.rpartition("@")[2]
+    return redirected._replace(netloc=f"{user}{at_sign}{host}").geturl()
 
 
-def _place(parts: SplitResult) -> tuple[str, str, int]:
+def _origin(parts: SplitResult) -> tuple[str, str, int]:
     """Return scheme, host and port of a URL."""
     return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
 
 
-def _ask(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
+def _request(url: SplitResult, deadline: float, tls: ssl.SSLContext | None) -> _Answer:
     """Send FFmpeg's first requests; return the first redirect, or the last answer.
 
     Raises:
         OSError, ValueError: there is no answer, or it cannot be read.
     """
-    scheme, host, port = _place(url)
-    plain = url._replace(netloc=url.netloc.rpartition("@")[2], fragment="")
-    web = scheme.startswith("http")
+    scheme, host, port = _origin(url)
+    without_user = url._replace(netloc=url.netloc.rpartition("@")[2], fragment="")
+    is_http = scheme.startswith("http")
     challenges: Sequence[str] = ()
-    answer, number = _Answer(0, {}, ""), 0
-    with contextlib.ExitStack() as opened:
+    answer, cseq = _Answer(0, {}, ""), 0
+    with contextlib.ExitStack() as links:
         link: socket.socket | None = None
-        for method in ("GET",) if web else ("OPTIONS", "DESCRIBE"):
+        for method in ("GET",) if is_http else ("OPTIONS", "DESCRIBE"):
             while True:
                 # a web server may close after a refusal; an RTSP server's challenge is for this
                 # connection
-                if link is None or web:
-                    link = opened.enter_context(_connected(scheme, host, port, end, tls))
-                number += 1
-                shown = _authorization(url, plain, method, challenges)
-                link.settimeout(_left(end))
+                if link is None or is_http:
+                    link = links.enter_context(_connect(scheme, host, port, deadline, tls))
+                cseq += 1
+                authorization = _authorization(url, without_user, method, challenges)
+                link.settimeout(_remaining_time(deadline))
                 peer = str(link.getpeername()[0])  # not available after the server has closed
-                link.sendall(_head(method, plain, number, shown).encode())
-                answer = _read(link, peer, end, web=web)
+                link.sendall(_request_text(method, without_user, cseq, authorization).encode())
+                answer = _read_answer(link, peer, deadline, is_http=is_http)
                 if answer.status in REDIRECTS:
                     return answer
-                challenged = answer.headers.get("www-authenticate", ())
-                if answer.status != 401 or challenges or not challenged or url.username is None:
+                new_challenges = answer.headers.get("www-authenticate", ())
+                if answer.status != 401 or challenges or not new_challenges or url.username is None:
                     break
-                challenges = challenged
+                challenges = new_challenges
         return answer
 
 
-def _connected(
-    scheme: str, host: str, port: int, end: float, tls: ssl.SSLContext | None
+def _connect(
+    scheme: str, host: str, port: int, deadline: float, tls: ssl.SSLContext | None
 ) -> socket.socket:
-    made = socket.create_connection((host, port), timeout=_left(end))
+    sock = socket.create_connection((host, port), timeout=_remaining_time(deadline))
     if scheme not in {"https", "rtsps"}:
-        return made
-    with contextlib.ExitStack() as undone:
-        undone.callback(made.close)
-        link = (tls or ssl.create_default_context()).wrap_socket(made, server_hostname=host)
-        undone.pop_all()
+        return sock
+    with contextlib.ExitStack() as cleanup:
+        cleanup.callback(sock.close)
+        link = (tls or ssl.create_default_context()).wrap_socket(sock, server_hostname=host)
+        cleanup.pop_all()
         return link
 
 
 def _authorization(
-    url: SplitResult, plain: SplitResult, method: str, challenges: Sequence[str]
+    url: SplitResult, without_user: SplitResult, method: str, challenges: Sequence[str]
 ) -> str:
     """Return the header that answers a challenge; "" without a supported challenge."""
     user, password = unquote(url.username or ""), unquote(url.password or "")
@@ -173,14 +176,15 @@ def _authorization(
         scheme, _, text = challenge.partition(" ")
         if scheme.lower() == "digest":
             passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
-            passwords.add_password(None, plain.geturl(), user, password)
-            request = urllib.request.Request(plain.geturl(), method=method)  # noqa: S310 - not sent
+            passwords.add_password(None, without_user.geturl(), user, password)
+            request = urllib.request.Request(without_user.geturl(), method=method)  # noqa: S310 - not sent
             if method != "GET":
-                request.selector = plain.geturl()
+                request.selector = without_user.geturl()
             words = (parameter.partition("=") for parameter in urllib.request.parse_http_list(text))
             parts = {key: value.removeprefix('"').removesuffix('"') for key, _, value in words}
-            made = urllib.request.HTTPDigestAuthHandler(passwords).get_authorization(request, parts)
-            return f"Authorization: Digest {made}" if made else ""
+            handler = urllib.request.HTTPDigestAuthHandler(passwords)
+            digest = handler.get_authorization(request, parts)
+            return f"Authorization: Digest {digest}" if digest else ""
         if scheme.lower() == "basic":
             return (
                 "Authorization: Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
@@ -188,25 +192,25 @@ def _authorization(
     return ""
 
 
-def _left(end: float) -> float:
-    left = end - time.monotonic()
-    if left <= 0:
+def _remaining_time(deadline: float) -> float:
+    remaining = deadline - time.monotonic()
+    if remaining <= 0:
         raise TimeoutError("no answer in time")
-    return left
+    return remaining
 
 
-def _head(method: str, url: SplitResult, number: int, authorization: str) -> str:
+def _request_text(method: str, url: SplitResult, cseq: int, authorization: str) -> str:
     if method == "GET":
         path = url._replace(scheme="", netloc="").geturl() or "/"
         lines = [f"GET {path} HTTP/1.1", f"Host: {url.netloc}", "Accept: */*"]
     else:
-        lines = [f"{method} {url.geturl()} RTSP/1.0", f"CSeq: {number}"]
+        lines = [f"{method} {url.geturl()} RTSP/1.0", f"CSeq: {cseq}"]
         lines += ["Accept: application/sdp"] if method == "DESCRIBE" else []
     lines.append("User-Agent: smartcam")
     return "\r\n".join((*lines, *([authorization] if authorization else ()), "", ""))
 
 
-def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
+def _read_answer(link: socket.socket, peer: str, deadline: float, *, is_http: bool) -> _Answer:
     """Read an answer, and skip its body if another answer may follow.
 
     Like FFmpeg, it accepts lines that end with LF, or with several CRs.
@@ -214,7 +218,7 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
     head = bytearray()  # without carriage returns
     size = 0
     while True:
-        received = _receive(link, end, size)
+        received = _receive(link, deadline, size)
         size += len(received)
         begin = max(0, len(head) - 1)
         head += received.replace(b"\r", b"")
@@ -227,26 +231,31 @@ def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
         key, _, value = line.partition(":")
         headers.setdefault(key.strip().lower(), []).append(value.strip())
     answer = _Answer(int(status.partition(" ")[2][:3]), headers, peer)
-    if not web:
-        left = int(headers.get("content-length", ("0",))[0])
+    if not is_http:
+        remaining = int(headers.get("content-length", ("0",))[0])
         # the last piece also holds the begin of the body, with carriage returns
         lines_of_head = received.count(b"\n") - head.count(b"\n", end_of_head + 2)
-        left -= len(received.split(b"\n", lines_of_head)[-1])
-        while left > 0:
-            received = _receive(link, end, size)
+        remaining -= len(received.split(b"\n", lines_of_head)[-1])
+        while remaining > 0:
+            received = _receive(link, deadline, size)
             size += len(received)
-            left -= len(received)
+            remaining -= len(received)
     return answer
 
 
-def _receive(link: socket.socket, end: float, before: int) -> bytes:
-    """Return the next bytes of an answer; ``before``: number of bytes received so far.
+def _receive(link: socket.socket, deadline: float, received_bytes: int) -> bytes:
+    """Return the next bytes of an answer.
+
+    Args:
+        link: connection.
+        deadline: time until which the bytes must come.
+        received_bytes: number of bytes of the answer received so far.
 
     Raises:
         OSError, ValueError: there are no bytes, or too many.
     """
-    link.settimeout(_left(end))
+    link.settimeout(_remaining_time(deadline))
     received = link.recv(4096)
-    if not received or before + len(received) > MAX_HEAD_BYTES:
+    if not received or received_bytes + len(received) > MAX_HEAD_BYTES:
         raise ValueError("no end of an answer")
     return received

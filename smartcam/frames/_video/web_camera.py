@@ -18,7 +18,7 @@ from smartcam.frames._streaming.rtp.driver import FirstPicture
 from smartcam.frames._video.driver import VideoDriver
 from smartcam.frames._video.frames import CONVERTIBLE
 from smartcam.frames._video.multipart import PictureCutter
-from smartcam.frames._video.redirects import why
+from smartcam.frames._video.redirects import failure_reason
 from smartcam.frames._video.web_request import WebStream
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class WebDriver(VideoDriver):
     byte.
     """
 
-    _playing: _PartsStream | None = None
-    _is_parts = False
+    _multipart_stream: _MultipartStream | None = None
+    _is_multipart = False
     _size: tuple[int, int] | None = None
 
     async def open(self) -> StreamFormat:
@@ -51,8 +51,8 @@ class WebDriver(VideoDriver):
         load("av")
         first = FirstPicture()
         try:
-            self._is_parts = await self._begin_parts(first)
-            if not self._is_parts:
+            self._is_multipart = await self._start_multipart(first)
+            if not self._is_multipart:
                 return await super().open()
             if self._fps:
                 raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
@@ -68,9 +68,9 @@ class WebDriver(VideoDriver):
         Raises:
             FrameSourceError: the source is gone, or does not answer.
         """
-        if not self._is_parts:
+        if not self._is_multipart:
             await super().start(sink)
-        elif not await self._begin_parts(sink):
+        elif not await self._start_multipart(sink):
             raise FrameFormatError(
                 f"{self.name}: expected parts as at the opening, got another answer: open it again",
                 source=self.name,
@@ -78,24 +78,26 @@ class WebDriver(VideoDriver):
 
     async def stop(self) -> None:
         """Stop reading."""
-        playing, self._playing = self._playing, None
-        if playing is not None:
-            await playing.end()
+        stream, self._multipart_stream = self._multipart_stream, None
+        if stream is not None:
+            await stream.stop()
         await super().stop()
 
-    async def _begin_parts(self, sink: FrameSink) -> bool:
-        """Start reading parts; return False for other streams, or if a proxy is needed."""
-        if self._elsewhere or _by_proxy(self.address.scheme, self.address.host):
+    async def _start_multipart(self, sink: FrameSink) -> bool:
+        """Start reading a multipart stream; return False for other streams, or with a proxy."""
+        if self._allows_elsewhere or _needs_proxy(self.address.scheme, self.address.host):
             return False
         url = self.address.url.partition("#")[0]
         stream = WebStream(self.name, url, self._tls)
         try:
             async with asyncio.timeout(self._timeout):
                 await stream.open()
-            self._check(stream)
+            self._check_answer(stream)
             if stream.answer.is_pictures:
-                self._playing = _PartsStream(stream, self._plan(), self._timeout, sink)
-                await self._playing.begin()
+                self._multipart_stream = _MultipartStream(
+                    stream, self._decoding_plan(), self._timeout, sink
+                )
+                await self._multipart_stream.start()
         except FrameSourceError:
             raise
         except TimeoutError:
@@ -103,35 +105,37 @@ class WebDriver(VideoDriver):
                 f"expected an answer, got none within {self._timeout:g} s"
             ) from None
         except (OSError, ValueError) as exc:
-            raise self._source_error(f"cannot be read: {why(exc)}") from None
+            raise self._source_error(f"cannot be read: {failure_reason(exc)}") from None
         finally:
-            if self._playing is None:
+            if self._multipart_stream is None:
                 stream.close()
-        return self._playing is not None
+        return self._multipart_stream is not None
 
-    def _check(self, stream: WebStream) -> None:
+    def _check_answer(self, stream: WebStream) -> None:
         answer = stream.answer
         if answer.status not in STREAM_STATUSES:
-            shown = f"{answer.status} {answer.reason}".strip()
-            raise self._source_error(f"cannot be read: {shown}")
+            status = f"{answer.status} {answer.reason}".strip()
+            raise self._source_error(f"cannot be read: {status}")
         coding = answer.header("content-encoding").lower()
         if answer.is_pictures and coding not in ("", "identity"):
             raise self._source_error(f"expected no encoding, got Content-Encoding: {coding[:40]}")
         if answer.is_pictures and self._format is not None and self._format.name == "H264":
             raise self._source_error("expected H264, got MJPEG")
 
-    def _plan(self) -> DecodingPlan:
+    def _decoding_plan(self) -> DecodingPlan:
         wanted = "" if self._format is None else self._format.name
-        passed_on = wanted == "MJPEG"
-        to = "" if passed_on or not wanted else CONVERTIBLE[wanted]
+        passes_encoded = wanted == "MJPEG"
+        pixel_format = "" if passes_encoded or not wanted else CONVERTIBLE[wanted]
         coding = JPEG._replace(size_in=_size_in)
-        return DecodingPlan(self.name, coding, self._delay, self._size, b"", to, passed_on)
+        return DecodingPlan(
+            self.name, coding, self._delay, self._size, b"", pixel_format, passes_encoded
+        )
 
     def _source_error(self, text: str) -> FrameSourceError:
         return FrameSourceError(f"{self.name}: {text}", source=self.name)
 
 
-class _PartsStream:
+class _MultipartStream:
     """The tasks and the connection of a driver while a camera sends parts."""
 
     def __init__(
@@ -141,17 +145,17 @@ class _PartsStream:
         self._loop = asyncio.get_running_loop()
         self._decoding = UnitDecoding(plan, sink)
         self._tasks: list[asyncio.Task[None]] = []
-        self._shown = self._received_at = self._loop.time()
+        self._decoded_at = self._received_at = self._loop.time()
 
-    async def begin(self) -> None:
+    async def start(self) -> None:
         """Start cutting and decoding pictures."""
-        await self._decoding.begin(self)
+        await self._decoding.start(self)
         self._tasks = [
             asyncio.create_task(work, name=f"{label} of {self._name}")
-            for work, label in ((self._read(), "parts"), (self._watch(), "silence"))
+            for work, label in ((self._read(), "parts"), (self._watch_silence(), "silence"))
         ]
 
-    async def end(self) -> None:
+    async def stop(self) -> None:
         """Stop; the sink is not called any more."""
         self._stream.close()
         for task in self._tasks:
@@ -160,21 +164,21 @@ class _PartsStream:
             if self._tasks:
                 await asyncio.wait(self._tasks)
         finally:
-            await self._decoding.end()
+            await self._decoding.stop()
 
     def utc(self, timestamp: int) -> float | None:
         """Return None: parts have no time."""
         return None
 
-    def want_picture(self) -> None:
+    def request_key_frame(self) -> None:
         """Do nothing: every picture is a key frame."""
 
-    def shown(self) -> None:
-        """Note that a picture was decoded."""
-        self._shown = self._loop.time()
+    def note_decoded(self) -> None:
+        """Record that a picture was decoded."""
+        self._decoded_at = self._loop.time()
 
     async def _read(self) -> None:
-        cutter, begins = PictureCutter(), True
+        cutter, is_first = PictureCutter(), True
         error: FrameSourceError
         try:
             async with contextlib.aclosing(self._stream.pieces()) as pieces:
@@ -182,26 +186,26 @@ class _PartsStream:
                     self._received_at = self._loop.time()
                     for picture in cutter.feed(piece):
                         damaged, cutter.damaged = cutter.damaged, 0
-                        unit = AccessUnit(picture, 0, 0, damaged, self._received_at, begins)
-                        self._decoding.take([unit])
-                        begins = False
+                        unit = AccessUnit(picture, 0, 0, damaged, self._received_at, is_first)
+                        self._decoding.queue_units([unit])
+                        is_first = False
             error = FrameSourceError(f"{self._name}: the server ended the stream")
         except MessageError as exc:
             error = FrameFormatError(f"{self._name}: expected JPEGs, got {exc}")
         except OSError as exc:
-            error = FrameSourceError(f"{self._name}: cannot be read: {why(exc)}")
+            error = FrameSourceError(f"{self._name}: cannot be read: {failure_reason(exc)}")
         await self._decoding.finish(error)
 
-    async def _watch(self) -> None:
-        while (left := self._shown + self._timeout - self._loop.time()) > 0:  # noqa: ASYNC110
-            await asyncio.sleep(left)
+    async def _watch_silence(self) -> None:
+        while (remaining := self._decoded_at + self._timeout - self._loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(remaining)
         seconds = f"{self._timeout:g} s"
         if self._loop.time() - self._received_at < self._timeout:
             text = f"expected a picture, got bytes that make no picture for {seconds}"
-            self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
+            self._decoding.report_end(FrameFormatError(f"{self._name}: {text}"))
         else:
             text = f"expected a picture, got no bytes for {seconds}"
-            self._decoding.over(FrameSourceError(f"{self._name}: {text}"))
+            self._decoding.report_end(FrameSourceError(f"{self._name}: {text}"))
 
 
 def _size_in(picture: bytes) -> tuple[int, int] | None:
@@ -212,6 +216,6 @@ def _size_in(picture: bytes) -> tuple[int, int] | None:
     return width, height
 
 
-def _by_proxy(scheme: str, host: str) -> bool:
+def _needs_proxy(scheme: str, host: str) -> bool:
     """Return True if the environment names a proxy for a host, which FFmpeg uses."""
     return bool(urllib.request.getproxies().get(scheme)) and not urllib.request.proxy_bypass(host)

@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 
 from smartcam.exceptions import FrameSourceError, MessageError
 from smartcam.frames._streaming.rtsp_client.authorization import Credentials
-from smartcam.frames._video.redirects import MAX_REDIRECTS, REDIRECTS, followed
+from smartcam.frames._video.redirects import MAX_REDIRECTS, REDIRECTS, checked_redirect
 
 if TYPE_CHECKING:
     import ssl
@@ -37,7 +37,7 @@ _PICTURES: Final = re.compile(r"(?i)\s*(?:multipart/|video/(?:x-)?(?:m|motion-?)
 MAX_INTERIM_ANSWERS: Final = 8
 """Largest number of interim answers (1xx)."""
 
-_HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
+_HEADER_END: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
@@ -89,23 +89,23 @@ class WebStream:
         """
         parts = urlsplit(self._url)
         credentials = Credentials(unquote(parts.username or ""), unquote(parts.password or ""))
-        redirects = refused = 0
+        redirects = refusals = 0
         while redirects <= MAX_REDIRECTS:
-            self.answer = answer = await self._ask(credentials)
+            self.answer = answer = await self._request(credentials)
             challenges = answer.headers.get("www-authenticate", ())
             if (
                 answer.status == 401
-                and refused < MAX_REFUSALS
-                and credentials.challenged(challenges)
+                and refusals < MAX_REFUSALS
+                and credentials.store_challenge(challenges)
             ):
-                refused += 1
+                refusals += 1
                 continue
             location = answer.header("location")
             if answer.status not in REDIRECTS or not location:
                 return
             peer = self._writer.get_extra_info("peername") if self._writer else None
             redirects += 1
-            self._url = followed(self._url, location, str((peer or ("",))[0]), self._name)
+            self._url = checked_redirect(self._url, location, str((peer or ("",))[0]), self._name)
         raise FrameSourceError(
             f"{self._name}: more than {MAX_REDIRECTS} redirects", source=self._name
         )
@@ -135,7 +135,7 @@ class WebStream:
                 size -= len(piece)
                 yield piece
 
-    async def _ask(self, credentials: Credentials) -> WebAnswer:
+    async def _request(self, credentials: Credentials) -> WebAnswer:
         self.close()
         parts = urlsplit(self._url)
         host, port = parts.hostname or "", parts.port or PORTS[parts.scheme]
@@ -145,38 +145,38 @@ class WebStream:
         )
         path = parts._replace(scheme="", netloc="", fragment="").geturl() or "/"
         path = path if path.startswith("/") else f"/{path}"
-        shown = credentials.header("GET", path)
+        authorization = credentials.header("GET", path)
         lines = [
             *(f"GET {path} HTTP/1.1", f"Host: {parts.netloc.rpartition('@')[2]}", "Accept: */*"),
             *("User-Agent: smartcam", "Connection: close"),
-            *([f"Authorization: {shown}"] if shown else ()),
+            *([f"Authorization: {authorization}"] if authorization else ()),
         ]
         self._writer.write("\r\n".join((*lines, "", "")).encode())
         self._unread = b""
-        answer = await self._head()
+        answer = await self._read_header()
         for _ in range(MAX_INTERIM_ANSWERS):
             if answer.status not in INTERIM:
                 break
-            answer = await self._head()
+            answer = await self._read_header()
         return answer
 
-    async def _head(self) -> WebAnswer:
+    async def _read_header(self) -> WebAnswer:
         received = bytearray()
-        looked = 0
-        while (ends := _HEAD_ENDS.search(received, max(0, looked - 10))) is None:
-            looked = len(received)
+        searched = 0
+        while (match := _HEADER_END.search(received, max(0, searched - 10))) is None:
+            searched = len(received)
             piece = await self._read_piece()
             received += piece
             if not piece or len(received) > MAX_HEAD_BYTES:
                 raise ValueError("no head")
-        self._unread = bytes(received[ends.end() :])
-        return _answer(bytes(received[: ends.start()]))
+        self._unread = bytes(received[match.end() :])
+        return _parse_header(bytes(received[: match.start()]))
 
-    async def _read_piece(self, most: int = PIECE_BYTES) -> bytes:
+    async def _read_piece(self, size: int = PIECE_BYTES) -> bytes:
         if self._unread:
-            piece, self._unread = self._unread[:most], self._unread[most:]
+            piece, self._unread = self._unread[:size], self._unread[size:]
             return piece
-        return b"" if self._reader is None else await self._reader.read(most)
+        return b"" if self._reader is None else await self._reader.read(size)
 
     async def _chunk_size(self) -> int:
         """Return the size of the next chunk; 0 at the end."""
@@ -194,7 +194,7 @@ class WebStream:
         return int(size, 16)
 
 
-def _answer(head: bytes) -> WebAnswer:
+def _parse_header(head: bytes) -> WebAnswer:
     first, *lines = head.decode("latin-1").replace("\r", "").split("\n")
     match = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
     if match is None:

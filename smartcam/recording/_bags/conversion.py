@@ -102,11 +102,13 @@ class BagConversion:
         chosen = (
             [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
         )
-        again = self.interpret_as is not None or self.calibration is not None
-        self._readers = {camera.name: self._reader(camera) for camera in chosen} if again else {}
+        interprets_again = self.interpret_as is not None or self.calibration is not None
+        self._readers = (
+            {camera.name: self._reader(camera) for camera in chosen} if interprets_again else {}
+        )
         self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
         for camera in chosen:
-            facts = {"interpret_as": self._spec(camera)} if again else camera.facts
+            facts = {"interpret_as": self._spec(camera)} if interprets_again else camera.facts
             self._items.describe({**facts, "camera": camera.name})
 
     @property
@@ -115,7 +117,7 @@ class BagConversion:
         return self._items.counts
 
     def steps(self) -> Generator[None, None, None]:
-        """Write the bag, an item a step; if the generator is closed early, remove the bag.
+        """Write the bag, one item in each step; if the generator is closed early, remove the bag.
 
         Raises as :func:`write_bag`.
         """
@@ -128,7 +130,7 @@ class BagConversion:
             with contextlib.closing(writer):
                 writer.start()
                 for item in self.recording.items(self.camera):
-                    self._see(item)
+                    self._track_byte_order(item)
                     for message in self._items.messages(item):
                         writer.add(*message)
                     yield
@@ -156,7 +158,7 @@ class BagConversion:
             )
         y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
         spec = self._spec(camera)
-        reading = Interpretation(
+        interpretation = Interpretation(
             spec,
             lenient=camera.facts.get("lenient") == "True",
             y_down=y_down,
@@ -166,17 +168,17 @@ class BagConversion:
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:
             raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
-        return _ResultReader(reading, int(endian))
+        return _ResultReader(interpretation, int(endian))
 
-    def _see(self, item: Item) -> None:
+    def _track_byte_order(self, item: Item) -> None:
         if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._readers:
-            self._readers[item.camera].see_status(item)
+            self._readers[item.camera].set_byte_order(item)
 
     def _read(self, result: Result) -> ReadResult:
         """Return a result as it is written to the bag."""
         if self._readers:
             return self._readers[result.camera].read(result)
-        if result.value == result.raw.hex():  # text form of bytes in a recording
+        if result.value == result.raw.hex():  # a recording has bytes as hexadecimal text
             return ReadResult(result._replace(value=result.raw))
         parts = parts_from_json(result.value)
         return ReadResult(result if parts is None else result._replace(value=parts))
@@ -189,8 +191,8 @@ class _ResultReader:
     _interpretation: Interpretation
     _endian: int
 
-    def see_status(self, entry: TraceEntry) -> None:
-        """Keep the byte order of a status."""
+    def set_byte_order(self, entry: TraceEntry) -> None:
+        """Use the byte order of a status for the next results."""
         endian = (entry.fields or {}).get("endian")
         if isinstance(endian, int):
             self._endian = endian
@@ -207,5 +209,5 @@ class _ResultReader:
                 at=result.received_at,
             )
         except InterpretationError as exc:
-            return ReadResult(result, f"{type(exc).__name__}: {exc}", again=True)
-        return ReadResult(result._replace(value=value, sequence=sequence), again=True)
+            return ReadResult(result, f"{type(exc).__name__}: {exc}", was_reinterpreted=True)
+        return ReadResult(result._replace(value=value, sequence=sequence), was_reinterpreted=True)

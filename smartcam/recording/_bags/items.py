@@ -26,7 +26,7 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._bags.specs import Specs
+from smartcam.recording._bags.specs import RecordedInterpreters
 from smartcam.recording._bags.writer import Topic
 from smartcam.recording._mcap.form import RecordedError, nanoseconds
 from smartcam.ros2._inside import (
@@ -94,12 +94,12 @@ class BagMessage(NamedTuple):
 class ReadResult(NamedTuple):
     """A result as it is written to the bag; ``error``: why it could not be interpreted, or "".
 
-    ``again``: it was interpreted again, so an earlier error does not count.
+    ``was_reinterpreted``: it was interpreted again, so an earlier error does not count.
     """
 
     result: Result
     error: str = ""
-    again: bool = False
+    was_reinterpreted: bool = False
 
 
 @dataclass(eq=False)
@@ -122,10 +122,11 @@ class BagItems:
     def describe(self, facts: Mapping[str, Any]) -> None:
         """Keep facts about a camera, as from ``Recorder.describe``."""
         if {"interpret_as", "pixels"} & facts.keys():
-            camera = self._of(facts["camera"])
+            camera = self._camera_of(facts["camera"])
             camera.facts.update(facts)
             pixels = camera.facts.get("pixels") == "True"
-            camera.specs = Specs(camera.facts.get("interpret_as", ""), pixels=pixels)
+            spec = camera.facts.get("interpret_as", "")
+            camera.interpreters = RecordedInterpreters(spec, pixels=pixels)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
         """Yield the messages of an item; none for a frame, since ROS has no message for it."""
@@ -136,67 +137,68 @@ class BagItems:
     def _messages(self, item: object) -> Iterator[BagMessage]:
         match item:
             case Result():
-                camera = self._of(item.camera)
-                camera.settle(item.raw)
+                camera = self._camera_of(item.camera)
+                camera.remove_container(item.raw)
                 yield from self._result(camera, *self._read(item)[:2])
             case TraceEntry():
-                self._of(item.camera).see_frame(item)
+                self._camera_of(item.camera).keep_container(item)
             case RecordedError():
-                yield from self._error(self._of(item.camera), item)
+                yield from self._error(self._camera_of(item.camera), item)
             case CameraEvent():
-                camera = self._of(item.camera)
-                camera.see_event(item)
-                yield from camera.state(item.at)
+                camera = self._camera_of(item.camera)
+                camera.update_state(item)
+                yield from camera.state_messages(item.at)
             case _:
                 pass
 
-    def _of(self, name: str) -> _BagCamera:
-        known = self._cameras.get(name)
-        if known is None:
+    def _camera_of(self, name: str) -> _BagCamera:
+        camera = self._cameras.get(name)
+        if camera is None:
             base = title = topic_of_camera(name)
             number = 2
             while title in self._titles:
                 title, number = f"{base}_{number}", number + 1
             self._titles.add(title)
-            known = self._cameras[name] = _BagCamera(
+            camera = self._cameras[name] = _BagCamera(
                 name, title, ResultMessages(self._types, name, name)
             )
-        return known
+        return camera
 
     def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
-        at, made = nanoseconds(result.received_at), camera.make
+        at, messages = nanoseconds(result.received_at), camera.result_messages
         if result.application < 0:  # the result's application is unknown
             result = result._replace(application=0)
-        parts = None if error else camera.specs.parts(result)
+        parts = None if error else camera.interpreters.localizations(result)
         frames = {part.pose.header.frame_id for part in parts or ()}
         self._count(results=1, unread=bool(error), localizations=parts is not None)
         if error:
-            message = made.result(result._replace(value=result.raw), None)
+            message = messages.result(result._replace(value=result.raw), None)
             message.error = utf8(error)
         else:
-            message = made.result(result, parts)
+            message = messages.result(result, parts)
         yield BagMessage(camera.results, at, message)
         if len(frames) > 1:  # a PoseArray has only one frame
             text = f"result {result.number}: poses in several frames: {', '.join(sorted(frames))}"
-            yield camera.warning(result.received_at, text)
+            yield camera.warning_message(result.received_at, text)
         elif parts is not None:
-            yield BagMessage(camera.localizations, at, made.poses(result, parts))
-            yield BagMessage(camera.detections, at, made.detections(result, parts))
+            yield BagMessage(camera.localizations, at, messages.poses(result, parts))
+            yield BagMessage(camera.detections, at, messages.detections(result, parts))
 
     def _error(self, camera: _BagCamera, item: RecordedError) -> Iterator[BagMessage]:
         text = f"{item.error}: {item.text}"
         if item.error not in UNREADABLE:
             self._count(errors=1)
-            yield camera.warning(item.at, text, triggered_at=item.triggered_at)
+            yield camera.warning_message(item.at, text, triggered_at=item.triggered_at)
             return
-        application, raw, at = camera.unread() or (0, b"", item.at)
+        application, raw, at = camera.take_unread() or (0, b"", item.at)
         result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
-        reading = self._read(result) if raw else ReadResult(result)
-        yield from self._result(camera, reading.result, reading.error if reading.again else text)
+        read = self._read(result) if raw else ReadResult(result)
+        error = read.error if read.was_reinterpreted else text
+        yield from self._result(camera, read.result, error)
 
-    def _count(self, **more: int) -> None:
-        now = {name: getattr(self.counts, name) + more[name] for name in more}
-        self.counts = self.counts._replace(**now)
+    def _count(self, **increments: int) -> None:
+        totals = {name: getattr(self.counts, name) + by for name, by in increments.items()}
+        self.counts = self.counts._replace(**totals)
 
 
 @dataclass(eq=False)
@@ -205,14 +207,14 @@ class _BagCamera:
 
     name: str
     title: str  # name in topics
-    make: ResultMessages
+    result_messages: ResultMessages
     url: str = ""
-    known: KnownState = field(init=False)  # state, as far as it was recorded
+    state: KnownState = field(init=False)  # state, as far as it was recorded
     facts: dict[str, Any] = field(default_factory=dict[str, Any])  # facts that were recorded
-    specs: Specs = field(default_factory=Specs)  # specifications by which its results are read
+    interpreters: RecordedInterpreters = field(default_factory=RecordedInterpreters)
 
     def __post_init__(self) -> None:
-        self.known = KnownState(self.name)
+        self.state = KnownState(self.name)
         self.results = Topic(f"/{self.title}/results", RESULT, DRIVER)
         self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
@@ -220,34 +222,38 @@ class _BagCamera:
         self._last_health: object = None  # contents of the last diagnostics
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_MAX_CONTAINERS)
 
-    def see_event(self, event: CameraEvent) -> None:
+    def update_state(self, event: CameraEvent) -> None:
         """Keep the state that an event reports."""
         match event:
             case Connected() | Reconnected():
                 self.url = event.url
-                self.known = self.known._replace(connected=True, why="")
+                self.state = self.state._replace(connected=True, why="")
             case Disconnected():
-                self.known = self.known._replace(connected=False, status=None, why=event.reason)
+                self.state = self.state._replace(connected=False, status=None, why=event.reason)
             case StatusChanged():
-                self.known = self.known._replace(status=event.status)
+                self.state = self.state._replace(status=event.status)
             case ApplicationChanged():
-                self.known = self.known._replace(application=event.application)
+                self.state = self.state._replace(application=event.application)
             case _:
                 pass
 
-    def state(self, at: datetime) -> Iterator[BagMessage]:
+    def state_messages(self, at: datetime) -> Iterator[BagMessage]:
         """Yield the messages of the state for its topic and, if they changed, the diagnostics."""
-        known = self.known
-        how = health(known, session_alive=bool(known.why))
-        fields = {"header": header_fields(at, self.name), **status_fields(known)}
+        state = self.state
+        condition = health(state, session_alive=bool(state.why))
+        fields = {"header": header_fields(at, self.name), **status_fields(state)}
         yield BagMessage(self._status, nanoseconds(at), fields)
-        health_now = (how.level, "" if how.level == OK else how.text, known.application)
-        if health_now != self._last_health:
-            self._last_health = health_now
-            application = [] if known.application is None else [("application", known.application)]
-            yield self._diagnostics(at, how.level, how.text, application)
+        health_contents = (
+            condition.level,
+            "" if condition.level == OK else condition.text,
+            state.application,
+        )
+        if health_contents != self._last_health:
+            self._last_health = health_contents
+            application = [] if state.application is None else [("application", state.application)]
+            yield self._diagnostics(at, condition.level, condition.text, application)
 
-    def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
+    def warning_message(self, at: datetime, text: str, **values: object) -> BagMessage:
         """Return a message of the diagnostics about a single error."""
         pairs = [(key, value) for key, value in values.items() if value is not None]
         return self._diagnostics(at, WARN, text, pairs)
@@ -261,7 +267,7 @@ class _BagCamera:
 
     # ------------------------------------------------------------------ containers
 
-    def see_frame(self, entry: TraceEntry) -> None:
+    def keep_container(self, entry: TraceEntry) -> None:
         """Keep a container until its result or error comes."""
         if entry.direction == "<" and entry.message == "ResultContainer" and entry.fields:
             data, application = entry.fields.get("data"), entry.fields.get("application", -1)
@@ -269,22 +275,22 @@ class _BagCamera:
                 with contextlib.suppress(ValueError):
                     self._containers.append((application, bytes.fromhex(data), entry.at))
 
-    def settle(self, raw: bytes) -> None:
+    def remove_container(self, raw: bytes) -> None:
         """Remove a container that was interpreted, and earlier ones."""
-        for place, (_, data, _) in enumerate(self._containers):
+        for index, (_, data, _) in enumerate(self._containers):
             if data == raw:
-                for _ in range(place + 1):
+                for _ in range(index + 1):
                     self._containers.popleft()
                 return
 
-    def unread(self) -> tuple[int, bytes, datetime] | None:
-        """Return application, bytes and time of the container that an error is about.
+    def take_unread(self) -> tuple[int, bytes, datetime] | None:
+        """Remove all containers; return application, bytes and time of the one an error is about.
 
         If several containers wait, it is not known which one: None.
         """
-        known = self._containers.pop() if len(self._containers) == 1 else None
+        container = self._containers.pop() if len(self._containers) == 1 else None
         self._containers.clear()
-        return known
+        return container
 
 
 def _hardware(url: str) -> str:
@@ -321,7 +327,7 @@ def _part(fields: Mapping[str, Any]) -> Localization:
         raise TypeError("no text")
     if type(photo) is not int:
         raise TypeError("no index")
-    place = Pose(
+    camera_pose = Pose(
         Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
         Position(*(_number(pose["position"][name]) for name in "xyz")),
         Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
@@ -331,8 +337,8 @@ def _part(fields: Mapping[str, Any]) -> Localization:
         errors: dict[str, Any] = {
             name: None if value is None else _number(value) for name, value in sigma.items()
         }
-        place = place.with_sigma(PoseSigma(**errors))
-    return Localization(feature, _number(fields["quality"]), photo, place)
+        camera_pose = camera_pose.with_sigma(PoseSigma(**errors))
+    return Localization(feature, _number(fields["quality"]), photo, camera_pose)
 
 
 def _number(value: object) -> float:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.frames import Frame
     from smartcam.models import Result
     from smartcam.observers import TraceEntry
-    from smartcam.recording._recorder import Given
+    from smartcam.recording._recorder import RecorderInput
 
 
 DISTRIBUTION = "jazzy"
@@ -59,7 +59,7 @@ class BagRecorder(Recorder):
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """Keep a result container, which is recorded if it cannot be interpreted."""
+        """Pass on a result container: it is recorded if it cannot be interpreted."""
         if entry.message == "ResultContainer":
             self._put(entry, len(entry.hex))
 
@@ -91,7 +91,7 @@ class _BagFile:
         self.start, self.flush = self._writer.start, self._writer.flush
         self.finish, self.close = self._writer.finish, self._writer.close
 
-    def add(self, item: Given, /) -> None:
+    def add(self, item: RecorderInput, /) -> None:
         """Write one item; raise ValueError if no message can be made from it."""
         if isinstance(item, Description):
             self.items.describe(item.facts)

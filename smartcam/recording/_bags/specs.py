@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Result
 
 
-class Specs:
+class RecordedInterpreters:
     """The interpreters that ``interpret_as`` names, for all applications or for each.
 
     Args:
@@ -33,20 +33,20 @@ class Specs:
         self._pixels = pixels
         self._with_parts: set[int] = set()  # applications that had localizations
 
-    def parts(self, result: Result) -> list[Localization] | None:
+    def localizations(self, result: Result) -> list[Localization] | None:
         """Return a result's localizations in metres; None if it has none, or in pixels.
 
         An empty list counts as localizations if its application had some.
         """
         parts, application = localizations_of(result.value), result.application
-        reader = self._by_application.get(application, self._by_application.get(None))
-        pixels = self._pixels or in_pixels(reader)
+        interpreter = self._by_application.get(application, self._by_application.get(None))
+        pixels = self._pixels or in_pixels(interpreter)
         if parts:
             self._with_parts.add(application)
             calibrated = parts[0].pose.header.frame_id != result.camera
             return None if pixels and not calibrated else parts
-        given = reader is not None and without_poses(reader) is None and not pixels
-        return parts if given or application in self._with_parts else None
+        has_poses = interpreter is not None and without_poses(interpreter) is None and not pixels
+        return parts if has_poses or application in self._with_parts else None
 
 
 def _resolved(spec: Any) -> Interpreter | None:

@@ -18,7 +18,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import smartcam
 from smartcam.exceptions import ConfigurationError
-from smartcam.recording._exclusive_files import opened
+from smartcam.recording._exclusive_files import open_exclusively
 from smartcam.recording._mcap.form import load_compress, load_extra
 from smartcam.recording._mcap.writer import McapWriter
 from smartcam.recording._recorder import CHUNK
@@ -33,7 +33,7 @@ VERSION = 8
 
 METADATA = "metadata.yaml"
 
-_HALF = f"{METADATA}.tmp"
+_TEMPORARY_METADATA = f"{METADATA}.tmp"
 
 _FOREVER = {"sec": 9_223_372_036, "nsec": 854_775_807}
 _RELIABLE, _BEST_EFFORT, _KEEP_LAST, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 2, 1, 1, 2, 1
@@ -76,14 +76,14 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
     """
     label = f"bag {folder}"
     try:
-        made = _made(folder, label, overwrite=overwrite)
+        created = _create_folder(folder, label, overwrite=overwrite)
         try:
-            stream = opened(mcap_of(folder), overwrite=overwrite)
+            stream = open_exclusively(mcap_of(folder), overwrite=overwrite)
             for old in folder.iterdir():
                 if old.name != mcap_of(folder).name:
                     old.unlink()
         except BaseException:
-            if made:
+            if created:
                 folder.rmdir()
             raise
     except (OSError, ValueError) as exc:
@@ -94,7 +94,7 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
     return stream
 
 
-def _made(folder: Path, label: str, *, overwrite: bool) -> bool:
+def _create_folder(folder: Path, label: str, *, overwrite: bool) -> bool:
     """Create the folder if it does not exist; return whether it was created."""
     try:
         folder.mkdir()
@@ -123,12 +123,12 @@ def mcap_of(folder: Path) -> Path:
 def _is_of_bag(folder: Path, path: Path) -> bool:
     """Return True if a file may be the bag's own; other recordings are not."""
     match = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
-    return (match is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
+    return (match is not None or path.name in {METADATA, _TEMPORARY_METADATA}) and not path.is_dir()
 
 
 def remove_folder(folder: Path) -> None:
     """Remove a bag of smartcam that is no longer being written."""
-    for path in (folder / METADATA, folder / _HALF, mcap_of(folder)):
+    for path in (folder / METADATA, folder / _TEMPORARY_METADATA, mcap_of(folder)):
         path.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # another program has put a file there
         folder.rmdir()
@@ -208,12 +208,12 @@ class BagWriter:
         if self._on_disk:
             os.fsync(self.stream.fileno())
         text = self._text({"rosbag2_bagfile_information": self._metadata()})
-        half = self.folder / _HALF
-        with half.open("w", encoding="utf-8") as stream:
+        temporary = self.folder / _TEMPORARY_METADATA
+        with temporary.open("w", encoding="utf-8") as stream:
             stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
-        half.replace(self.folder / METADATA)
+        temporary.replace(self.folder / METADATA)
 
     def close(self) -> None:
         """Close the file, and drop bytes that cannot be written."""
@@ -221,26 +221,26 @@ class BagWriter:
             self.stream.close()
 
     def _new_channel(self, topic: Topic) -> _BagChannel:
-        kind = self.types.message(topic.type)
-        if kind.name not in self._schemas:
-            self._schemas[kind.name] = self._writer.register_schema(
-                kind.name, "ros2msg", kind.text.encode()
+        message_type = self.types.message(topic.type)
+        if message_type.name not in self._schemas:
+            self._schemas[message_type.name] = self._writer.register_schema(
+                message_type.name, "ros2msg", message_type.text.encode()
             )
         qos = self._text([_policies(topic.qos)]).strip()
-        number = self._writer.register_channel(
+        channel_id = self._writer.register_channel(
             topic.name,
             "cdr",
-            self._schemas[kind.name],
-            {"offered_qos_profiles": qos, "topic_type_hash": kind.hash},
+            self._schemas[message_type.name],
+            {"offered_qos_profiles": qos, "topic_type_hash": message_type.hash},
         )
         metadata = {
             "name": topic.name,
-            "type": kind.name,
+            "type": message_type.name,
             "serialization_format": "cdr",
             "offered_qos_profiles": qos,
-            "type_description_hash": kind.hash,
+            "type_description_hash": message_type.hash,
         }
-        return _BagChannel(number, metadata)
+        return _BagChannel(channel_id, metadata)
 
     def _write_metadata_record(self) -> None:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import FrameFormatError
-from smartcam.recording._exclusive_files import opened
+from smartcam.recording._exclusive_files import open_exclusively
 from smartcam.recording._folders.track import Gap
 from smartcam.recording._recorder import Description, RecordingFile
 from smartcam.recording._state import STATE_METADATA
@@ -62,75 +62,75 @@ class FolderFiles:
         clock: Callable[[], float],
     ) -> None:
         self._folder, self._limits, self._compress, self._clock = folder, limits, compress, clock
-        self._looked = -math.inf  # time of the last listing of the folder
-        self._stuck: set[str] = set()  # files that could not be deleted
+        self._listed_at = -math.inf  # time of the last listing of the folder
+        self._undeletable: set[str] = set()  # files that could not be deleted
 
     def enter(self) -> None:
         """Enter the folder; raises as :meth:`RecordingFolder.enter`."""
         self._folder.enter()
-        self._looked = self._clock()
+        self._listed_at = self._clock()
 
-    def write(self, track: CameraTrack, given: list[Any]) -> None:
-        """Write records of a camera, and remove those on the disk from ``given``.
+    def write(self, track: CameraTrack, entries: list[Any]) -> None:
+        """Write records of a camera, and remove those on the disk from ``entries``.
 
         Raises:
             OSError: the remaining records could not be written.
         """
-        done = written = 0
+        done_count = written = 0
         try:
-            for place, item in enumerate(given):
-                if track.file is None or (not place % ITEMS_PER_CHECK and self._is_over(track)):
+            for index, entry in enumerate(entries):
+                if track.file is None or (not index % ITEMS_PER_CHECK and self._must_end(track)):
                     self._flush(track, written)
-                    done, written = place, 0
-                    self._begin(track, item)
-                written += self._add(track, item)
+                    done_count, written = index, 0
+                    self._begin_file(track, entry)
+                written += self._add(track, entry)
             self._flush(track, written)
-            done = len(given)
+            done_count = len(entries)
         except BaseException:
-            self._cut(track)
+            self._cut_file(track)
             raise
         finally:
-            del given[:done]
+            del entries[:done_count]
 
-    def _is_over(self, track: CameraTrack) -> bool:
-        aged = self._clock() - track.begun >= self._limits.age
+    def _must_end(self, track: CameraTrack) -> bool:
+        aged = self._clock() - track.begun_at >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
-    def _add(self, track: CameraTrack, given: Any) -> int:
-        """Add an object's records to the file; return their number."""
+    def _add(self, track: CameraTrack, entry: Any) -> int:
+        """Add an entry's records to the file; return their number."""
         file = track.file
         if file is None:  # cannot happen: the file was begun
             return 0
         if track.gap is not None and not track.gap_written:
             self._add_gap(track, file, track.gap)
             track.gap_written = True
-        if isinstance(given, Gap):
-            track.follow_all(given)
-            self._add_gap(track, file, given)
+        if isinstance(entry, Gap):
+            track.update_state_from_gap(entry)
+            self._add_gap(track, file, entry)
             return 0
-        if isinstance(given, Description):
-            track.facts |= given.facts
+        if isinstance(entry, Description):
+            track.facts |= entry.facts
             file.add(Description(track.facts))
             return 0
-        track.follow(given)
+        track.update_state(entry)
         written = 0
         try:
-            items = [*track.read(given)]
+            items = [*track.make_items(entry)]
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:  # noqa: BLE001 - an interpreter may raise anything
-            track.lose_one(f"unexpected {exc!r}")
+            track.count_one_lost(f"unexpected {exc!r}")
             return 0
-        track.more += len(items) - 1  # an uninterpretable result makes an error, too
+        track.extra_records += len(items) - 1  # an uninterpretable result makes an error, too
         for item in items:
             try:
                 file.add(item)
             except FrameFormatError as exc:  # an OSError, but not the disk's
-                track.lose_one(str(exc))
+                track.count_one_lost(str(exc))
             except OSError:
                 raise
             except Exception as exc:  # noqa: BLE001 - the record could not be read again
-                track.lose_one(str(exc))
+                track.count_one_lost(str(exc))
             else:
                 written += 1
         return written
@@ -138,25 +138,25 @@ class FolderFiles:
     @staticmethod
     def _add_gap(track: CameraTrack, file: RecordingFile, gap: Gap) -> None:
         file.add(gap.error(track.camera))
-        file.note(STATE_METADATA, track.state.facts(track.endian, gap.until))
+        file.add_facts(STATE_METADATA, track.state.to_facts(track.endian, gap.until))
 
-    def _begin(self, track: CameraTrack, first: Any) -> None:
+    def _begin_file(self, track: CameraTrack, first: Any) -> None:
         """End a camera's file, if any, and begin the next one, whose first record is ``first``.
 
         Raises:
             OSError: the file cannot be created.
         """
         now = self._clock()
-        if now - self._looked > LISTING_INTERVAL:
-            self._folder.look()
-            self._looked = now
+        if now - self._listed_at > LISTING_INTERVAL:
+            self._folder.list_files()
+            self._listed_at = now
         at = _time_of(first)
         path = self._folder.next_path(track.camera, at)
-        file = RecordingFile(opened(path, overwrite=False), self._compress, path)
+        file = RecordingFile(open_exclusively(path, overwrite=False), self._compress, path)
         try:
             file.start()
             file.add(Description(track.facts))
-            file.note(STATE_METADATA, track.state.facts(track.endian, at))
+            file.add_facts(STATE_METADATA, track.state.to_facts(track.endian, at))
             file.flush()
         except BaseException:
             file.close()
@@ -165,7 +165,7 @@ class FolderFiles:
             raise
         self._folder.add(path)
         self.finish(track)
-        track.file, track.begun, track.good = file, now, file.size
+        track.file, track.begun_at, track.synced_bytes = file, now, file.size
 
     def _flush(self, track: CameraTrack, written: int) -> None:
         """Sync the added records to the disk, and count them."""
@@ -173,20 +173,20 @@ class FolderFiles:
         if file is None:
             return
         file.flush()
-        file.check()
-        track.good = file.size
+        file.check_path()
+        track.synced_bytes = file.size
         track.written += written
         if track.gap_written:
             track.gap, track.gap_written = None, False
-        self._folder.grown(file.path, file.size)
+        self._folder.set_size(file.path, file.size)
 
-    def _cut(self, track: CameraTrack) -> None:
+    def _cut_file(self, track: CameraTrack) -> None:
         """Close a file, cut to the last whole chunk."""
         file, track.file = track.file, None
         track.gap_written = False
         if file is not None:
-            file.cut(track.good)
-            self._folder.grown(file.path, track.good)
+            file.cut_to(track.synced_bytes)
+            self._folder.set_size(file.path, track.synced_bytes)
 
     def finish(self, track: CameraTrack) -> None:
         """End a camera's file, if any; without an index if that cannot be written."""
@@ -196,15 +196,15 @@ class FolderFiles:
         try:
             file.finish()
         except (OSError, ValueError) as exc:
-            file.cut(track.good)
+            file.cut_to(track.synced_bytes)
             logger.warning("%s has no end: %s", file.path, exc)
         file.close()
-        self._folder.grown(file.path, file.size)
+        self._folder.set_size(file.path, file.size)
 
     def end_old(self, tracks: Iterable[CameraTrack]) -> None:
         """End files that are old enough, also of silent cameras."""
         for track in tracks:
-            if self._is_over(track) and self._clock() - track.begun >= self._limits.age:
+            if self._must_end(track) and self._clock() - track.begun_at >= self._limits.age:
                 self.finish(track)
 
     # ------------------------------------------------------------------ the bound on the disk
@@ -212,8 +212,10 @@ class FolderFiles:
     def delete_old(self, tracks: Sequence[CameraTrack]) -> None:
         """Delete the oldest files until the rest is within the bound."""
         folder = self._folder
-        while folder.bytes > self._limits.keep:
-            old_files = [file for file in folder.files.values() if file.name not in self._stuck]
+        while folder.total_bytes > self._limits.keep:
+            old_files = [
+                file for file in folder.files.values() if file.name not in self._undeletable
+            ]
             if not old_files:
                 return
             oldest = min(old_files)
@@ -223,12 +225,12 @@ class FolderFiles:
             try:
                 folder.delete(oldest.name)
             except OSError as exc:
-                self._stuck.add(oldest.name)
+                self._undeletable.add(oldest.name)
                 logger.warning("%s cannot be deleted: %s", folder.path / oldest.name, exc)
 
 
-def _time_of(given: Any) -> datetime:
-    """Return the time of an object; the present time if it has none."""
-    item = getattr(given, "result", given)
+def _time_of(entry: Any) -> datetime:
+    """Return the time of an entry; the present time if it has none."""
+    item = getattr(entry, "result", entry)
     at = getattr(item, "received_at", None) or getattr(item, "at", None)
     return at if isinstance(at, datetime) else datetime.now(UTC)

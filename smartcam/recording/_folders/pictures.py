@@ -45,38 +45,38 @@ class FleetPictures:
     Args:
         server: agent of the cameras.
         writer: writer of the recordings.
-        all_of_them: whether every picture is recorded, or only pictures of results.
+        records_all: whether every picture is recorded, or only pictures of results.
     """
 
-    def __init__(self, server: FleetServer, writer: FolderWriter, *, all_of_them: bool) -> None:
-        self._server, self._writer, self._all = server, writer, all_of_them
+    def __init__(self, server: FleetServer, writer: FolderWriter, *, records_all: bool) -> None:
+        self._server, self._writer, self._records_all = server, writer, records_all
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._matchers: dict[str, PictureMatcher] = {}
 
-    def follow(self, track: CameraTrack) -> None:
-        """Record the pictures of a camera from now on; do nothing if they already are."""
+    def start_recording(self, track: CameraTrack) -> None:
+        """Record the pictures of a camera from now on; do nothing if they already are recorded."""
         task = self._tasks.get(track.camera)
         if task is None or task.done():
             name = f"smartcam.recordings.pictures[{track.camera}]"
             loop = asyncio.get_running_loop()
             self._tasks[track.camera] = loop.create_task(self._record(track), name=name)
 
-    def result(self, track: CameraTrack, result: Result[Any]) -> None:
+    def add_result(self, track: CameraTrack, result: Result[Any]) -> None:
         """Record the picture of a result, found by its time."""
         matcher = self._matchers.get(track.camera)
         if matcher is not None:
             matcher.results.append(result)
-            self._settle(track, matcher)
+            self._put_matched(track, matcher)
 
     def add_reported(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
-        """Record the picture of a result, as the camera names it."""
-        made = 0, result.number, result.received_at
-        self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *made))
+        """Record the picture of a result, of which the camera says that it belongs to it."""
+        link = 0, result.number, result.received_at
+        self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *link))
 
     async def stop(self) -> None:
         """Record no more pictures.
 
-        Cancellation: takes effect when the tasks have ended, which wait for nothing.
+        Cancellation: takes effect when the tasks have ended, which takes no waiting.
         """
         tasks = [*self._tasks.values()]
         self._tasks.clear()
@@ -94,61 +94,65 @@ class FleetPictures:
                 return
             if host.frames.reports_pictures:
                 return
-            why = "they ended"
+            reason = "they ended"
             try:
-                if await self._take_all(track, await host.frames.source()):
+                if await self._receive(track, await host.frames.source()):
                     delays, logged = RETRY.delays(), ""
             except (SmartCamError, OSError) as exc:
-                why = str(exc)
+                reason = str(exc)
             except Exception as exc:  # a driver may be a plug-in's
                 logger.exception("%s ! its pictures are not recorded", track.camera)
-                why = repr(exc)
-            if why != logged and not host.frames.closed:
-                logged = why
-                self._report(track, why)
+                reason = repr(exc)
+            if reason != logged and not host.frames.closed:
+                logged = reason
+                self._report(track, reason)
             await asyncio.sleep(next(delays))
 
-    async def _take_all(self, track: CameraTrack, source: FrameSource) -> bool:
+    async def _receive(self, track: CameraTrack, source: FrameSource) -> bool:
         """Receive pictures until the source ends; return whether any came."""
-        came = False
+        has_received = False
         matcher = PictureMatcher(MAX_MATCHED_BYTES)
 
-        def take(frame: Frame) -> bool:
-            nonlocal came
-            came = True
+        def on_frame(frame: Frame) -> bool:
+            nonlocal has_received
+            has_received = True
             picture = RecordedPicture(track.camera, captured_at(frame), frame)
-            if self._all:
+            if self._records_all:
                 return self._put(track, picture)
             matcher.add_picture(picture)
-            self._settle(track, matcher)
+            self._put_matched(track, matcher)
             return True
 
-        tap = FrameTap(source, take, lambda: self._writer.waiting > MAX_BYTES_WITH_PICTURES // 2)
-        if not self._all:
+        tap = FrameTap(
+            source,
+            on_frame,
+            lambda: self._writer.waiting_bytes > MAX_BYTES_WITH_PICTURES // 2,
+        )
+        if not self._records_all:
             self._matchers[track.camera] = matcher
         try:
             await tap.ended()
         finally:
             self._matchers.pop(track.camera, None)
             tap.close()
-        return came
+        return has_received
 
-    def _settle(self, track: CameraTrack, matcher: PictureMatcher) -> None:
-        for _, picture, _ in matcher.settled_by_time():
+    def _put_matched(self, track: CameraTrack, matcher: PictureMatcher) -> None:
+        for _, picture, _ in matcher.take_matched_by_time():
             if picture is not None:
                 self._put(track, RecordedPicture(track.camera, captured_at(picture), picture))
 
     def _put(self, track: CameraTrack, picture: RecordedPicture) -> bool:
         """Write a picture, or leave it out and count it if results need the room."""
         size = memoryview(picture.frame.data).nbytes
-        fits = self._writer.waiting + size <= MAX_BYTES_WITH_PICTURES
+        fits = self._writer.waiting_bytes + size <= MAX_BYTES_WITH_PICTURES
         return self._writer.put(
             track, picture, size if fits and size <= MAX_PICTURE_SIZE_BYTES else -1
         )
 
-    def _report(self, track: CameraTrack, why: str) -> None:
+    def _report(self, track: CameraTrack, reason: str) -> None:
         """Report in the log and in the recording that a camera's pictures do not come."""
-        logger.warning("%s ! its pictures are not recorded: %s", track.camera, why)
-        text = f"its pictures are not recorded: {why}"
+        logger.warning("%s ! its pictures are not recorded: %s", track.camera, reason)
+        text = f"its pictures are not recorded: {reason}"
         error = RecordedError(track.camera, datetime.now(UTC), "FrameSourceError", text, None)
         self._writer.put(track, error, len(text))

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam.recording._mcap.form import Item
 
 
-class _SeenResult(NamedTuple):
+class _ResultWithEndian(NamedTuple):
     """A result of an agent, with its byte order."""
 
     result: Result[Any]  # result, whose value is its container
@@ -128,18 +128,18 @@ class FleetRecorder(Server):
             self._writer = None
             await _run_to_end(writer.stop)
             raise
-        kind = _Frames if section.frames else _Hooks
-        self._pictures = self._made_pictures(writer)
-        self._observer = kind(self._server, section, writer, self._pictures)
+        observer_class = _SessionAndFrameObserver if section.frames else _SessionObserver
+        self._pictures = self._new_pictures(writer)
+        self._observer = observer_class(self._server, section, writer, self._pictures)
         self._server.observers.append(self._observer)
 
-    def _made_pictures(self, writer: FolderWriter) -> FleetPictures | None:
+    def _new_pictures(self, writer: FolderWriter) -> FleetPictures | None:
         if self.section.pictures == "none":
             return None
         with from_part("frames", "pictures need"):
             from smartcam.recording._folders.pictures import FleetPictures
 
-        return FleetPictures(self._server, writer, all_of_them=self.section.pictures == "all")
+        return FleetPictures(self._server, writer, records_all=self.section.pictures == "all")
 
     async def stop(self) -> None:
         """Write waiting records and end the files; 30 s at most, usually some milliseconds.
@@ -183,7 +183,7 @@ async def _run_to_end(work: Callable[[], None]) -> None:
         raise
 
 
-class _Hooks(Observer):
+class _SessionObserver(Observer):
     """Passes frames, results, events and errors of an agent's sessions to the writer."""
 
     def __init__(
@@ -199,40 +199,40 @@ class _Hooks(Observer):
         self._tracks: dict[str, CameraTrack | None] = {}
 
     def on_state(self, event: CameraEvent) -> None:
-        """Keep an event."""
+        """Pass on an event."""
         track = self._track(event.camera)
         if track is not None:
             if isinstance(event, StatusChanged):
                 track.endian = self._endian(event.camera) or 0
             self._writer.put(track, event, 0, event=True)
             if self._pictures is not None:
-                self._pictures.follow(track)
+                self._pictures.start_recording(track)
 
     def on_results(self, results: Sequence[Result]) -> None:
-        """Keep results that came together."""
+        """Pass on results that came together."""
         camera = results[0].camera
         track = self._track(camera)
         if track is None:
             return
         endian = self._endian(camera)
         for result in results:
-            self._writer.put(track, _SeenResult(result, endian), 4 * len(result.raw))
+            self._writer.put(track, _ResultWithEndian(result, endian), 4 * len(result.raw))
             if self._pictures is not None:
-                self._pictures.result(track, result)
+                self._pictures.add_result(track, result)
 
     def on_picture(self, result: Result, frame: Frame) -> None:
-        """Keep the picture of a software camera's result."""
+        """Pass on the picture of a software camera's result."""
         track = self._track(result.camera)
         if track is not None and self._pictures is not None:
             self._pictures.add_reported(track, result, frame)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
-        """Keep an error."""
+        """Pass on an error."""
         track = self._track(camera)
         if track is not None:
             text = str(error)
-            kind = type(error).__name__
-            recorded = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
+            error_name = type(error).__name__
+            recorded = RecordedError(camera, datetime.now(UTC), error_name, text, triggered_at)
             self._writer.put(track, recorded, len(text))
 
     def _endian(self, camera: str) -> int | None:
@@ -241,15 +241,15 @@ class _Hooks(Observer):
 
     def _track(self, camera: str) -> CameraTrack | None:
         if camera not in self._tracks and camera in self._server.hosts:
-            self._tracks[camera] = self._new(camera)
+            self._tracks[camera] = self._new_track(camera)
         return self._tracks.get(camera)
 
-    def _new(self, camera: str) -> CameraTrack | None:
+    def _new_track(self, camera: str) -> CameraTrack | None:
         if not self._section.chooses(camera):
             return None
         settings = self._server.hosts[camera].settings
         spec, y_down, lenient = settings.interpret_as, settings.y_down, settings.lenient
-        track = self._writer.track(camera, _SeenReading(camera, spec, y_down, lenient).items)
+        track = self._writer.new_track(camera, _ItemMaker(camera, spec, y_down, lenient).items)
         facts_given = {
             "fleet": self._server.file.fleet,
             "interpret_as": spec,
@@ -263,18 +263,18 @@ class _Hooks(Observer):
         return track
 
 
-class _Frames(_Hooks):
-    """Passes frames on, too."""
+class _SessionAndFrameObserver(_SessionObserver):
+    """Passes the frames of the protocol on, too."""
 
     def on_raw_frame(self, frame: RawFrame) -> None:
-        """Keep a frame; the writer's thread decodes it."""
+        """Pass on a frame; the writer's thread decodes it."""
         track = self._track(frame.camera)
         if track is not None:
             self._writer.put(track, frame, 2 * frame.size)
 
 
-class _SeenReading:
-    """Makes records in the writer's thread, where it interprets results.
+class _ItemMaker:
+    """Makes items of a camera's entries in the writer's thread, where it interprets results.
 
     Args:
         camera: name of the camera.
@@ -289,25 +289,27 @@ class _SeenReading:
         if spec is not None:
             self._interpret = Interpretation(spec, lenient=lenient, y_down=y_down)
 
-    def items(self, given: Any) -> Iterator[Item]:
-        """Yield the records of an object."""
-        if not isinstance(given, _SeenResult):
-            yield given
+    def items(self, entry: Any) -> Iterator[Item]:
+        """Yield the items of an entry."""
+        if not isinstance(entry, _ResultWithEndian):
+            yield entry
             return
-        result = given.result._replace(value=None)
-        if self._interpret is None or given.endian is None:
+        result = entry.result._replace(value=None)
+        if self._interpret is None or entry.endian is None:
             yield result
             return
         try:
-            yield self._read(given, given.endian, self._interpret)
+            yield self._interpreted(entry.result, entry.endian, self._interpret)
         except SmartCamError as exc:
             yield result
             at = datetime.now(UTC)
-            kind = type(exc).__name__
-            yield RecordedError(self._camera, at, kind, str(exc), result.triggered_at)
+            error_name = type(exc).__name__
+            yield RecordedError(self._camera, at, error_name, str(exc), result.triggered_at)
 
-    def _read(self, given: _SeenResult, endian: int, interpret: Interpretation) -> Result[Any]:
-        result, cells, fault = given.result, None, None
+    def _interpreted(
+        self, result: Result[Any], endian: int, interpret: Interpretation
+    ) -> Result[Any]:
+        cells = fault = None
         if result.value.cells:
             content: dict[str, Any] = json.loads(result.value.cells)
             fault, texts = content.get("fault"), content.get("cells")

@@ -71,29 +71,30 @@ class FleetReplay(Server):
         self._server: FleetServer | None = None
         self._stack = contextlib.AsyncExitStack()
         self.skipped: dict[str, str] = {}
-        self._played: dict[str, ReplayedCamera | ReplayedLines] = {}
+        self._cameras: dict[str, ReplayedCamera | ReplayedLines] = {}
         self._on_over = check_callable(on_over, "on_over", "replay")
         for name in recording.cameras if cameras is None else cameras:
             try:
-                self._played[name] = replay(
+                self._cameras[name] = replay(
                     recording,
                     camera=name,
                     speed=speed,
                     loop=loop,
-                    on_over=functools.partial(self._over, name),
+                    on_over=functools.partial(self._on_camera_over, name),
                 )
             except ConfigurationError as exc:
                 if cameras is not None:
                     raise
                 self.skipped[name] = str(exc)
-        # cameras that are already over
-        self._silent = {name for name, played in self._played.items() if not played.remaining}
-        if not self._played:
-            why = "; ".join(self.skipped.values()) or "no camera is in it"
-            raise ConfigurationError(f"recording {recording.path}: nothing can be played: {why}")
+        self._already_over = {
+            name for name, camera in self._cameras.items() if not camera.remaining
+        }
+        if not self._cameras:
+            reason = "; ".join(self.skipped.values()) or "no camera is in it"
+            raise ConfigurationError(f"recording {recording.path}: nothing can be played: {reason}")
 
-    def _over(self, name: str) -> None:
-        if name not in self._silent:
+    def _on_camera_over(self, name: str) -> None:
+        if name not in self._already_over:
             self._on_over(name)
 
     @property
@@ -123,13 +124,13 @@ class FleetReplay(Server):
             entries: dict[str, Any] = {}
             frames: dict[str, Callable[[], FrameSource]] = {}
             fleet = None
-            for name, camera in self._played.items():
+            for name, camera in self._cameras.items():
                 await stack.enter_async_context(camera)
-                known = self._recording.camera(name)
-                fleet = fleet or known.facts.get("fleet")
-                entries[name] = {"url": camera.url, **_camera_options(known)}
+                recorded = self._recording.camera(name)
+                fleet = fleet or recorded.facts.get("fleet")
+                entries[name] = {"url": camera.url, **_camera_options(recorded)}
                 if isinstance(camera, ReplayedCamera):
-                    pictures = camera._show_pictures(self._recording, name)  # noqa: SLF001
+                    pictures = camera._prepare_pictures(self._recording, name)  # noqa: SLF001
                     if pictures is not None:
                         frames[name] = pictures.source
             content: dict[str, Any] = {"listen": self._listen, "cameras": entries}

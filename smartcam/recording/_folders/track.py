@@ -64,7 +64,7 @@ class CameraTrack:
 
     Args:
         camera: name of the camera.
-        read: function that makes items of an object; called in the writer's thread.
+        make_items: function that makes items of an entry; called in the writer's thread.
 
     Attributes:
         endian: byte order of the last status.
@@ -75,11 +75,12 @@ class CameraTrack:
         overflow: the growing gap of records that are left out; None if none are.
     """
 
-    def __init__(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> None:
+    def __init__(self, camera: str, make_items: Callable[[Any], Iterator[Item]]) -> None:
         self.camera = camera
-        self.read = read
+        self.make_items = make_items
         self.offered = self.left_out = 0  # counted in the threads that offer records
-        self.written = self.lost = self.more = 0  # counted in the writer's thread
+        # counted in the writer's thread; `extra_records`: records beyond one of each entry
+        self.written = self.lost = self.extra_records = 0
         self.overflow: Gap | None = None
         self.state = RecordedState(camera)
         self.endian = 0
@@ -87,47 +88,47 @@ class CameraTrack:
         self.gap: Gap | None = None  # gap that is not on the disk yet
         self.gap_written = False  # whether the gap is in the file's next chunk
         self.file: RecordingFile | None = None
-        self.begun = 0.0  # time of the file's beginning, on the monotonic clock
-        self.good = 0  # bytes of the file that are on the disk
+        self.begun_at = 0.0  # time of the file's beginning, on the monotonic clock
+        self.synced_bytes = 0  # bytes of the file that are on the disk
 
     @property
     def account(self) -> RecordingAccount:
         """Account of the camera's records."""
         written, lost = self.written, self.lost + self.left_out
-        return RecordingAccount(written, self.offered + self.more - written - lost, lost)
+        return RecordingAccount(written, self.offered + self.extra_records - written - lost, lost)
 
-    def lose(self, given: list[Any], reason: str) -> None:
-        """Count objects that are not written; keep the camera's state that they report."""
-        for item in given:
-            if isinstance(item, Description):
-                self.facts |= item.facts
-            elif isinstance(item, Gap):
-                self._widen(item)  # a gap is already counted
-                self.follow_all(item)
+    def count_lost(self, entries: list[Any], reason: str) -> None:
+        """Count entries that are not written; update the camera's state from them."""
+        for entry in entries:
+            if isinstance(entry, Description):
+                self.facts |= entry.facts
+            elif isinstance(entry, Gap):
+                self._extend_gap(entry)  # its records are already counted
+                self.update_state_from_gap(entry)
             else:
-                self.follow(item)
-                self.lose_one(reason)
+                self.update_state(entry)
+                self.count_one_lost(reason)
 
-    def lose_one(self, reason: str) -> None:
+    def count_one_lost(self, reason: str) -> None:
         """Count a record that is not written."""
         at = datetime.now(UTC)
         self.lost += 1
-        self._widen(Gap(at, at, 1, reason))
+        self._extend_gap(Gap(at, at, 1, reason))
 
-    def follow(self, item: object) -> None:
-        """Keep the camera's state that an item reports."""
-        if isinstance(item, CameraEvent):
-            self.state = self.state.after(item)
-        if isinstance(item, (Connected, Reconnected)):
-            self.facts |= address_facts(item.url)
+    def update_state(self, entry: object) -> None:
+        """Update the camera's state and address from an entry, if that is an event."""
+        if isinstance(entry, CameraEvent):
+            self.state = self.state.after(entry)
+        if isinstance(entry, (Connected, Reconnected)):
+            self.facts |= address_facts(entry.url)
 
-    def follow_all(self, gap: Gap) -> None:
-        """Keep the camera's state that the events of a gap report."""
+    def update_state_from_gap(self, gap: Gap) -> None:
+        """Update the camera's state from the events of a gap."""
         for event in gap.events.values():
-            self.follow(event)
+            self.update_state(event)
 
-    def _widen(self, more: Gap) -> None:
+    def _extend_gap(self, later: Gap) -> None:
         if self.gap is None:
-            self.gap = replace(more)
+            self.gap = replace(later)
         else:
-            self.gap.until, self.gap.count = more.until, self.gap.count + more.count
+            self.gap.until, self.gap.count = later.until, self.gap.count + later.count

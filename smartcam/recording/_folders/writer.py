@@ -56,16 +56,16 @@ class _Trouble:
 
     error: RecordingError
     reason: str  # text without the folder
-    full: bool  # whether the disk was full
-    again: float  # time of the next try, on the monotonic clock
-    tries: int = 0
+    disk_was_full: bool
+    retry_at: float  # time of the next try, on the monotonic clock
+    failed_retries: int = 0
 
 
 @dataclass(eq=False)
 class _DiskQueue:
     """The records that wait for the thread."""
 
-    items: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
+    entries: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
     bytes: int = 0
 
 
@@ -94,9 +94,9 @@ class FolderWriter:
     ) -> None:
         self._folder, self._report, self._clock = folder, report, clock
         self._files = FolderFiles(folder, limits, compress, clock)
-        self._more = threading.Condition()
+        self._condition = threading.Condition()
         self._waiting = _DiskQueue()
-        self._closing = False
+        self._is_closing = False
         self._tracks: dict[str, CameraTrack] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
@@ -104,8 +104,8 @@ class FolderWriter:
 
     def forked(self) -> None:
         """Write nothing in a fork of the process that has the folder; leave out all records."""
-        self._more, self._waiting = threading.Condition(), _DiskQueue()
-        self._thread, self._closing = None, True
+        self._condition, self._waiting = threading.Condition(), _DiskQueue()
+        self._thread, self._is_closing = None, True
 
     # ------------------------------------------------------------------ from any thread
 
@@ -117,61 +117,61 @@ class FolderWriter:
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
         """Accounts of each camera's records."""
-        with self._more:
+        with self._condition:
             return {name: track.account for name, track in self._tracks.items()}
 
-    def track(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> CameraTrack:
-        """Return a new track."""
-        with self._more:
-            track = self._tracks[camera] = CameraTrack(camera, read)
+    def new_track(self, camera: str, make_items: Callable[[Any], Iterator[Item]]) -> CameraTrack:
+        """Return a new track of a camera."""
+        with self._condition:
+            track = self._tracks[camera] = CameraTrack(camera, make_items)
         return track
 
     def describe(self, track: CameraTrack, facts: dict[str, str]) -> None:
         """Write facts about a camera to each of its files."""
-        with self._more:
-            self._waiting.items.append((track, Description({"camera": track.camera, **facts})))
+        with self._condition:
+            self._waiting.entries.append((track, Description({"camera": track.camera, **facts})))
 
     @property
-    def waiting(self) -> int:
+    def waiting_bytes(self) -> int:
         """Bytes that wait for the disk."""
         return self._waiting.bytes
 
-    def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> bool:
-        """Put an object into the list, or leave it out and count it if too much waits. Never wait.
+    def put(self, track: CameraTrack, entry: Any, size: int, *, event: bool = False) -> bool:
+        """Put an entry into the list, or leave it out and count it if too much waits. Never wait.
 
-        Return whether the object is in the list.
+        Return whether the entry is in the list.
 
         Args:
-            track: track of the camera that ``given`` is about.
-            given: object that ``read`` of the track makes items of.
-            size: bytes that ``given`` counts for while waiting; below 0: it is too large.
-            event: whether ``given`` is an event; events have more room to wait.
+            track: track of the camera that the entry is about.
+            entry: object that ``make_items`` of the track makes items of.
+            size: bytes that the entry counts for while waiting; below 0: it is too large.
+            event: whether the entry is an event; events have more room to wait.
         """
-        with self._more:
+        with self._condition:
             waiting = self._waiting
             track.offered += 1
             room = MAX_WAITING_BYTES * EVENT_ROOM_FACTOR if event else MAX_WAITING_BYTES
-            if self._closing or waiting.bytes > room or size < 0:
-                self._leave_out(track, given)
+            if self._is_closing or waiting.bytes > room or size < 0:
+                self._leave_out(track, entry)
                 return False
             before = waiting.bytes
-            waiting.items.append((track, given))
+            waiting.entries.append((track, entry))
             waiting.bytes += size + ITEM_OVERHEAD_BYTES
             if not before or before < CHUNK <= waiting.bytes:
-                self._more.notify()
+                self._condition.notify()
             return True
 
-    def _leave_out(self, track: CameraTrack, given: Any) -> None:
+    def _leave_out(self, track: CameraTrack, entry: Any) -> None:
         at = datetime.now(UTC)
         track.left_out += 1
         if track.overflow is None:
             track.overflow = Gap(at, at, 0, "the disk is too slow")
-            self._waiting.items.append((track, track.overflow))
+            self._waiting.entries.append((track, track.overflow))
         gap = track.overflow
         gap.until, gap.count = at, gap.count + 1
-        if isinstance(given, CameraEvent):
-            gap.events.pop(type(given), None)
-            gap.events[type(given)] = given
+        if isinstance(entry, CameraEvent):
+            gap.events.pop(type(entry), None)
+            gap.events[type(entry)] = entry
 
     def start(self) -> None:
         """Enter the folder and start the thread; blocks while the disk does.
@@ -184,15 +184,17 @@ class FolderWriter:
         except OSError as exc:
             self._fail(exc)
         self._thread = threading.Thread(
-            target=self._run, name=f"smartcam.recordings[{self._folder.path.name}]", daemon=True
+            target=self._write_until_closed,
+            name=f"smartcam.recordings[{self._folder.path.name}]",
+            daemon=True,
         )
         self._thread.start()
 
     def stop(self) -> None:
         """Write waiting records and end the files; blocks, with a bound. Idempotent."""
-        with self._more:
-            self._closing = True
-            self._more.notify()
+        with self._condition:
+            self._is_closing = True
+            self._condition.notify()
         thread = self._thread
         if thread is not None:
             thread.join(CLOSE_TIMEOUT)
@@ -205,43 +207,45 @@ class FolderWriter:
 
     # ------------------------------------------------------------------ the thread
 
-    def _run(self) -> None:
+    def _write_until_closed(self) -> None:
         try:
-            over = False
-            while not over:
-                items, over = self._take()
-                self._write(items)
+            is_last = False
+            while not is_last:
+                batches, is_last = self._take_batches()
+                self._write(batches)
         finally:
             for track in self._all_tracks():
                 self._files.finish(track)
             self._folder.leave()
 
-    def _take(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
+    def _take_batches(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
         """Wait for records; return them by camera, and whether they were the last."""
-        with self._more:
-            self._more.wait_for(lambda: self._waiting.items or self._closing, INTERVAL)
-            if self._waiting.items:
-                self._more.wait_for(lambda: self._closing or self._waiting.bytes > CHUNK, INTERVAL)
+        with self._condition:
+            self._condition.wait_for(lambda: self._waiting.entries or self._is_closing, INTERVAL)
+            if self._waiting.entries:
+                self._condition.wait_for(
+                    lambda: self._is_closing or self._waiting.bytes > CHUNK, INTERVAL
+                )
             taken, self._waiting = self._waiting, _DiskQueue()
             for track in self._tracks.values():
                 track.overflow = None
-            over = self._closing
+            is_last = self._is_closing
         batches: dict[CameraTrack, list[Any]] = {}
-        for track, item in taken.items:
-            batches.setdefault(track, []).append(item)
-        return batches, over
+        for track, entry in taken.entries:
+            batches.setdefault(track, []).append(entry)
+        return batches, is_last
 
     def _write(self, batches: dict[CameraTrack, list[Any]]) -> None:
         """Write records, or count them as lost; never raises."""
         try:
-            if self._ready(batches):
-                for track, given in batches.items():
-                    self._files.write(track, given)
+            if self._should_try(batches):
+                for track, entries in batches.items():
+                    self._files.write(track, entries)
                 tracks = self._all_tracks()
                 self._files.end_old(tracks)
                 self._files.delete_old(tracks)
                 if batches:
-                    self._heal()
+                    self._report_recovery()
         except (OSError, ConfigurationError) as exc:
             self._fail(exc)
         except Exception as exc:
@@ -249,10 +253,10 @@ class FolderWriter:
             self._fail(exc)
         trouble = self._trouble
         if trouble is not None:
-            for track, given in batches.items():
-                track.lose(given, trouble.reason)
+            for track, entries in batches.items():
+                track.count_lost(entries, trouble.reason)
 
-    def _ready(self, batches: dict[CameraTrack, list[Any]]) -> bool:
+    def _should_try(self, batches: dict[CameraTrack, list[Any]]) -> bool:
         """Return True if the disk should be tried; after a failure, check its free room first.
 
         Raises:
@@ -262,35 +266,35 @@ class FolderWriter:
         trouble, now = self._trouble, self._clock()
         if trouble is None:
             return True
-        if now < trouble.again or not batches:
+        if now < trouble.retry_at or not batches:
             return False
         self._files.enter()
-        if trouble.full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:
+        if trouble.disk_was_full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return True
 
     def _all_tracks(self) -> list[CameraTrack]:
-        with self._more:
+        with self._condition:
             return [*self._tracks.values()]
 
     # ------------------------------------------------------------------ trouble
 
     def _fail(self, error: Exception) -> None:
         before = self._trouble
-        tries = 0 if before is None else before.tries + 1
+        failed_retries = 0 if before is None else before.failed_retries + 1
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         prefix = f"recordings {self._folder.path}: "
         failure = RecordingError(prefix + reason.removeprefix(prefix))
         failure.__cause__ = error
-        full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
-        again = self._clock() + RETRY_DELAYS[min(tries, len(RETRY_DELAYS) - 1)]
-        self._trouble = _Trouble(failure, reason, full, again, tries)
+        disk_was_full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
+        retry_at = self._clock() + RETRY_DELAYS[min(failed_retries, len(RETRY_DELAYS) - 1)]
+        self._trouble = _Trouble(failure, reason, disk_was_full, retry_at, failed_retries)
         if before is None:
             logger.warning("%s; nothing is recorded until it is better", failure)
             self._report(failure)
 
-    def _heal(self) -> None:
-        """Note that the disk works again."""
+    def _report_recovery(self) -> None:
+        """Report that the disk works again, if it had failed."""
         if self._trouble is not None:
             self._trouble = None
             logger.warning("recordings %s: recorded again", self._folder.path)

@@ -6,11 +6,10 @@ from collections import deque
 from typing import Generic, TypeVar
 
 MAX_FRAMES = 4096
-"""Largest number of kept frames: a delivery may have many frames before its first result."""
+"""Largest number of kept frames: many frames may come together before their first result."""
 
 MAX_CHARACTERS = 1 << 23
-"""Largest number of hex characters of the kept frames together; the last one is kept
-in any case."""
+"""Largest number of hex characters of all kept frames; the last frame is kept in any case."""
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -29,9 +28,12 @@ class LastBodies(Generic[Key, Value]):
         self._characters = 0
 
     def add(self, key: Key, value: Value, characters: int) -> None:
-        """Keep a frame's value, and drop the oldest ones beyond the bounds.
+        """Keep a frame's value, and drop the oldest values beyond the bounds.
 
-        ``characters``: number of hex characters of the frame's data.
+        Args:
+            key: key of the frame.
+            value: value of the frame.
+            characters: number of hex characters of the frame's data.
         """
         self._order.append((key, value, characters))
         self._values[key] = value

@@ -67,7 +67,7 @@ MAX_PICTURE_SIZE_BYTES = 1 << 27
 
 MAX_VALUES = 3_000_000
 """Largest number of commas and opening brackets of a message, written or read: each may become an
-object of a hundred times its size. A container of 1 MiB with one field a byte has two million."""
+object of a hundred times its size. A container of 1 MiB with one field per byte has two million."""
 
 MAX_CAMERAS = 10_000
 """Largest number of cameras in a file: their facts are kept while it is read."""
@@ -135,16 +135,16 @@ def captured_at(frame: Frame) -> datetime:
     return datetime.fromtimestamp(min(max(0.0, frame.utc), MAX_CAPTURE_TIME), UTC)
 
 
-class Kind(NamedTuple):
+class MessageKind(NamedTuple):
     """One kind of message."""
 
-    topic: str  # last part of its topic
-    schema: str  # name of its schema
-    about: str  # description for the schema
-    properties: Mapping[str, Any]  # the schema's, by field
+    topic: str  # last part of the topic
+    schema: str  # name of the schema
+    description: str  # description in the schema
+    properties: Mapping[str, Any]  # properties in the schema, by field
     required: tuple[str, ...]  # fields that are always there
-    to_text: Callable[..., str]  # makes the message of an item, in ASCII
-    # makes the item of an object; raises any exception if the object does not fit
+    to_text: Callable[..., str]  # function that makes an item's message, in ASCII
+    # function that makes the item of a JSON object, or raises any exception
     from_json: Callable[[dict[str, Any]], Item]
 
     @property
@@ -153,7 +153,7 @@ class Kind(NamedTuple):
         return {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             "title": self.schema,
-            "description": self.about,
+            "description": self.description,
             "type": "object",
             "properties": dict(self.properties),
             "required": list(self.required),
@@ -183,7 +183,7 @@ def nanoseconds(at: datetime) -> int:
 
 
 def count_values(data: bytes) -> int:
-    """Return the approximate number of values of a message, and check its bounds.
+    """Check the bounds of a message; return the approximate number of its values.
 
     Raises:
         ValueError: the message exceeds a bound.
@@ -209,11 +209,11 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
         ValueError: the message could not be read again.
     """
     to_text = KINDS[kind].to_text
-    return bounded(to_text(item) if raw_from is None else to_text(item, raw_from))
+    return checked_bytes(to_text(item) if raw_from is None else to_text(item, raw_from))
 
 
-def bounded(text: str) -> bytes:
-    """Return a message's text as bytes.
+def checked_bytes(text: str) -> bytes:
+    """Return a message's text as bytes, after checking its bounds.
 
     Raises:
         ValueError: the message could not be read again.
@@ -270,19 +270,19 @@ def _error_text(error: RecordedError) -> str:
 T = TypeVar("T")
 
 
-def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
+def _required_field(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """Return a required field.
 
     Raises:
         ValueError: the field is missing, or of another type.
     """
-    value = optional(fields, name, kind)
+    value = optional_field(fields, name, kind)
     if value is None:
         raise ValueError(f"{name}: nothing is there, expected {kind.__name__}")
     return value
 
 
-def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
+def optional_field(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
     """Return an optional field.
 
     Raises:
@@ -297,8 +297,8 @@ def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
 
 
 def camera_name(fields: Mapping[str, Any]) -> str:
-    """Return the name of a message's camera; raises as :func:`_get`."""
-    name = _get(fields, "camera", str)
+    """Return the name of a message's camera; raises as :func:`_required_field`."""
+    name = _required_field(fields, "camera", str)
     if len(name) > MAX_NAME_CHARACTERS:
         raise ValueError(
             f"camera: a name of {len(name)} characters, expected {MAX_NAME_CHARACTERS} at most"
@@ -318,12 +318,12 @@ def time_of(text: str) -> datetime:
     return at.astimezone(UTC)
 
 
-def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
-    return time_of(_get(fields, name, str))
+def _required_time(fields: Mapping[str, Any], name: str) -> datetime:
+    return time_of(_required_field(fields, name, str))
 
 
-def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
-    text = optional(fields, name, str)
+def _optional_time(fields: Mapping[str, Any], name: str) -> datetime | None:
+    text = optional_field(fields, name, str)
     return None if text is None else time_of(text)
 
 
@@ -349,189 +349,191 @@ def status_of(names: object) -> Status:
 _BIT_DIGITS = len("0x") + 16  # 64 bits: the vendor's 32 and 32 of smartcam
 
 
-def _frame(fields: dict[str, Any]) -> TraceEntry:
-    direction, data = _get(fields, "direction", str), _get(fields, "hex", str)
+def _frame_from_json(fields: dict[str, Any]) -> TraceEntry:
+    direction, data = _required_field(fields, "direction", str), _required_field(fields, "hex", str)
     if direction not in {">", "<", "!"}:
         raise ValueError(f"direction: {direction!r:.60} came, expected >, < or !")
     bytes.fromhex(data)
-    body = cast("dict[str, Any] | None", optional(fields, "fields", dict))
-    data_from = optional(fields, "data_from", int)
+    body = cast("dict[str, Any] | None", optional_field(fields, "fields", dict))
+    data_from = optional_field(fields, "data_from", int)
     if data_from is not None:
         body = with_data(body, data, data_from)
     return TraceEntry(
-        _when_of(fields, "at"),
+        _required_time(fields, "at"),
         camera_name(fields),
         direction,
-        optional(fields, "message_id", int),
-        _get(fields, "message", str),
+        optional_field(fields, "message_id", int),
+        _required_field(fields, "message", str),
         body,
         data,
     )
 
 
-def _result(fields: dict[str, Any]) -> Result:
+def _result_from_json(fields: dict[str, Any]) -> Result:
     latency = fields.get("latency")
     if latency is not None and not (type(latency) in {int, float} and math.isfinite(latency)):
         raise ValueError(f"latency: {latency!r:.60} came, expected seconds")
-    raw = bytes.fromhex(_get(fields, "raw", str))
-    value_from = optional(fields, "value_from", str)
+    raw = bytes.fromhex(_required_field(fields, "raw", str))
+    value_from = optional_field(fields, "value_from", str)
     if value_from not in {None, "raw"}:
         raise ValueError(f"value_from: {value_from!r:.60} came, expected raw")
     return Result(
         camera_name(fields),
-        _get(fields, "application", int),
-        optional(fields, "sequence", int),
-        _get(fields, "number", int),
-        _optional_when(fields, "triggered_at"),
-        _when_of(fields, "received_at"),
+        _required_field(fields, "application", int),
+        optional_field(fields, "sequence", int),
+        _required_field(fields, "number", int),
+        _optional_time(fields, "triggered_at"),
+        _required_time(fields, "received_at"),
         latency,
         raw,
         fields.get("value") if value_from is None else raw.hex(),
     )
 
 
-def _event(fields: dict[str, Any]) -> CameraEvent:
-    camera, at = camera_name(fields), _when_of(fields, "at")
-    match _get(fields, "event", str):
+def _event_from_json(fields: dict[str, Any]) -> CameraEvent:
+    camera, at = camera_name(fields), _required_time(fields, "at")
+    match _required_field(fields, "event", str):
         case "Connected":
-            return Connected(camera=camera, at=at, url=_get(fields, "url", str))
+            return Connected(camera=camera, at=at, url=_required_field(fields, "url", str))
         case "Reconnected":
-            return Reconnected(camera=camera, at=at, url=_get(fields, "url", str))
+            return Reconnected(camera=camera, at=at, url=_required_field(fields, "url", str))
         case "Disconnected":
             return Disconnected(
                 camera=camera,
                 at=at,
-                reason=_get(fields, "reason", str),
-                expected=_get(fields, "expected", bool),
+                reason=_required_field(fields, "reason", str),
+                expected=_required_field(fields, "expected", bool),
             )
         case "StatusChanged":
             before = fields.get("previous_status")
             return StatusChanged(
                 camera=camera,
                 at=at,
-                status=status_of(_get(fields, "status", list)),
+                status=status_of(_required_field(fields, "status", list)),
                 previous=None if before is None else status_of(before),
             )
         case "ApplicationChanged":
             return ApplicationChanged(
                 camera=camera,
                 at=at,
-                application=_get(fields, "application", int),
-                previous=optional(fields, "previous_application", int),
+                application=_required_field(fields, "application", int),
+                previous=optional_field(fields, "previous_application", int),
             )
         case "NoticeReceived":
             return NoticeReceived(
                 camera=camera,
                 at=at,
-                kind=_get(fields, "kind", str),
-                code=_get(fields, "code", int),
-                text=_get(fields, "text", str),
+                kind=_required_field(fields, "kind", str),
+                code=_required_field(fields, "code", int),
+                text=_required_field(fields, "text", str),
             )
         case _:
             return CameraEvent(camera=camera, at=at)
 
 
-def _error(fields: dict[str, Any]) -> RecordedError:
+def _error_from_json(fields: dict[str, Any]) -> RecordedError:
     return RecordedError(
         camera_name(fields),
-        _when_of(fields, "at"),
-        _get(fields, "error", str),
-        _get(fields, "text", str),
-        _optional_when(fields, "triggered_at"),
-        _optional_when(fields, "since"),
-        optional(fields, "records", int),
+        _required_time(fields, "at"),
+        _required_field(fields, "error", str),
+        _required_field(fields, "text", str),
+        _optional_time(fields, "triggered_at"),
+        _optional_time(fields, "since"),
+        optional_field(fields, "records", int),
     )
 
 
 # ---------------------------------------------------------------------- the table
 
 
-def _text(about: str) -> dict[str, Any]:
-    return {"type": "string", "description": about}
+def _text_schema(description: str) -> dict[str, Any]:
+    return {"type": "string", "description": description}
 
 
-def _integer(about: str) -> dict[str, Any]:
-    return {"type": "integer", "description": about}
+def _integer_schema(description: str) -> dict[str, Any]:
+    return {"type": "integer", "description": description}
 
 
-def _when(about: str) -> dict[str, Any]:
-    return {"type": "string", "format": "date-time", "description": f"{about}; ISO 8601, UTC"}
+def _time_schema(description: str) -> dict[str, Any]:
+    return {"type": "string", "format": "date-time", "description": f"{description}; ISO 8601, UTC"}
 
 
-_CAMERA = _text("name of the camera")
-_AT = _when("when")
+_CAMERA = _text_schema("name of the camera")
+_AT = _time_schema("when")
 _BITS = {"type": "array", "items": {"type": "string"}, "description": "names of the status bits"}
-_TRIGGERED_AT = _when("when it was triggered; absent where it was not")
+_TRIGGERED_AT = _time_schema("when it was triggered; absent where it was not")
 
-KINDS: dict[str, Kind] = {
-    "frames": Kind(
+KINDS: dict[str, MessageKind] = {
+    "frames": MessageKind(
         "frames",
         "smartcam.Frame",
         "A frame on the wire, or bytes that make no frame.",
         {
             "at": _AT,
             "camera": _CAMERA,
-            "direction": _text("> to the camera, < from it, ! bytes that make no frame"),
-            "message_id": _integer("id on the wire"),
-            "message": _text("name of the message, or what is wrong with the bytes"),
+            "direction": _text_schema("> to the camera, < from it, ! bytes that make no frame"),
+            "message_id": _integer_schema("id on the wire"),
+            "message": _text_schema("name of the message, or what is wrong with the bytes"),
             "fields": {"type": "object", "properties": {}, "description": "the decoded body"},
-            "hex": _text("the bytes"),
-            "data_from": _integer("at which of the bytes data begins, which fields has not"),
+            "hex": _text_schema("the bytes"),
+            "data_from": _integer_schema("at which of the bytes data begins, which fields has not"),
         },
         ("at", "camera", "direction", "message", "hex"),
         frame_text,
-        _frame,
+        _frame_from_json,
     ),
-    "results": Kind(
+    "results": MessageKind(
         "results",
         "smartcam.Result",
         "A decoded result container; in `value` stands what the interpreter made of it.",
         {
             "camera": _CAMERA,
-            "application": _integer("id of the application that made it"),
-            "sequence": _integer("value of the layout's @sequence field"),
-            "number": _integer("the client's own count, from 1"),
+            "application": _integer_schema("id of the application that made it"),
+            "sequence": _integer_schema("value of the layout's @sequence field"),
+            "number": _integer_schema("the client's own count, from 1"),
             "triggered_at": _TRIGGERED_AT,
-            "received_at": _when("when its last byte arrived"),
+            "received_at": _time_schema("when its last byte arrived"),
             "latency": {"type": "number", "description": "seconds from trigger to arrival"},
-            "raw": _text("the container's bytes behind the application id, as hex"),
-            "raw_from": _integer("the frame that has them as its data: its sequence in its topic"),
-            "value_from": _text("raw: the value is these bytes"),
+            "raw": _text_schema("the container's bytes behind the application id, as hex"),
+            "raw_from": _integer_schema(
+                "the frame that has them as its data: its sequence in its topic"
+            ),
+            "value_from": _text_schema("raw: the value is these bytes"),
         },
         ("camera", "application", "number", "received_at"),
         result_text,
-        _result,
+        _result_from_json,
     ),
-    "events": Kind(
+    "events": MessageKind(
         "events",
         "smartcam.Event",
         "Something happened to the camera.",
         {
-            "event": _text(
+            "event": _text_schema(
                 "Connected, Reconnected, Disconnected, StatusChanged, ApplicationChanged or "
                 "NoticeReceived"
             ),
             "camera": _CAMERA,
             "at": _AT,
-            "url": _text("Connected, Reconnected: the address, with everything pinned"),
-            "reason": _text("Disconnected: why"),
+            "url": _text_schema("Connected, Reconnected: the address, with everything pinned"),
+            "reason": _text_schema("Disconnected: why"),
             "expected": {
                 "type": "boolean",
                 "description": "Disconnected: by the client's own wish",
             },
             "status": _BITS,
             "previous_status": _BITS,
-            "application": _integer("ApplicationChanged: id of the active application"),
-            "previous_application": _integer("ApplicationChanged: id of the one before"),
-            "kind": _text("NoticeReceived: error, notification or debug"),
-            "code": _integer("NoticeReceived: the camera's number of it"),
-            "text": _text("NoticeReceived: what the camera says"),
+            "application": _integer_schema("ApplicationChanged: id of the active application"),
+            "previous_application": _integer_schema("ApplicationChanged: id of the one before"),
+            "kind": _text_schema("NoticeReceived: error, notification or debug"),
+            "code": _integer_schema("NoticeReceived: the camera's number of it"),
+            "text": _text_schema("NoticeReceived: what the camera says"),
         },
         ("event", "camera", "at"),
         _event_text,
-        _event,
+        _event_from_json,
     ),
-    "errors": Kind(
+    "errors": MessageKind(
         "errors",
         "smartcam.Error",
         "Something went wrong: a trigger without a result, a lost link, a container that does "
@@ -539,15 +541,15 @@ KINDS: dict[str, Kind] = {
         {
             "camera": _CAMERA,
             "at": _AT,
-            "error": _text("name of the exception's class"),
-            "text": _text("what it says"),
+            "error": _text_schema("name of the exception's class"),
+            "text": _text_schema("what it says"),
             "triggered_at": _TRIGGERED_AT,
-            "since": _when("RecordingGap: since when records were not written"),
-            "records": _integer("RecordingGap: how many were not written"),
+            "since": _time_schema("RecordingGap: since when records were not written"),
+            "records": _integer_schema("RecordingGap: how many were not written"),
         },
         ("camera", "at", "error", "text"),
         _error_text,
-        _error,
+        _error_from_json,
     ),
 }
 """The kinds of messages, by the last part of their topics."""

@@ -1,8 +1,8 @@
 """Frames and results as JSON, with fast code, since a recording consists mostly of them.
 
 The text is that of ``json.dumps(jsonable(item))`` without white space and without fields that are
-None, but bytes are in it only once (:func:`frame_text`, :func:`result_text`). Values of types that
-a client does not make are converted by that call itself.
+None. Bytes are written only once (:func:`frame_text`, :func:`result_text`). Values of types that a
+client does not make are converted by ``jsonable`` and ``json.dumps``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.observers import RawFrame
 
 MAX_CACHED_FRAME_TEXTS = 256
-"""Largest number of kinds of frames whose text is kept, without their time and data."""
+"""Largest number of cached texts of frames, which are without time and data."""
 
 VALUE_IS_RAW = '"raw"'
 
@@ -39,10 +39,10 @@ def frame_text(entry: TraceEntry) -> str:
     number = "" if message_id is None else f'"message_id":{text_of(message_id)},'
     body = "" if fields is None else f'"fields":{text_of(fields)},'
     data_text = hex_text(data) if type(data) is str else text_of(data)
-    begins = "" if data_from is None else f',"data_from":{data_from}'
+    data_from_text = "" if data_from is None else f',"data_from":{data_from}'
     return (
         f'{{"at":{text_of(at)},"camera":{text_of(camera)},"direction":{text_of(direction)},'
-        f'{number}"message":{text_of(message)},{body}"hex":{data_text}{begins}}}'
+        f'{number}"message":{text_of(message)},{body}"hex":{data_text}{data_from_text}}}'
     )
 
 
@@ -50,11 +50,11 @@ class FrameTexts:
     """Makes the texts of frames, with cached parts for frames that differ only in their data."""
 
     def __init__(self) -> None:
-        # text before and after the data, by the kind of frame. The dialect is kept as well, since
-        # its id in memory could otherwise be reused
-        self._known: dict[tuple[object, ...], tuple[str, str, object]] = {}
-        # of the last frame: time, camera, dialect, sender, id, bytes of the payload, those before
-        # its data, and the text before and after that
+        # text before and after the data, by properties of the frame. The dialect is kept, too:
+        # otherwise another object could get its id
+        self._cached_texts: dict[tuple[object, ...], tuple[str, str, object]] = {}
+        # of the last frame: time, camera, dialect, sender, message id, payload size, payload before
+        # the data, text before the data, text after the data
         self._last: tuple[Any, ...] = (None, None, None, None, None, 0, b"", "", "")
 
     def text(self, raw: RawFrame) -> tuple[str, str]:
@@ -64,45 +64,47 @@ class FrameTexts:
         """
         at, camera, dialect, sender, frame = raw
         if isinstance(frame, TraceEntry):
-            return frame_text(frame), body_of(frame)
+            return frame_text(frame), data_of(frame)
         message_id, payload = frame
-        known_at, name, known_dialect, known_sender, known_id, size, head, front, end = self._last
+        last_at, last_camera, last_dialect, last_sender, last_id, size, head, start, end = (
+            self._last
+        )
         if (
-            at is known_at
-            and camera is name
-            and dialect is known_dialect
-            and sender is known_sender
-            and message_id == known_id
+            at is last_at
+            and camera is last_camera
+            and dialect is last_dialect
+            and sender is last_sender
+            and message_id == last_id
             and len(payload) == size
             and payload.startswith(head)
-        ):  # came together with the last one, and differs only in its data
+        ):  # came together with the last frame, and differs only in its data
             data = payload[len(head) :].hex()
-            return f"{front}{data}{end}", data
-        begins = dialect.data_begins(sender, message_id)
-        if begins is None or len(payload) <= begins or sender is not Sender.CAMERA:
+            return f"{start}{data}{end}", data
+        data_offset = dialect.data_begins(sender, message_id)
+        if data_offset is None or len(payload) <= data_offset or sender is not Sender.CAMERA:
             entry = raw.entry()
-            return frame_text(entry), body_of(entry)
-        kind = camera, id(dialect), message_id, payload[:begins], len(payload)
-        data, known = payload[begins:].hex(), self._known.get(kind)
-        if known is None:
+            return frame_text(entry), data_of(entry)
+        key = camera, id(dialect), message_id, payload[:data_offset], len(payload)
+        data, cached = payload[data_offset:].hex(), self._cached_texts.get(key)
+        if cached is None:
             entry = raw.entry()
             text = frame_text(entry)
-            before = f'{{"at":{text_of(at)}'
-            behind = f'","data_from":{len(entry.hex) // 2 - len(payload) + begins}}}'
-            if text.startswith(before) and text.endswith(data + behind):
-                if len(self._known) >= MAX_CACHED_FRAME_TEXTS:
-                    self._known.clear()
-                front = text[len(before) : len(text) - len(data) - len(behind)]
-                self._known[kind] = front, behind, dialect
-            return text, body_of(entry)
-        front, end = f'{{"at":{text_of(at)}{known[0]}', known[1]
-        about = at, camera, dialect, sender, message_id, len(payload), payload[:begins]
-        self._last = (*about, front, end)
-        return f"{front}{data}{end}", data
+            time_text = f'{{"at":{text_of(at)}'
+            end = f'","data_from":{len(entry.hex) // 2 - len(payload) + data_offset}}}'
+            if text.startswith(time_text) and text.endswith(data + end):
+                if len(self._cached_texts) >= MAX_CACHED_FRAME_TEXTS:
+                    self._cached_texts.clear()
+                start = text[len(time_text) : len(text) - len(data) - len(end)]
+                self._cached_texts[key] = start, end, dialect
+            return text, data_of(entry)
+        start, end = f'{{"at":{text_of(at)}{cached[0]}', cached[1]
+        properties = at, camera, dialect, sender, message_id, len(payload), payload[:data_offset]
+        self._last = (*properties, start, end)
+        return f"{start}{data}{end}", data
 
 
-def body_of(entry: TraceEntry) -> str:
-    """Return the data of a camera's frame as hex; "" without data."""
+def data_of(entry: TraceEntry) -> str:
+    """Return the ``data`` of a frame from the camera as hex; "" without data."""
     data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
     return data if type(data) is str else ""
 

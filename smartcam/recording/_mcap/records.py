@@ -99,10 +99,10 @@ class RecordReader:
     _name: object  # name of the file, for errors
 
     def __post_init__(self) -> None:
-        self.place: int = 0  # bytes read so far
-        self._count = 0  # records read
-        self._messages = 0  # messages read
-        self._unpacked = 0  # unpacked bytes of chunks, and bytes of results from frames
+        self.offset: int = 0  # number of bytes read so far
+        self._record_count = 0  # records read
+        self._message_count = 0  # messages read
+        self._unpacked_bytes = 0  # unpacked bytes of chunks, and bytes of results from frames
         self._crc = 0
 
     def records(self) -> Iterator[Record]:
@@ -117,7 +117,7 @@ class RecordReader:
         while True:
             crc = self._crc
             opcode, length = _HEAD.unpack(self._read(_HEAD.size))
-            self._count_one()
+            self._count_record()
             if length > MAX_RECORD_BYTES:
                 raise ValueError(f"a record of {length} bytes, expected {MAX_RECORD_BYTES} at most")
             if opcode == _CHUNK:
@@ -127,19 +127,19 @@ class RecordReader:
                 self._check_magic()
                 return
             elif opcode == _DATA_END:
-                expected = _Body(memoryview(self._read(_small(length)))).number(4)
+                expected = _FieldReader(memoryview(self._read(_checked_length(length)))).number(4)
                 if expected not in {0, crc}:
                     raise ValueError(f"the data's checksum is {crc:08x}, expected {expected:08x}")
             elif opcode == _STATISTICS:
-                expected = _Body(memoryview(self._read(_small(length)))).number(8)
-                if expected != self._messages:
-                    raise ValueError(f"of {expected} messages {self._messages} are there")
+                expected = _FieldReader(memoryview(self._read(_checked_length(length)))).number(8)
+                if expected != self._message_count:
+                    raise ValueError(f"of {expected} messages {self._message_count} are there")
             elif opcode == _NONE:
                 raise ValueError("a record of the kind 0, which there is not")
             elif opcode == _METADATA:
-                yield _metadata(_Body(memoryview(self._read(_small(length)))))
+                yield _metadata(_FieldReader(memoryview(self._read(_checked_length(length)))))
             elif opcode in _PARSERS:
-                self._messages += opcode == _MESSAGE
+                self._message_count += opcode == _MESSAGE
                 yield _PARSERS[opcode](memoryview(self._read(length)))
             else:
                 self._skip(length)
@@ -150,50 +150,52 @@ class RecordReader:
         Raises:
             RecordingError: their sum exceeds the bound.
         """
-        self._unpacked += size
-        if self._unpacked > max(MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE * self.place):
+        self._unpacked_bytes += size
+        if self._unpacked_bytes > max(MIN_UNPACKED_BYTES, UNPACKED_PER_BYTE * self.offset):
             raise RecordingError(
-                f"recording {self._name}: the first {self.place} bytes of the file unpack to "
-                f"{self._unpacked}, expected {UNPACKED_PER_BYTE} for each at most, or "
+                f"recording {self._name}: the first {self.offset} bytes of the file unpack to "
+                f"{self._unpacked_bytes}, expected {UNPACKED_PER_BYTE} for each at most, or "
                 f"{MIN_UNPACKED_BYTES}"
             )
 
     def _unpack(self, body: memoryview) -> Iterator[Record]:
-        """Yield the records of a chunk, whose bytes are kept until the last record."""
-        data = self._inflated(body)
-        place = 0
-        while place < len(data):
-            if len(data) - place < _HEAD.size:
+        """Yield the records of a chunk; its unpacked bytes are kept until the last record."""
+        data = self._unpack_chunk(body)
+        offset = 0
+        while offset < len(data):
+            if len(data) - offset < _HEAD.size:
                 raise ValueError("a record in a chunk is cut off")
-            opcode, length = _HEAD.unpack_from(data, place)
-            place += _HEAD.size
-            if length > len(data) - place:
-                raise ValueError(f"a record of {length} bytes in the last {len(data) - place}")
-            self._count_one()
+            opcode, length = _HEAD.unpack_from(data, offset)
+            offset += _HEAD.size
+            if length > len(data) - offset:
+                raise ValueError(f"a record of {length} bytes in the last {len(data) - offset}")
+            self._count_record()
             if opcode in _PARSERS:
-                self._messages += opcode == _MESSAGE
-                yield _PARSERS[opcode](data[place : place + length])
-            place += length
+                self._message_count += opcode == _MESSAGE
+                yield _PARSERS[opcode](data[offset : offset + length])
+            offset += length
 
-    def _inflated(self, body: memoryview) -> memoryview:
+    def _unpack_chunk(self, body: memoryview) -> memoryview:
         """Unpack a chunk."""
-        fields = _Body(body)
-        _, _, plain_bytes, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
-        how = fields.text()
-        packed = fields.take(fields.number(8))
-        if how in {"zstd", "lz4"}:
-            data = memoryview(self._pieces((_zstd if how == "zstd" else _lz4)(packed)))
-        elif how:
-            raise ValueError(f"a chunk is packed as {how!r:.40}, expected zstd, lz4 or nothing")
+        fields = _FieldReader(body)
+        _, _, unpacked_size, crc = _CHUNK_HEAD.unpack(fields.read(_CHUNK_HEAD.size))
+        compression = fields.text()
+        packed = fields.read(fields.number(8))
+        if compression in {"zstd", "lz4"}:
+            data = memoryview(self._inflate_all((_zstd if compression == "zstd" else _lz4)(packed)))
+        elif compression:
+            raise ValueError(
+                f"a chunk is packed as {compression!r:.40}, expected zstd, lz4 or nothing"
+            )
         else:
             data = packed
-        if len(data) != plain_bytes:
-            raise ValueError(f"a chunk unpacks to {len(data)} bytes, expected {plain_bytes}")
+        if len(data) != unpacked_size:
+            raise ValueError(f"a chunk unpacks to {len(data)} bytes, expected {unpacked_size}")
         if crc not in {0, zlib.crc32(data)}:
             raise ValueError(f"a chunk's checksum is not {crc:08x}")
         return data
 
-    def _pieces(self, inflate: Callable[[int], bytes]) -> bytearray:
+    def _inflate_all(self, inflate: Callable[[int], bytes]) -> bytearray:
         """Join inflated pieces, up to the bound."""
         data = bytearray()
         while piece := inflate(PIECE_BYTES):
@@ -206,12 +208,12 @@ class RecordReader:
                 )
         return data
 
-    def _count_one(self) -> None:
-        self._count += 1
-        if self._count > MIN_RECORDS and self._count > self.place:
+    def _count_record(self) -> None:
+        self._record_count += 1
+        if self._record_count > MIN_RECORDS and self._record_count > self.offset:
             raise RecordingError(
-                f"recording {self._name}: {self._count} records in the first {self.place} bytes "
-                f"of the file, expected one a byte at most, or {MIN_RECORDS}"
+                f"recording {self._name}: {self._record_count} records in the first {self.offset} "
+                f"bytes of the file, expected one a byte at most, or {MIN_RECORDS}"
             )
 
     # ------------------------------------------------------------------ the file
@@ -222,21 +224,21 @@ class RecordReader:
             raise ValueError(f"{magic.hex(' ')} is not MCAP's magic, {MAGIC.hex(' ')}")
 
     def _read(self, size: int) -> bytes:
-        """Return the next bytes; allocate memory only as they come, not by the length."""
+        """Return the next bytes; memory is allocated as they come: the length may be wrong."""
         if size <= PIECE_BYTES:
-            return self._piece(size)
+            return self._read_piece(size)
         data = bytearray()
         while len(data) < size:
-            data += self._piece(min(PIECE_BYTES, size - len(data)))
+            data += self._read_piece(min(PIECE_BYTES, size - len(data)))
         return bytes(data)
 
     def _skip(self, size: int) -> None:
         while size:
-            size -= len(self._piece(min(PIECE_BYTES, size)))
+            size -= len(self._read_piece(min(PIECE_BYTES, size)))
 
-    def _piece(self, size: int) -> bytes:
+    def _read_piece(self, size: int) -> bytes:
         data = self._stream.read(size)
-        self.place += len(data)
+        self.offset += len(data)
         self._crc = zlib.crc32(data, self._crc)
         if len(data) < size:
             raise CutOffError("the file ends here")
@@ -244,46 +246,46 @@ class RecordReader:
 
 
 @dataclass(slots=True, eq=False)
-class _Body:
+class _FieldReader:
     """A reader of a record's fields, one after the other."""
 
     _data: memoryview
-    _place: int = 0
+    _offset: int = 0
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Number of remaining bytes."""
-        return len(self._data) - self._place
+        return len(self._data) - self._offset
 
-    def take(self, size: int) -> memoryview:
+    def read(self, size: int) -> memoryview:
         """Return the next bytes."""
-        if size > self.left:
-            raise ValueError(f"a field of {size} bytes in the last {self.left} of a record")
-        self._place += size
-        return self._data[self._place - size : self._place]
+        if size > self.remaining:
+            raise ValueError(f"a field of {size} bytes in the last {self.remaining} of a record")
+        self._offset += size
+        return self._data[self._offset - size : self._offset]
 
     def number(self, size: int) -> int:
         """Return the next number."""
-        return int.from_bytes(self.take(size), "little")
+        return int.from_bytes(self.read(size), "little")
 
     def text(self) -> str:
         """Return the next text, which its length precedes."""
-        return str(self.take(self.number(4)), "utf-8")
+        return str(self.read(self.number(4)), "utf-8")
 
 
-def _small(length: int) -> int:
+def _checked_length(length: int) -> int:
     if length > MAX_FACTS_BYTES:
         raise ValueError(f"a record of {length} bytes, expected {MAX_FACTS_BYTES} at most")
     return length
 
 
 def _schema(data: memoryview) -> Schema:
-    fields = _Body(data)
+    fields = _FieldReader(data)
     return Schema(fields.number(2), fields.text()[:200])  # another program's name may be long
 
 
 def _channel(data: memoryview) -> Channel:
-    fields = _Body(data)
+    fields = _FieldReader(data)
     return Channel(fields.number(2), fields.number(2))
 
 
@@ -294,11 +296,11 @@ def _message(data: memoryview) -> McapMessage:
     return McapMessage(channel, sequence, data[_MESSAGE_HEAD.size :])
 
 
-def _metadata(fields: _Body) -> Metadata:
+def _metadata(fields: _FieldReader) -> Metadata:
     name = fields.text()
-    facts = _Body(fields.take(fields.number(4)))
+    facts = _FieldReader(fields.read(fields.number(4)))
     metadata: dict[str, str] = {}
-    while facts.left:
+    while facts.remaining:
         key = facts.text()
         metadata[key] = facts.text()
     return Metadata(name, metadata)
@@ -315,7 +317,7 @@ _PARSERS: dict[int, Callable[[memoryview], Record]] = {
 
 
 def _zstd(packed: memoryview) -> Callable[[int], bytes]:
-    """Return a reader of the next bytes; a frame's window is as large as its chunk at most."""
+    """Return a function that unpacks the next bytes; a zstd window is limited to a chunk's size."""
     library: Any = load_extra("zstandard")
     inflater = library.ZstdDecompressor(max_window_size=1 << (MAX_CHUNK_BYTES - 1).bit_length())
     stream = inflater.stream_reader(packed)
@@ -333,17 +335,17 @@ def _zstd(packed: memoryview) -> Callable[[int], bytes]:
 def _lz4(packed: memoryview) -> Callable[[int], bytes]:
     library: Any = load_extra("lz4.frame")
     inflater = library.LZ4FrameDecompressor()
-    rest = bytes(packed)
+    pending = bytes(packed)
 
     def inflate(size: int) -> bytes:
-        nonlocal rest
+        nonlocal pending
         if inflater.eof:
             return b""
         try:
-            data: bytes = inflater.decompress(rest, max_length=size)
+            data: bytes = inflater.decompress(pending, max_length=size)
         except RuntimeError as exc:
             raise ValueError(f"a chunk is no lz4: {exc}") from exc
-        rest = b""  # the decompressor keeps unused bytes
+        pending = b""  # the decompressor keeps unused bytes
         return data
 
     return inflate

@@ -21,7 +21,7 @@ _ATTACHMENT_INDEX, _SUMMARY_OFFSET, _DATA_END = 0x0A, 0x0E, 0x0F
 
 _HEAD = struct.Struct("<BQ")  # opcode, length of the record's content
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-_pack_head, _MESSAGE_BEGINS = _MESSAGE_HEAD.pack, _MESSAGE_HEAD.size
+_pack_head, _MESSAGE_HEAD_SIZE = _MESSAGE_HEAD.pack, _MESSAGE_HEAD.size
 _MESSAGE_FIELDS = _MESSAGE_HEAD.size - _HEAD.size
 _CHUNK_FIELDS = struct.Struct("<QQQI")
 _COUNT = struct.Struct("<HQ")
@@ -48,14 +48,14 @@ class McapWriter:
         self._compress = compress
         self._chunk_size = chunk_size
         self._parts: list[bytes] = []  # parts of the chunk that is being filled
-        self._packs = True  # whether the chunk will be compressed
+        self._compresses = True  # whether the chunk will be compressed
         self._size = 0  # number of bytes of the parts
-        # times and offsets in the chunk by channel, alternating
-        self._places: dict[int, list[int]] = {}
-        self._first = self._last = 0  # first and last time of its messages
-        self._counts: dict[int, int] = {}  # number of messages of each channel
-        self._began = self._ended = 0  # first and last time of all messages
-        self._chunks = 0
+        # for each channel: time and offset in the chunk of each message, alternating
+        self._index_entries: dict[int, list[int]] = {}
+        self._first_time = self._last_time = 0  # of the messages in the chunk
+        self._message_counts: dict[int, int] = {}  # number of messages of each channel
+        self._file_first_time = self._file_last_time = 0  # of all messages
+        self._chunk_count = 0
         # records to repeat at the end
         self._schema_records: list[bytes] = []
         self._channel_records: list[bytes] = []
@@ -70,9 +70,9 @@ class McapWriter:
         """Write a schema; return its number."""
         number = len(self._schema_records) + 1
         size = len(data).to_bytes(4, "little")
-        named = number.to_bytes(2, "little"), _text(name), _text(encoding)
-        self._schema_records.append(_record(_SCHEMA, *named, size, data))
-        self._put(self._schema_records[-1])
+        names = number.to_bytes(2, "little"), _text(name), _text(encoding)
+        self._schema_records.append(_record(_SCHEMA, *names, size, data))
+        self._add_record(self._schema_records[-1])
         return number
 
     def register_channel(
@@ -83,11 +83,11 @@ class McapWriter:
         numbers = struct.pack("<HH", number, schema)
         record = _record(_CHANNEL, numbers, _text(topic), _text(encoding), _map(metadata))
         self._channel_records.append(record)
-        self._put(record)
+        self._add_record(record)
         return number
 
     def add_message(
-        self, channel: int, at: int, data: bytes, sequence: int, *, packs: bool = True
+        self, channel: int, at: int, data: bytes, sequence: int, *, compressed: bool = True
     ) -> None:
         """Write a message.
 
@@ -96,33 +96,33 @@ class McapWriter:
             at: time of the message, nanoseconds since 1970, UTC.
             data: bytes of the message.
             sequence: the channel's own count.
-            packs: whether the message should be compressed; a chunk with a message that should not
-                be is written uncompressed.
+            compressed: whether the message should be compressed; one message that should not be
+                keeps its whole chunk uncompressed.
         """
-        if not packs:
-            self._packs = False
-        places = self._places.get(channel)
-        if places is None:
-            if not self._places:
-                self._first = self._last = at
-            places = self._places[channel] = []
-        if at < self._first:
-            self._first = at
-        elif at > self._last:
-            self._last = at
-        size, before = len(data), self._size
+        if not compressed:
+            self._compresses = False
+        entries = self._index_entries.get(channel)
+        if entries is None:
+            if not self._index_entries:
+                self._first_time = self._last_time = at
+            entries = self._index_entries[channel] = []
+        if at < self._first_time:
+            self._first_time = at
+        elif at > self._last_time:
+            self._last_time = at
+        size, offset = len(data), self._size
         head = _pack_head(_MESSAGE, _MESSAGE_FIELDS + size, channel, sequence, at, at)
-        places += (at, before)
+        entries += (at, offset)
         self._parts += (head, data)
-        self._size = before = before + _MESSAGE_BEGINS + size
-        if before > self._chunk_size:
+        self._size = end = offset + _MESSAGE_HEAD_SIZE + size
+        if end > self._chunk_size:
             self.end_chunk()
 
     def add_metadata(self, name: str, facts: Mapping[str, str]) -> None:
         """Write facts under a name, before the chunk that is being filled."""
         record = _record(_METADATA, _text(name), _map(facts))
-        place = struct.pack("<QQ", self._stream.tell(), len(record))
-        self._metadata_indexes.append(_record(_METADATA_INDEX, place, _text(name)))
+        position = struct.pack("<QQ", self._stream.tell(), len(record))
+        self._metadata_indexes.append(_record(_METADATA_INDEX, position, _text(name)))
         self._stream.write(record)
 
     def flush(self) -> None:
@@ -134,10 +134,10 @@ class McapWriter:
         """Write the index and the end of the file."""
         self.end_chunk()
         self._stream.write(_record(_DATA_END, bytes(4)))
-        start = place = self._stream.tell()
+        start = offset = self._stream.tell()
         parts: list[bytes] = []
         offsets: list[bytes] = []
-        for kind, records in (
+        for opcode, records in (
             (_SCHEMA, self._schema_records),
             (_CHANNEL, self._channel_records),
             (_STATISTICS, [self._statistics()]),
@@ -146,17 +146,17 @@ class McapWriter:
             (_METADATA_INDEX, self._metadata_indexes),
         ):
             size = sum(map(len, records))
-            offsets.append(_record(_SUMMARY_OFFSET, _OFFSET.pack(kind, place, size)))
+            offsets.append(_record(_SUMMARY_OFFSET, _OFFSET.pack(opcode, offset, size)))
             parts += records
-            place += size
+            offset += size
         summary = b"".join((*parts, *offsets))
-        footer = _HEAD.pack(_FOOTER, 20) + struct.pack("<QQ", start, place)
+        footer = _HEAD.pack(_FOOTER, 20) + struct.pack("<QQ", start, offset)
         crc = zlib.crc32(footer, zlib.crc32(summary))
         self._stream.write(b"".join((summary, footer, crc.to_bytes(4, "little"), MAGIC)))
 
     # ------------------------------------------------------------------ inside
 
-    def _put(self, record: bytes) -> None:
+    def _add_record(self, record: bytes) -> None:
         self._parts.append(record)
         self._size += len(record)
         if self._size > self._chunk_size:
@@ -164,54 +164,59 @@ class McapWriter:
 
     def end_chunk(self) -> None:
         """Write the chunk, unless it has no messages."""
-        if not self._places:
+        if not self._index_entries:
             return
         data = b"".join(self._parts)
-        packed, how = (self._compress(data), _ZSTD) if self._packs else (data, "")
-        times = self._first, self._last
+        packed, compression = (self._compress(data), _ZSTD) if self._compresses else (data, "")
+        times = self._first_time, self._last_time
         chunk = (
             _CHUNK_FIELDS.pack(*times, len(data), zlib.crc32(data)),
-            _text(how),
+            _text(compression),
             len(packed).to_bytes(8, "little"),
         )
         start, length = self._stream.tell(), sum(map(len, chunk)) + len(packed) + _HEAD.size
-        place = start + length
+        offset = start + length
         indexes: list[bytes] = []
-        places: list[bytes] = []
-        for channel, places_of_channel in self._places.items():
-            indexes.append(_index_record(channel, places_of_channel))
-            places.append(_COUNT.pack(channel, place))
-            place += len(indexes[-1])
-            self._counts[channel] = self._counts.get(channel, 0) + len(places_of_channel) // 2
+        index_offsets: list[bytes] = []
+        for channel, entries in self._index_entries.items():
+            indexes.append(_index_record(channel, entries))
+            index_offsets.append(_COUNT.pack(channel, offset))
+            offset += len(indexes[-1])
+            count = self._message_counts.get(channel, 0)
+            self._message_counts[channel] = count + len(entries) // 2
         self._stream.write(_HEAD.pack(_CHUNK, length - _HEAD.size) + b"".join(chunk))
         self._stream.write(packed)
         self._stream.write(b"".join(indexes))
         self._chunk_indexes.append(
             _record(
                 _CHUNK_INDEX,
-                struct.pack("<QQQQI", *times, start, length, _COUNT.size * len(places)),
-                *places,
-                (place - start - length).to_bytes(8, "little"),
-                _text(how),
+                struct.pack("<QQQQI", *times, start, length, _COUNT.size * len(index_offsets)),
+                *index_offsets,
+                (offset - start - length).to_bytes(8, "little"),
+                _text(compression),
                 struct.pack("<QQ", len(packed), len(data)),
             )
         )
-        self._began = min(self._began, self._first) if self._chunks else self._first
-        self._ended = max(self._ended, self._last)
-        self._chunks += 1
-        self._parts, self._size, self._places = [], 0, {}
-        self._packs = True
+        self._file_first_time = (
+            min(self._file_first_time, self._first_time) if self._chunk_count else self._first_time
+        )
+        self._file_last_time = max(self._file_last_time, self._last_time)
+        self._chunk_count += 1
+        self._parts, self._size, self._index_entries = [], 0, {}
+        self._compresses = True
 
     def _statistics(self) -> bytes:
-        counts = self._counts
+        counts = self._message_counts
         totals = (
             *(sum(counts.values()), len(self._schema_records), len(self._channel_records)),
-            *(0, len(self._metadata_indexes), self._chunks),  # no attachments
+            *(0, len(self._metadata_indexes), self._chunk_count),  # no attachments
         )
         return _record(
             _STATISTICS,
             struct.pack("<QHIIII", *totals),
-            struct.pack("<QQI", self._began, self._ended, _COUNT.size * len(counts)),
+            struct.pack(
+                "<QQI", self._file_first_time, self._file_last_time, _COUNT.size * len(counts)
+            ),
             *(_COUNT.pack(channel, count) for channel, count in counts.items()),
         )
 
@@ -230,6 +235,6 @@ def _map(texts: Mapping[str, str]) -> bytes:
     return len(data).to_bytes(4, "little") + data
 
 
-def _index_record(channel: int, places: list[int]) -> bytes:
-    data = struct.pack(f"<{len(places)}Q", *places)
+def _index_record(channel: int, entries: list[int]) -> bytes:
+    data = struct.pack(f"<{len(entries)}Q", *entries)
     return _record(_MESSAGE_INDEX, struct.pack("<HI", channel, len(data)), data)

@@ -1,7 +1,7 @@
 """The marks of a picture as Foxglove's message ``foxglove.ImageAnnotations``.
 
-A viewer draws them over the picture. Fields with numbers from 100 on are smartcam's, and stand in
-the file's schema: with them a mark is read exactly as it was written. Foxglove counts pixels from
+A viewer draws them over the picture. Fields with numbers from 100 on are smartcam's, and are in the
+file's schema: with them a mark is read exactly as it was written. Foxglove counts pixels from
 the upper left corner of the upper left pixel, smartcam from its centre.
 """
 
@@ -16,10 +16,10 @@ from smartcam.recording._pictures.protobuf import (
     TIMESTAMP,
     Fields,
     WireField,
+    encode_message,
+    encode_timestamp,
     file_set,
-    message,
-    timestamp,
-    values_of,
+    parse_message,
 )
 
 if TYPE_CHECKING:
@@ -97,37 +97,37 @@ def annotations_message(frame: Frame) -> bytes:
 
     Marks after the first thousand are left out, and marks whose coordinates are not finite.
     """
-    thick = stroke_width(frame.width, frame.height)
-    stamp = timestamp(frame.utc)
-    parts: dict[str, list[bytes]] = {"points": [], "texts": []}
-    for place, drawing in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
+    line_width = stroke_width(frame.width, frame.height)
+    stamp = encode_timestamp(frame.utc)
+    annotations: dict[str, list[bytes]] = {"points": [], "texts": []}
+    for number, drawing in enumerate(frame.drawings[:MAX_DRAWINGS], 1):
         points = drawing.points[:MAX_POINTS]
         if not points or not all(math.isfinite(x) and math.isfinite(y) for x, y in points):
             continue
-        marked = {"timestamp": stamp, "place": place, "role": drawing.role}
+        common = {"timestamp": stamp, "place": number, "role": drawing.role}
         text = drawing.text[:MAX_TEXT_CHARACTERS]
         if drawing.kind != "text":
             values = {
-                **marked,
+                **common,
                 "type": _TYPE_OF[drawing.kind],
                 "points": [_point(*point) for point in points],
                 "outline_color": _colour(drawing.role),
-                "thickness": thick * (3.0 if drawing.kind == "points" else 1.0),
+                "thickness": line_width * (3.0 if drawing.kind == "points" else 1.0),
                 "word": text,
             }
-            parts["points"].append(message(_MESSAGES["PointsAnnotation"], values))
-            marked = {"timestamp": stamp}
+            annotations["points"].append(encode_message(_MESSAGES["PointsAnnotation"], values))
+            common = {"timestamp": stamp}
         if text:
             values = {
-                **marked,
+                **common,
                 "position": _point(*points[0]),
                 "text": text,
-                "font_size": 14.0 * thick,
+                "font_size": 14.0 * line_width,
                 "text_color": _colour(drawing.role),
                 "background_color": _colour(None),
             }
-            parts["texts"].append(message(_MESSAGES["TextAnnotation"], values))
-    return message(_MESSAGES["ImageAnnotations"], parts)
+            annotations["texts"].append(encode_message(_MESSAGES["TextAnnotation"], values))
+    return encode_message(_MESSAGES["ImageAnnotations"], annotations)
 
 
 def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
@@ -136,29 +136,30 @@ def drawings_of(data: memoryview) -> tuple[Drawing, ...]:
     Raises:
         ValueError: the message is not valid.
     """
-    lists = values_of(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
-    drawn: dict[int, Drawing] = {}
+    lists = parse_message(_MESSAGES["ImageAnnotations"], data, 2 * MAX_DRAWINGS)
+    drawings: dict[int, Drawing] = {}
     for annotation in lists.get("points", ()):
-        values = values_of(_MESSAGES["PointsAnnotation"], annotation, MAX_POINTS + 100)
+        values = parse_message(_MESSAGES["PointsAnnotation"], annotation, MAX_POINTS + 100)
         kind = _KINDS.get(values.get("type", 0))
         if kind is None:
             raise ValueError(f"type: {values.get('type', 0)} came, expected 1 to 3")
         points = tuple(map(_coordinates, values.get("points", ())))
-        drawn[_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
+        drawings[_mark_number(values)] = Drawing(kind, points, _role(values), _text(values, "word"))
     for annotation in lists.get("texts", ()):
-        values = values_of(_MESSAGES["TextAnnotation"], annotation, 100)
+        values = parse_message(_MESSAGES["TextAnnotation"], annotation, 100)
         if "place" in values:  # others are the words of points
             point = _coordinates(values.get("position", memoryview(b"")))
-            drawn[_number(values)] = Drawing("text", (point,), _role(values), _text(values, "text"))
-    return tuple(drawing for _, drawing in sorted(drawn.items()))
+            text = _text(values, "text")
+            drawings[_mark_number(values)] = Drawing("text", (point,), _role(values), text)
+    return tuple(drawing for _, drawing in sorted(drawings.items()))
 
 
 def _point(x: float, y: float) -> bytes:
-    return message(_MESSAGES["Point2"], {"x": x + 0.5, "y": y + 0.5})
+    return encode_message(_MESSAGES["Point2"], {"x": x + 0.5, "y": y + 0.5})
 
 
 def _coordinates(data: memoryview) -> tuple[float, float]:
-    values = values_of(_MESSAGES["Point2"], data, 10)
+    values = parse_message(_MESSAGES["Point2"], data, 10)
     return values.get("x", 0.0) - 0.5, values.get("y", 0.0) - 0.5
 
 
@@ -167,10 +168,10 @@ def _colour(role: Role | None) -> bytes:
     red, green, blue = (0, 0, 0) if role is None else COLOURS[role]
     opacity = 0.5 if role is None else 1.0
     values = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": opacity}
-    return message(_MESSAGES["Color"], values)
+    return encode_message(_MESSAGES["Color"], values)
 
 
-def _number(values: dict[str, Any]) -> int:
+def _mark_number(values: dict[str, Any]) -> int:
     number: int = values.get("place", 0)
     if not 1 <= number <= MAX_DRAWINGS:
         raise ValueError(f"place: {number} came, expected 1 to {MAX_DRAWINGS}")

@@ -39,7 +39,7 @@ STOP_TIMEOUT: Final = 5.0
 
 MAX_SPEED: Final = 1000.0
 
-_KNOWN: Final = ("camera", "name", "pace", "speed")
+_PARAMETERS: Final = ("camera", "name", "pace", "speed")
 
 
 class RecordedDriver(TaskDriver):
@@ -49,7 +49,7 @@ class RecordedDriver(TaskDriver):
 
     ========== ====================================================================================
     ``camera`` name of the camera in the recording; needed where several have pictures
-    ``pace``   ``real`` (default): with the times between pictures as they were; or ``none``: each
+    ``pace``   ``real`` (default): with the recorded times between pictures; or ``none``: each
                picture when the readers have taken the last one, and none is skipped
     ``speed``  times faster than recorded, 0.001 to 1000; default 1
     ``name``   of the source; default: that of the camera
@@ -70,13 +70,13 @@ class RecordedDriver(TaskDriver):
         if match is not None and "://" not in address.url:
             path, fragment = match[1], match[2]
         self._path = Path(path)
-        parameters = address.parameters(_KNOWN, fragment)
+        parameters = address.parameters(_PARAMETERS, fragment)
         self._camera = parameters.get("camera")
         self._given_name = parameters.get("name")
         pace = parameters.get("pace", "real")
         if pace not in ("real", "none"):
             raise address.wrong("pace", "real or none", pace)
-        self._paced = pace == "real"
+        self._keeps_pace = pace == "real"
         self._speed = address.number(
             "speed", parameters.get("speed", "1"), 1 / MAX_SPEED, MAX_SPEED
         )
@@ -94,12 +94,12 @@ class RecordedDriver(TaskDriver):
             FrameFormatError: the recording has no pictures, or pictures of several cameras.
             FrameSourceError: the path does not exist, or is no recording of smartcam.
         """
-        first = await asyncio.to_thread(self._first)
+        first = await asyncio.to_thread(self._find_first)
         self._camera = first.camera
         frame = first.frame
         return StreamFormat(frame.format, frame.width, frame.height)
 
-    def _first(self) -> RecordedPicture:
+    def _find_first(self) -> RecordedPicture:
         first: RecordedPicture | None = None
         items_from_first = 0
         cameras: dict[str, None] = {}
@@ -155,7 +155,7 @@ class RecordedDriver(TaskDriver):
                 yield item._replace(left_out=item.left_out + gap)
                 gap = 0
 
-    async def _next(self, pictures: Iterator[RecordedPicture]) -> RecordedPicture | None:
+    async def _read_next(self, pictures: Iterator[RecordedPicture]) -> RecordedPicture | None:
         """Return the next picture, read in a thread; None at the end."""
         reading = asyncio.get_running_loop().run_in_executor(None, next, pictures, None)
         self._reading = reading
@@ -169,29 +169,29 @@ class RecordedDriver(TaskDriver):
         last: Frame | None = None
         due = loop.time()
         try:
-            while (picture := await self._next(pictures)) is not None:
+            while (picture := await self._read_next(pictures)) is not None:
                 frame = frame_of(picture)
-                if self._paced:
-                    due += 0.0 if last is None else _between(last, frame) / self._speed
+                if self._keeps_pace:
+                    due += 0.0 if last is None else _seconds_between(last, frame) / self._speed
                     due = max(due, loop.time() - MAX_DELAY)
                     await asyncio.sleep(due - loop.time())
                 now = time.monotonic()
-                captured = min(now, due) if self._paced else now
+                captured = min(now, due) if self._keeps_pace else now
                 sink.frame(dataclasses.replace(frame, captured=captured, source=self.name))
-                if not self._paced:
+                if not self._keeps_pace:
                     await sink.wait_taken()
                 last = frame
         except (ConfigurationError, RecordingError) as exc:
             sink.ended(FrameSourceError(str(exc), source=self.name))
         except Exception as exc:  # noqa: BLE001 - readers get every error
-            failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
-            failed.__cause__ = exc
-            sink.ended(failed)
+            error = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
+            error.__cause__ = exc
+            sink.ended(error)
         else:
             sink.ended(None)
 
 
-def _between(last: Frame, frame: Frame) -> float:
+def _seconds_between(last: Frame, frame: Frame) -> float:
     """Return the seconds between two captures, by the monotonic clock if both are from one run."""
     by_clock, by_utc = frame.captured - last.captured, frame.utc - last.utc
     same_clock = by_clock >= 0 and abs(by_clock - by_utc) < 1 + 0.01 * by_clock

@@ -125,7 +125,7 @@ class RotatingRecorder:
     @property
     def has_room(self) -> bool:
         """True if less than half of the room for waiting pictures is used."""
-        return self._writer is None or self._writer.waiting < MAX_WAITING_PICTURE_BYTES // 2
+        return self._writer is None or self._writer.waiting_bytes < MAX_WAITING_PICTURE_BYTES // 2
 
     def add_picture(self, frame: Frame, *, camera: str = "") -> bool:
         """Add a picture, or leave it out and count it if too much waits. Never waits.
@@ -147,13 +147,13 @@ class RotatingRecorder:
         name = camera or file_name(frame.source)
         track = self._tracks.get(name)
         if track is None:
-            known = FileName(name, datetime.now(UTC))
-            if FileName.parse(str(known)) is None:
+            example = FileName(name, datetime.now(UTC))
+            if FileName.parse(str(example)) is None:
                 raise ConfigurationError(
                     f"recordings {self.path}: camera {name!r:.60}: expected a name of small "
                     "letters, digits, _ and -, which the files have in theirs"
                 )
-            track = self._tracks[name] = self._writer.track(name, _itself)
+            track = self._tracks[name] = self._writer.new_track(name, _single_item)
         size = memoryview(frame.data).nbytes
         return self._writer.put(
             track,
@@ -186,5 +186,5 @@ def file_name(name: str) -> str:
     return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
 
 
-def _itself(picture: RecordedPicture) -> Iterator[RecordedPicture]:
+def _single_item(picture: RecordedPicture) -> Iterator[RecordedPicture]:
     yield picture

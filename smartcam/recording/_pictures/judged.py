@@ -41,14 +41,14 @@ class JudgedPictures(Observer):
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
         self._matcher = PictureMatcher(MAX_MATCHED_BYTES)
-        self._settled = asyncio.Event()
-        self._streams = asyncio.Event()
+        self._all_matched = asyncio.Event()
+        self._has_pictures = asyncio.Event()
 
     def on_results(self, results: Sequence[Result]) -> None:
         """Find the pictures of results."""
-        self._settled.clear()
+        self._all_matched.clear()
         self._matcher.results += results
-        self._settle(results[0].camera)
+        self._add_matched(results[0].camera)
 
     async def record(self, source: FrameSource, camera: str) -> None:
         """Record pictures of an open source until it ends.
@@ -59,13 +59,13 @@ class JudgedPictures(Observer):
         Cancellation: safe; earlier pictures are recorded.
         """
 
-        def take(frame: Frame) -> bool:
-            self._streams.set()
+        def on_frame(frame: Frame) -> bool:
+            self._has_pictures.set()
             self._matcher.add_picture(RecordedPicture(camera, captured_at(frame), frame))
-            self._settle(camera)
+            self._add_matched(camera)
             return True
 
-        tap = FrameTap(source, take, lambda: not self._recorder.has_room)
+        tap = FrameTap(source, on_frame, lambda: not self._recorder.has_room)
         try:
             await tap.ended()
         finally:
@@ -75,17 +75,17 @@ class JudgedPictures(Observer):
         """Wait until the first picture has come, 2 s at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FIRST_PICTURE_TIMEOUT):
-                await self._streams.wait()
+                await self._has_pictures.wait()
 
     async def wait_settled(self) -> None:
         """Wait until the picture of each result has come or cannot come, 2 s at most."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_PICTURE_TIMEOUT):
-                await self._settled.wait()
+                await self._all_matched.wait()
 
-    def _settle(self, camera: str) -> None:
-        for _, picture, _ in self._matcher.settled_by_time():
+    def _add_matched(self, camera: str) -> None:
+        for _, picture, _ in self._matcher.take_matched_by_time():
             if picture is not None:
                 self._recorder.add_picture(picture, camera=camera)
         if not self._matcher.results:
-            self._settled.set()
+            self._all_matched.set()

@@ -20,12 +20,12 @@ from smartcam.recording._pictures.protobuf import (
     TIMESTAMP,
     Fields,
     WireField,
-    encoded,
+    encode_field,
+    encode_message,
+    encode_timestamp,
     file_set,
-    message,
+    parse_message,
     tag,
-    timestamp,
-    values_of,
     varint,
 )
 
@@ -170,7 +170,7 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
     name = schema_of(picture)
     data = memoryview(frame.data).cast("B")
     values: dict[str, Any] = {
-        "timestamp": timestamp(frame.utc),
+        "timestamp": encode_timestamp(frame.utc),
         "frame_id": picture.camera,
         "pixel_format": frame.format.name,
         "picture_width": frame.width,
@@ -200,11 +200,11 @@ def picture_message(picture: RecordedPicture, annotations_from: int | None = Non
     else:
         values["format"] = _COMPRESSIONS.get(frame.format.name, frame.format.name)
     fields = SCHEMAS[name]
-    head = message(fields, values)
-    if frame.device_time == 0:
-        head += encoded(fields["device_time"], 0.0)
-    head += tag(fields["data"].number, BYTES) + varint(data.nbytes + len(padding))
-    return b"".join((head, data, padding))
+    fields_bytes = encode_message(fields, values)
+    if frame.device_time == 0:  # a time, but 0 is left out of messages
+        fields_bytes += encode_field(fields["device_time"], 0.0)
+    fields_bytes += tag(fields["data"].number, BYTES) + varint(data.nbytes + len(padding))
+    return b"".join((fields_bytes, data, padding))
 
 
 # ---------------------------------------------------------------------- schemas
@@ -233,23 +233,23 @@ def picture_of(
     Raises:
         ValueError: the message is not valid, or lacks a field of its format.
     """
-    values = values_of(SCHEMAS[schema], data, MAX_FIELDS)
+    values = parse_message(SCHEMAS[schema], data, MAX_FIELDS)
     fields = _Values(values)
     try:
         pixel_format = find_format(fields.text("pixel_format", 100))
         marks = drawings if number and fields.integer("annotations_from") == number else ()
-        frame = _frame(fields, pixel_format, marks)
+        frame = _new_frame(fields, pixel_format, marks)
         pixel_format.check(frame.data, frame.width, frame.height, frame.stride)
         at = datetime.fromtimestamp(frame.utc, UTC)
         received = fields.result_received_at()
     except (FrameFormatError, OverflowError, OSError) as exc:
         raise ValueError(f"a picture: {exc!s:.300}") from exc
     camera = fields.text("frame_id", MAX_NAME_CHARACTERS)
-    made = fields.number_of_result(), received
-    return RecordedPicture(camera, at, frame, fields.integer("left_out"), *made)
+    link = fields.number_of_result(), received
+    return RecordedPicture(camera, at, frame, fields.integer("left_out"), *link)
 
 
-def _frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
+def _new_frame(fields: _Values, pixel_format: PixelFormat, drawings: tuple[Drawing, ...]) -> Frame:
     moment = fields.text("moment", 100)
     if moment not in Moment.__members__:
         raise ValueError(f"moment: {moment!r:.60} came, expected {', '.join(Moment.__members__)}")

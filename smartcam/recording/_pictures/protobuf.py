@@ -32,13 +32,13 @@ class WireField(NamedTuple):
     Attributes:
         number: number of the field.
         type: type of the field, one of :data:`TYPES`.
-        of: full name of the type of a message or an enumeration, with a dot in front.
+        type_name: full name of the type of a message or an enumeration, with a dot in front.
         repeated: whether the message may have several of the field.
     """
 
     number: int
     type: str
-    of: str = ""
+    type_name: str = ""
     repeated: bool = False
 
 
@@ -49,19 +49,19 @@ Fields = dict[str, WireField]
 # ---------------------------------------------------------------------- writing
 
 
-def message(fields: Fields, values: Mapping[str, Any]) -> bytes:
+def encode_message(fields: Fields, values: Mapping[str, Any]) -> bytes:
     """Return a message; values that are None, 0 or "" are left out, as Protocol Buffers do."""
     return b"".join(
-        encoded(fields[name], value)
+        encode_field(fields[name], value)
         for name, value in values.items()
         if value is not None and value not in (0, "")
     )
 
 
-def encoded(field: WireField, value: Any) -> bytes:
+def encode_field(field: WireField, value: Any) -> bytes:
     """Return a field with its value; of a repeated field with each of the values in a list."""
     if field.repeated and isinstance(value, list):
-        return b"".join(encoded(field, item) for item in value)
+        return b"".join(encode_field(field, item) for item in value)
     if field.type == "double":
         return tag(field.number, FIXED64) + struct.pack("<d", value)
     if field.type == "fixed32":
@@ -69,17 +69,17 @@ def encoded(field: WireField, value: Any) -> bytes:
     if field.type in ("uint64", "enum"):
         return tag(field.number, VARINT) + varint(value)
     data: bytes = value.encode("utf-8", "replace") if field.type == "string" else value
-    return sized(field.number, data)
+    return length_delimited(field.number, data)
 
 
-def timestamp(utc: float) -> bytes:
+def encode_timestamp(utc: float) -> bytes:
     """Return a time, seconds since 1970, as google.protobuf.Timestamp."""
     seconds, nanoseconds = divmod(max(0, round(utc * 1e9)), 1_000_000_000)
     return tag(1, VARINT) + varint(seconds) + tag(2, VARINT) + varint(nanoseconds)
 
 
-def sized(number: int, data: bytes) -> bytes:
-    """Return a field that begins with the number of its bytes."""
+def length_delimited(number: int, data: bytes) -> bytes:
+    """Return a field of bytes, before which their number stands."""
     return tag(number, BYTES) + varint(len(data)) + data
 
 
@@ -101,7 +101,7 @@ def varint(value: int) -> bytes:
 # ---------------------------------------------------------------------- reading
 
 
-def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
+def parse_message(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
     """Return the values of a message's known fields; a repeated field has a list of them.
 
     Args:
@@ -114,7 +114,7 @@ def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
     """
     known = {field.number: (name, field) for name, field in fields.items()}
     values: dict[str, Any] = {}
-    for count, (number, wire_type, value) in enumerate(_pieces(data)):
+    for count, (number, wire_type, value) in enumerate(_wire_fields(data)):
         if count >= most:
             raise ValueError(f"a message of more than {most} fields")
         name, field = known.get(number, ("", None))
@@ -130,54 +130,54 @@ def values_of(fields: Fields, data: memoryview, most: int) -> dict[str, Any]:
     return values
 
 
-def _same(value: Any) -> Any:
+def _unchanged(value: Any) -> Any:
     return value
 
 
 _READERS: Final[dict[str, tuple[int, Callable[[Any], Any]]]] = {
     "double": (FIXED64, lambda value: struct.unpack("<d", value)[0]),
     "fixed32": (FIXED32, lambda value: struct.unpack("<I", value)[0]),
-    "uint64": (VARINT, _same),
-    "enum": (VARINT, _same),
-    "string": (BYTES, _same),
-    "bytes": (BYTES, _same),
-    "message": (BYTES, _same),
+    "uint64": (VARINT, _unchanged),
+    "enum": (VARINT, _unchanged),
+    "string": (BYTES, _unchanged),
+    "bytes": (BYTES, _unchanged),
+    "message": (BYTES, _unchanged),
 }
 
 
-def _pieces(data: memoryview) -> Iterator[tuple[int, int, Any]]:
+def _wire_fields(data: memoryview) -> Iterator[tuple[int, int, Any]]:
     """Yield the number, wire type and value of each field."""
-    place = 0
-    while place < len(data):
-        start, place = _read_varint(data, place)
-        wire_type = start & 7
+    offset = 0
+    while offset < len(data):
+        field_tag, offset = _read_varint(data, offset)
+        wire_type = field_tag & 7
         if wire_type == VARINT:
-            value, place = _read_varint(data, place)
-            yield start >> 3, wire_type, value
+            value, offset = _read_varint(data, offset)
+            yield field_tag >> 3, wire_type, value
             continue
         if wire_type == BYTES:
-            size, place = _read_varint(data, place)
+            size, offset = _read_varint(data, offset)
         elif wire_type in (FIXED32, FIXED64):
             size = 4 if wire_type == FIXED32 else 8
         else:
             raise ValueError(f"a field of wire type {wire_type}")
-        if size > len(data) - place:
-            raise ValueError(f"a field of {size} bytes in the last {len(data) - place}")
-        yield start >> 3, wire_type, data[place : place + size]
-        place += size
+        if size > len(data) - offset:
+            raise ValueError(f"a field of {size} bytes in the last {len(data) - offset}")
+        yield field_tag >> 3, wire_type, data[offset : offset + size]
+        offset += size
 
 
-def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
-    """Return the number that begins at a place, and the place after it."""
+def _read_varint(data: memoryview, offset: int) -> tuple[int, int]:
+    """Return the number at an offset, and the offset after it."""
     value = 0
     for shift in range(0, 64, 7):
-        if place >= len(data):
+        if offset >= len(data):
             raise ValueError("a number is cut off")
-        byte = data[place]
-        place += 1
+        byte = data[offset]
+        offset += 1
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return value & 0xFFFF_FFFF_FFFF_FFFF, place
+            return value & 0xFFFF_FFFF_FFFF_FFFF, offset
     raise ValueError("a number of more than 64 bits")
 
 
@@ -195,40 +195,45 @@ def file_set(
         enums: enumerations that a message has within itself, and their names from 0 on.
     """
     package, _, short = name.partition(".")
-    times = sized(2, _descriptor("seconds", 1, 3)) + sized(2, _descriptor("nanos", 2, 5))
-    stamp_path = "google/protobuf/timestamp.proto"
-    stamp = _file(stamp_path, "google.protobuf", [sized(1, b"Timestamp") + times])
+    timestamp = length_delimited(1, b"Timestamp")
+    for field_name, number, type_number in (("seconds", 1, 3), ("nanos", 2, 5)):
+        timestamp += length_delimited(2, _descriptor(field_name, number, type_number))
+    timestamp_path = "google/protobuf/timestamp.proto"
+    timestamp_file = _file(timestamp_path, "google.protobuf", [timestamp])
     bodies = []
-    for called, fields in messages.items():
-        body = sized(1, called.encode())
+    for message_name, fields in messages.items():
+        body = length_delimited(1, message_name.encode())
         for key, field in fields.items():
             descriptor = _descriptor(
-                key, field.number, TYPES[field.type], field.of, repeated=field.repeated
+                key, field.number, TYPES[field.type], field.type_name, repeated=field.repeated
             )
-            body += sized(2, descriptor)
-        for enum, names in enums.get(called, {}).items():
+            body += length_delimited(2, descriptor)
+        for enum, names in enums.get(message_name, {}).items():
             members = (
-                sized(2, sized(1, member.encode()) + tag(2, VARINT) + varint(number))
+                length_delimited(
+                    2, length_delimited(1, member.encode()) + tag(2, VARINT) + varint(number)
+                )
                 for number, member in enumerate(names)
             )
-            body += sized(4, sized(1, enum.encode()) + b"".join(members))
+            body += length_delimited(4, length_delimited(1, enum.encode()) + b"".join(members))
         bodies.append(body)
-    main = _file(f"{package}/{short}.proto", package, bodies, stamp_path)
-    return sized(1, stamp) + sized(1, main)
+    main = _file(f"{package}/{short}.proto", package, bodies, timestamp_path)
+    return length_delimited(1, timestamp_file) + length_delimited(1, main)
 
 
 def _descriptor(
-    name: str, number: int, kind: int, of: str = "", *, repeated: bool = False
+    name: str, number: int, type_number: int, type_name: str = "", *, repeated: bool = False
 ) -> bytes:
     """Return a FieldDescriptorProto."""
-    encoded = sized(1, name.encode()) + tag(3, VARINT) + varint(number)
-    encoded += tag(4, VARINT) + varint(3 if repeated else 1) + tag(5, VARINT) + varint(kind)
-    return encoded + (sized(6, of.encode()) if of else b"")
+    descriptor = length_delimited(1, name.encode()) + tag(3, VARINT) + varint(number)
+    descriptor += tag(4, VARINT) + varint(3 if repeated else 1)
+    descriptor += tag(5, VARINT) + varint(type_number)
+    return descriptor + (length_delimited(6, type_name.encode()) if type_name else b"")
 
 
-def _file(path: str, package: str, messages: list[bytes], needs: str = "") -> bytes:
+def _file(path: str, package: str, messages: list[bytes], imported_path: str = "") -> bytes:
     """Return a FileDescriptorProto."""
-    head = sized(1, path.encode()) + sized(2, package.encode())
-    needed = sized(3, needs.encode()) if needs else b""
-    made = b"".join(sized(4, message) for message in messages)
-    return head + needed + made + sized(12, b"proto3")
+    head = length_delimited(1, path.encode()) + length_delimited(2, package.encode())
+    imports = length_delimited(3, imported_path.encode()) if imported_path else b""
+    message_types = b"".join(length_delimited(4, message) for message in messages)
+    return head + imports + message_types + length_delimited(12, b"proto3")

@@ -50,26 +50,26 @@ async def record_frames(
     check_callable(on_start, "on_start", "recording")
     camera = check_text(camera, "camera", "recording", most=MAX_NAME_CHARACTERS)
     _ = source.format  # raises if the source is not open
-    kept = 0
+    recorded = 0
     refusals: list[SmartCamError] = []
 
-    def take(frame: Frame) -> bool:
-        nonlocal kept
+    def on_frame(frame: Frame) -> bool:
+        nonlocal recorded
         try:
-            if kept == count or not recorder.add_picture(frame, camera=camera):
+            if recorded == count or not recorder.add_picture(frame, camera=camera):
                 return False
         except SmartCamError as exc:  # must not reach the driver, which calls this
             refusals.append(exc)
             tap.close()
             return False
-        kept += 1
-        if kept == 1:
+        recorded += 1
+        if recorded == 1:
             on_start()
-        if kept == count:
+        if recorded == count:
             tap.close()
         return True
 
-    tap = FrameTap(source, take, lambda: not recorder.has_room)
+    tap = FrameTap(source, on_frame, lambda: not recorder.has_room)
     ended = asyncio.ensure_future(tap.ended())
     failed = asyncio.ensure_future(recorder.wait_failed())
     try:

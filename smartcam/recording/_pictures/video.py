@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames._inside import colour_properties, to_lossless_video
-from smartcam.recording._exclusive_files import opened
+from smartcam.recording._exclusive_files import open_exclusively
 from smartcam.recording._mcap.form import RecordedPicture
 
 if TYPE_CHECKING:
@@ -57,9 +57,9 @@ class VideoFile:
         self._overwrite = overwrite
         self._container: Any = None
         self._video: Any = None
-        self._form: tuple[str, int, int] | None = None
-        self._began = 0.0
-        self._last = -1
+        self._format_and_size: tuple[str, int, int] | None = None
+        self._start_time = 0.0
+        self._last_ticks = -1
 
     def check_picture(self, frame: Frame, camera: str) -> None:
         """Check that the video can hold a picture.
@@ -90,10 +90,10 @@ class VideoFile:
         if not isinstance(item, RecordedPicture):
             return
         frame = item.frame
-        form = frame.format.name, frame.width, frame.height
+        format_and_size = frame.format.name, frame.width, frame.height
         try:
-            if form != self._form:
-                self._begin(item, form)
+            if format_and_size != self._format_and_size:
+                self._begin_video(item, format_and_size)
             self._write(frame)
         except FrameFormatError as exc:
             raise ValueError(str(exc)) from exc
@@ -108,7 +108,7 @@ class VideoFile:
         if self._container is None:
             return
         container, self._container = self._container, None
-        if self._form is not None and self._form[0] != "MJPEG":
+        if self._format_and_size is not None and self._format_and_size[0] != "MJPEG":
             for packet in self._video.encode(None):
                 container.mux(packet)
         container.close()
@@ -123,28 +123,32 @@ class VideoFile:
         with contextlib.suppress(OSError):
             self._stream.close()
 
-    def _begin(self, picture: RecordedPicture, form: tuple[str, int, int]) -> None:
-        """Begin a video for pictures of a form, in a further file if there is one already."""
+    def _begin_video(self, picture: RecordedPicture, format_and_size: tuple[str, int, int]) -> None:
+        """Begin a video for pictures of a format and size, in a further file after the first."""
         frame = picture.frame
-        if self._form is not None:
+        if self._format_and_size is not None:
             self.finish()
             self._stream.close()
             first = self.paths[0]
             path = first.with_stem(f"{first.stem}-{len(self.paths) + 1}")
-            self._stream = opened(path, overwrite=self._overwrite)
+            self._stream = open_exclusively(path, overwrite=self._overwrite)
             self.paths.append(path)
-        self._form, self._began, self._last = form, frame.captured, -1
+        self._format_and_size, self._start_time, self._last_ticks = (
+            format_and_size,
+            frame.captured,
+            -1,
+        )
         self._container = load("av").open(
             self._stream, "w", format="matroska", options=dict(OPTIONS)
         )
         self._container.metadata["creation_time"] = picture.at.isoformat().replace("+00:00", "Z")
         self._container.metadata["title"] = picture.camera
-        jpeg = form[0] == "MJPEG"
-        video = self._video = self._container.add_stream("mjpeg" if jpeg else "ffv1", rate=1000)
+        is_jpeg = format_and_size[0] == "MJPEG"
+        video = self._video = self._container.add_stream("mjpeg" if is_jpeg else "ffv1", rate=1000)
         video.width, video.height = frame.width, frame.height
         video.time_base = TICK_DURATION
         video.codec_context.time_base = TICK_DURATION
-        if jpeg:
+        if is_jpeg:
             video.pix_fmt = "yuvj420p"  # nothing is encoded: the JPEGs have these values themselves
         else:
             video.pix_fmt = to_lossless_video(frame).format.name
@@ -154,9 +158,9 @@ class VideoFile:
             video.options = {"level": "3", "slicecrc": "1"}
 
     def _write(self, frame: Frame) -> None:
-        ticks = round((frame.captured - self._began) / float(TICK_DURATION))
-        ticks = self._last = max(ticks, self._last + 1)
-        if self._form is not None and self._form[0] == "MJPEG":
+        ticks = round((frame.captured - self._start_time) / float(TICK_DURATION))
+        ticks = self._last_ticks = max(ticks, self._last_ticks + 1)
+        if self._format_and_size is not None and self._format_and_size[0] == "MJPEG":
             packet = load("av").Packet(bytes(frame.data))
             packet.stream, packet.time_base = self._video, TICK_DURATION
             packet.pts = packet.dts = ticks

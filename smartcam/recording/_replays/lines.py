@@ -48,47 +48,47 @@ class LineAnswers:
     """The answers to a line, for each time that the client sent it.
 
     Attributes:
-        given: the answers.
+        answers: the answers.
         moments: the moment of each: 0 before the first trigger, 2n - 1 during the n-th one, 2n
             after its answer.
-        next: index of the next answer, if they are played in order.
-        asked: number of times that the line was sent since the moment began.
-        asked_at: moment that `asked` counts in.
+        next_index: index of the next answer, if they are played in order.
+        asked_count: number of times that the line was sent during ``asked_moment``.
+        asked_moment: moment that ``asked_count`` belongs to.
     """
 
-    given: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
+    answers: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
     moments: list[int] = field(default_factory=list[int])
-    next: int = 0
-    asked: int = 0
-    asked_at: int = -1
+    next_index: int = 0
+    asked_count: int = 0
+    asked_moment: int = -1
 
     @property
-    def left(self) -> int:
-        """Number of answers that are left, in this round."""
-        return max(0, len(self.given) - self.next)
+    def remaining(self) -> int:
+        """Number of remaining answers of this round."""
+        return max(0, len(self.answers) - self.next_index)
 
-    def take(self, *, loop: bool) -> list[TimedLine]:
+    def next_answer(self, *, loop: bool) -> list[TimedLine]:
         """Return the next answer; after the last one the last again, or with ``loop`` the first."""
-        if loop and self.next >= len(self.given):
-            self.next = 0
-        answer = self.given[min(self.next, len(self.given) - 1)]
-        self.next += 1
+        if loop and self.next_index >= len(self.answers):
+            self.next_index = 0
+        answer = self.answers[min(self.next_index, len(self.answers) - 1)]
+        self.next_index += 1
         return answer
 
-    def take_at(self, moment: int) -> list[TimedLine]:
+    def next_answer_at(self, moment: int) -> list[TimedLine]:
         """Return the next answer of a moment; after its last one the last again.
 
         Without an answer at the moment, use the nearest moment of the same kind, earlier ones
         first: before and after triggers are one kind, during triggers is the other.
         """
-        if moment != self.asked_at:
-            self.asked, self.asked_at = 0, moment
+        if moment != self.asked_moment:
+            self.asked_count, self.asked_moment = 0, moment
         nearest = min(
             self.moments, key=lambda at: ((at - moment) % 2, at > moment, abs(at - moment))
         )
-        of_moment = [place for place, at in enumerate(self.moments) if at == nearest]
-        answer = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
-        self.asked += 1
+        of_moment = [index for index, at in enumerate(self.moments) if at == nearest]
+        answer = self.answers[of_moment[min(self.asked_count, len(of_moment) - 1)]]
+        self.asked_count += 1
         return answer
 
 
@@ -99,7 +99,8 @@ class LinesPlan:
     Attributes:
         greeting: bytes sent before the first line.
         answers: answers to each line, by the line without its end.
-        secrets: answers to lines that were not recorded, such as passwords, by place in a session.
+        secrets: answers to lines that were not recorded, such as passwords, by the line's index in
+            its session.
         triggers: number of triggers that were recorded.
     """
 
@@ -119,33 +120,31 @@ def eight_bits(picture: Frame) -> NDArray[np.uint8]:
 
 @dataclass(slots=True)
 class _AskedLine:
-    """A line of the recorded client: its answer, and its begin and end in the recording.
-
-    A line that was not recorded, such as a password, is identified by its place in the session.
-    """
+    """A line of the recorded client, and its answer."""
 
     at: float
+    # the line; if it was not recorded, as a password is not: its index in the session
     line: bytes | int = 0
-    begin: int = 0
-    end: int | None = None
+    item_index: int = 0  # index of the line's item in the recording
+    answer_index: int | None = None  # index of the item with the end of the answer
     pieces: list[TimedLine] = field(default_factory=list[TimedLine])
 
 
 def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
-    """Find the answer to each line: bytes after it, or bytes that name it as their request.
+    """Find the answer to each line: the bytes after it, or the bytes with its key.
 
     Raises:
         RecordingError: the recording is more than :data:`MAX_REPLAY_BYTES`.
     """
     plan = LinesPlan()
-    now, place, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0
-    known: dict[str, _AskedLine] = {}  # lines by the key that identifies their answers
+    current, line_index, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0
+    by_key: dict[str, _AskedLine] = {}  # lines by the key that identifies their answers
     lines: list[_AskedLine] = []
-    for number, item in enumerate(items):
+    for item_index, item in enumerate(items):
         if isinstance(item, Disconnected):
-            _forget_silence(lines)
-            now, place = _AskedLine(item.at.timestamp()), 0
-            known.clear()
+            _drop_unanswered(lines)
+            current, line_index = _AskedLine(item.at.timestamp()), 0
+            by_key.clear()
         if not isinstance(item, TraceEntry) or item.direction == "!":
             continue
         at, data = item.at.timestamp(), bytes.fromhex(item.hex)
@@ -155,28 +154,28 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
                 f"recording: {size} bytes of lines, expected {MAX_REPLAY_BYTES} at most"
             )
         if item.direction == "<":
-            answered = known.get(codec.answer_key(data), now)
+            answered = by_key.get(codec.answer_key(data), current)
             answered.at = answered.at or at  # a greeting answers no line
-            answered.end = number
+            answered.answer_index = item_index
             answered.pieces.append(TimedLine(max(0.0, at - answered.at), data))
             continue
-        now = _AskedLine(at, bare(codec, data) if data else place, number)
-        known[codec.request_key(data)] = now
-        lines.append(now)
-        place += 1
-    _forget_silence(lines)
-    _arrange(plan, lines, codec)
+        current = _AskedLine(at, line_text(codec, data) if data else line_index, item_index)
+        by_key[codec.request_key(data)] = current
+        lines.append(current)
+        line_index += 1
+    _drop_unanswered(lines)
+    _add_answers(plan, lines, codec)
     return plan
 
 
-def _forget_silence(lines: list[_AskedLine]) -> None:
+def _drop_unanswered(lines: list[_AskedLine]) -> None:
     """Leave out the last line of a link that ended before its answer, which is unknown."""
     if lines and not lines[-1].pieces:
         lines.pop()
 
 
-def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
-    """Add the answer of each line to a plan."""
+def _add_answers(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
+    """Add the answers of lines to a plan."""
     triggers = [
         asked for asked in lines if isinstance(asked.line, bytes) and is_trigger(codec, asked.line)
     ]
@@ -187,15 +186,17 @@ def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None
             if isinstance(asked.line, bytes)
             else plan.secrets.setdefault(asked.line, LineAnswers())
         )
-        answers.given.append(asked.pieces)
-        answers.moments.append(_moment(asked.begin, triggers))
+        answers.answers.append(asked.pieces)
+        answers.moments.append(_moment(asked.item_index, triggers))
 
 
-def _moment(place: int, triggers: list[_AskedLine]) -> int:
-    """Return the moment of a place in a recording, see :class:`LineAnswers`."""
-    before = bisect_left(triggers, place, key=lambda trigger: trigger.begin)
-    end = triggers[before - 1].end if before else None
-    return 2 * before - (before > 0 and (end is None or end > place))
+def _moment(item_index: int, triggers: list[_AskedLine]) -> int:
+    """Return the moment of an item of a recording, see :class:`LineAnswers`."""
+    triggers_before = bisect_left(triggers, item_index, key=lambda trigger: trigger.item_index)
+    if not triggers_before:
+        return 0
+    answered_at = triggers[triggers_before - 1].answer_index
+    return 2 * triggers_before - (answered_at is None or answered_at > item_index)
 
 
 def is_trigger(codec: LineCodec, line: bytes) -> bool:
@@ -204,7 +205,7 @@ def is_trigger(codec: LineCodec, line: bytes) -> bool:
     return codec.message_type(m.Sender.CLIENT, row) is m.Trigger
 
 
-def bare(codec: LineCodec, data: bytes) -> bytes:
+def line_text(codec: LineCodec, data: bytes) -> bytes:
     """Return a client's line without its end, and without parts that differ each time."""
     return codec.text(data).encode(codec.encoding, "replace")
 
@@ -214,7 +215,7 @@ class ReplayedLines(LineCamera):
 
     def __init__(
         self,
-        kind: type[LineCamera],
+        camera_class: type[LineCamera],
         recording: Recording,
         *,
         camera: str | None = None,
@@ -223,47 +224,47 @@ class ReplayedLines(LineCamera):
         on_over: Callable[[], None] | None = None,
         **options: Any,
     ) -> None:
-        known = recording.camera(camera)
-        self._kind = kind
+        recorded = recording.camera(camera)
+        self._camera_class = camera_class
         self.also_hears: tuple[LineRow, ...] = (
-            kind.also_hears if issubclass(kind, TicketedCamera) else ()
+            camera_class.also_hears if issubclass(camera_class, TicketedCamera) else ()
         )
-        self._address = parse_address(known.url)
-        self.protocol: Protocol = load_protocol(known.protocol)
-        self.max_links: int = kind.max_links
-        self.write_limit: int = kind.write_limit
-        super().__init__(**{"name": known.name, **options})
+        self._address = parse_address(recorded.url)
+        self.protocol: Protocol = load_protocol(recorded.protocol)
+        self.max_links: int = camera_class.max_links
+        self.write_limit: int = camera_class.write_limit
+        super().__init__(**{"name": recorded.name, **options})
         if recording.since is not None:
             raise ConfigurationError(
-                f"recording {recording.path}: camera {known.name!r} speaks in lines, which are "
-                "played from the begin, not from a time on"
+                f"recording {recording.path}: camera {recorded.name!r} speaks in lines, which are "
+                "played from the beginning, not from a time on"
             )
-        self.plan: LinesPlan = plan_lines(recording.items(known.name), self.lines)
+        self.plan: LinesPlan = plan_lines(recording.items(recorded.name), self.lines)
         if not self.plan.answers:
             raise ConfigurationError(
-                f"recording {recording.path}: no line to camera {known.name!r} is in it"
+                f"recording {recording.path}: no line to camera {recorded.name!r} is in it"
             )
         self._speed, self._loop = speed, loop
-        spoken = next(iter(self.protocol.dialects.values()))
-        self._at_once = isinstance(spoken, LineDialect) and spoken.at_once
+        dialect = next(iter(self.protocol.dialects.values()))
+        self._at_once = isinstance(dialect, LineDialect) and dialect.at_once
         self._on_over = None if loop else on_over
-        self._places: dict[LineClient, int] = {}
-        self._triggered = 0  # triggers that were played
-        self._answered = 0  # the last trigger whose whole answer was sent
-        self._images = self._recorded_images(recording, known.name)
+        self._line_counts: dict[LineClient, int] = {}
+        self._trigger_count = 0  # number of triggers so far
+        self._last_answered = 0  # number of the last trigger whose whole answer was sent
+        self._images = self._recorded_images(recording, recorded.name)
 
     def make_codec(self) -> LineCodec:
         """Return the codec of the recorded camera."""
-        return self._kind.make_codec(self)
+        return self._camera_class.make_codec(self)
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
-        """Return a new client of the recorded camera's kind."""
-        if issubclass(self._kind, TicketedCamera):
+        """Return a new client, of the class that the recorded camera has."""
+        if issubclass(self._camera_class, TicketedCamera):
             return TicketedClient(self, link, server)
         return super().make_client(link, server)
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
-        """Note the unchanged line of a client."""
+        """Keep the key of a client's line: its answer goes to the line of the same key."""
         if isinstance(client, TicketedClient):
             client.ticket = self.lines.request_key(message.data)
 
@@ -281,13 +282,13 @@ class ReplayedLines(LineCamera):
             if isinstance(item, Result):
                 of_result[item.number] = triggers
             elif isinstance(item, TraceEntry) and item.direction == ">":
-                triggers += is_trigger(self.lines, bare(self.lines, bytes.fromhex(item.hex)))
+                triggers += is_trigger(self.lines, line_text(self.lines, bytes.fromhex(item.hex)))
         images: dict[int, bytes] = {}
         size = 0
         for result, picture, _ in recording.judged(camera):
             if picture is None:
                 continue
-            answer = self._kind.image_answer(eight_bits(picture))
+            answer = self._camera_class.image_answer(eight_bits(picture))
             if answer is None:
                 return {}
             images[of_result[result.number]] = answer
@@ -303,13 +304,13 @@ class ReplayedLines(LineCamera):
         row = self.lines.row_of(line)
         if self.lines.message_type(m.Sender.CLIENT, row) is not m.ReadImage:
             return None
-        return self._images.get(min(self._triggered, max(self._images, default=0)))
+        return self._images.get(min(self._trigger_count, max(self._images, default=0)))
 
     @property
     def remaining(self) -> int:
-        """Number of triggers that are left, in this round."""
+        """Number of remaining triggers of this round."""
         return sum(
-            answers.left
+            answers.remaining
             for line, answers in self.plan.answers.items()
             if is_trigger(self.lines, line)
         )
@@ -320,81 +321,82 @@ class ReplayedLines(LineCamera):
 
     def greet(self, client: LineClient) -> None:
         """Send a client the bytes that the recorded camera sent before any line."""
-        self._places[client] = 0
+        self._line_counts[client] = 0
         if 0 in self.plan.secrets:
             client.hide_next_line()
-        self._play(client, self.plan.greeting)
+        self._send_pieces(client, self.plan.greeting)
 
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line with its recorded answer."""
-        place = self._places[client]
-        self._places[client] += 1
+        index = self._line_counts[client]
+        self._line_counts[client] += 1
         if self._at_once:
             client = client.answer_later()
         data = line.encode(self.lines.encoding, "replace")
-        answers = self.plan.secrets.get(place) or self.plan.answers.get(data)
+        answers = self.plan.secrets.get(index) or self.plan.answers.get(data)
         if answers is None and (image := self._image_for(line)) is not None:
-            self._play(client, [TimedLine(0.0, image)], client.end_line)
+            self._send_pieces(client, [TimedLine(0.0, image)], client.end_line)
             return
         if answers is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
         triggers = is_trigger(self.lines, data)
-        self._triggered += triggers
-        if triggers and not answers.left and not self._loop:
+        self._trigger_count += triggers
+        if triggers and not answers.remaining and not self._loop:
             client.answer(None)
             return
-        if place + 1 in self.plan.secrets:
+        if index + 1 in self.plan.secrets:
             client.hide_next_line()
-        pieces = self._take(data, answers)
-        self._play(client, pieces, self._ended(client, trigger=triggers and bool(pieces)))
+        pieces = self._answer_for(data, answers)
+        on_sent = self._on_answer_sent(client, is_trigger=triggers and bool(pieces))
+        self._send_pieces(client, pieces, on_sent)
         if triggers and self._on_over is not None and not self.remaining:
             on_over, self._on_over = self._on_over, None
             on_over()
 
-    def _take(self, line: bytes, answers: LineAnswers) -> list[TimedLine]:
-        """Return the recorded pieces that answer a line now."""
+    def _answer_for(self, line: bytes, answers: LineAnswers) -> list[TimedLine]:
+        """Return the recorded pieces that answer a line now, one of ``answers``."""
         if (
             is_trigger(self.lines, line)
             or not self.plan.triggers
             or answers is not self.plan.answers.get(line)
         ):
-            return answers.take(loop=self._loop)
-        return answers.take_at(self._moment())
+            return answers.next_answer(loop=self._loop)
+        return answers.next_answer_at(self._moment())
 
     def _moment(self) -> int:
         """Return the moment of the recording that is played, see :class:`LineAnswers`."""
-        number = self._triggered
+        number = self._trigger_count
         if self._loop and number:
             number = (number - 1) % self.plan.triggers + 1
-        return 2 * number - (self._answered < self._triggered)
+        return 2 * number - (self._last_answered < self._trigger_count)
 
-    def _ended(self, client: LineClient, *, trigger: bool) -> Callable[[], None]:
+    def _on_answer_sent(self, client: LineClient, *, is_trigger: bool) -> Callable[[], None]:
         """Return the function to call when the whole answer to a line is sent."""
-        number = self._triggered
+        number = self._trigger_count
 
-        def end() -> None:
-            if trigger:
-                self._answered = max(self._answered, number)
+        def on_sent() -> None:
+            if is_trigger:
+                self._last_answered = max(self._last_answered, number)
             client.end_line()
 
-        return end
+        return on_sent
 
-    def _play(
-        self, client: LineClient, pieces: list[TimedLine], done: Callable[[], None] | None = None
+    def _send_pieces(
+        self, client: LineClient, pieces: list[TimedLine], on_sent: Callable[[], None] | None = None
     ) -> None:
-        """Send pieces, each at its time; then call ``end``."""
+        """Send pieces, each at its time; then call ``on_sent``."""
         if not pieces:
-            if done is not None:
-                done()
+            if on_sent is not None:
+                on_sent()
             return
         for index, piece in enumerate(pieces):
             last = index == len(pieces) - 1
 
             def say(data: bytes = piece.data, last: bool = last) -> None:
                 client.say_recorded(data)
-                if last and done is not None:
-                    done()
+                if last and on_sent is not None:
+                    on_sent()
 
             self.after(piece.seconds / self._speed, say)
 
@@ -402,5 +404,5 @@ class ReplayedLines(LineCamera):
         """Remove a closed link; a second call does nothing."""
         client = self._clients.get(link)
         if client is not None:
-            self._places.pop(client, None)
+            self._line_counts.pop(client, None)
         super().lost(link)

@@ -1,8 +1,8 @@
 """Show the pictures of recorded results, each when a replay sends its result again.
 
-A smart camera whose protocol has no pictures, such as a BVS camera, shows them separately, as the
-frames of the camera at an agent. A result is identified by its application and its bytes; if
-results with the same bytes cannot be distinguished, they have no picture.
+The protocol of BVS cameras has no pictures. So the agent that shares a replayed camera offers them
+as the camera's frames. A picture belongs to a result with the same application and bytes; several
+results with the same bytes get their pictures in order, or none if their order is not certain.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class ReplayedPictures:
 
     Attributes:
         name: name of the camera.
-        shown: picture of the last result that was sent; None before the first, or if it has no
-            picture.
-        first: first picture of the recording; None without one.
+        current_picture: picture of the last result that was sent; None before the first result, or
+            if that result has no picture.
+        first_picture: first picture of the recording; None without one.
     """
 
     def __init__(
@@ -58,12 +58,12 @@ class ReplayedPictures:
         speed: float,
     ) -> None:
         self.name = camera
-        self.shown: Frame | None = None
+        self.current_picture: Frame | None = None
         self.sinks: set[FrameSink] = set()
-        self._speed, self._began = speed, 0.0
-        self._times_given: collections.Counter[tuple[int, bytes]] = collections.Counter()
-        self._pictures = _by_application(recording, camera, applications)
-        self.first: Frame | None = next(
+        self._speed, self._inspection_start = speed, 0.0
+        self._send_counts: collections.Counter[tuple[int, bytes]] = collections.Counter()
+        self._pictures = _pictures_by_result(recording, camera, applications)
+        self.first_picture: Frame | None = next(
             (shown.frame for row in self._pictures.values() for shown in row if shown), None
         )
 
@@ -71,34 +71,38 @@ class ReplayedPictures:
         """Return a source of the pictures, not open."""
         return FrameSource(_ResultPictures(self), timeout=None, stall=None, linger=2.0)
 
-    def begins(self) -> None:
-        """Note the beginning of an inspection, whose picture is exposed from now on."""
-        self._began = time.monotonic()
+    def start_inspection(self) -> None:
+        """Start an inspection now; its picture is not exposed earlier."""
+        self._inspection_start = time.monotonic()
 
-    def given(self, application: int, data: bytes) -> None:
-        """Show the picture of the result that is being sent."""
+    def show_picture_of(self, application: int, data: bytes) -> None:
+        """Show the picture of a result, which is being sent."""
         key = application, data
         pictures = self._pictures.get(key)
         chosen = None
         if pictures:
-            chosen = pictures[self._times_given[key] % len(pictures)]
-            self._times_given[key] += 1
+            chosen = pictures[self._send_counts[key] % len(pictures)]
+            self._send_counts[key] += 1
         if chosen is None:
-            self.shown = None
+            self.current_picture = None
             return
         frame, seconds = chosen
         now = time.monotonic()
-        captured = min(now, max(self._began, now - seconds / self._speed))
-        duration = min(frame.duration / self._speed, captured - self._began)
-        self.shown = changed(frame, captured=captured, duration=duration)
+        captured = min(now, max(self._inspection_start, now - seconds / self._speed))
+        duration = min(frame.duration / self._speed, captured - self._inspection_start)
+        self.current_picture = changed(frame, captured=captured, duration=duration)
         for sink in tuple(self.sinks):
-            sink.frame(self.shown)
+            sink.frame(self.current_picture)
 
 
-def _by_application(
+def _pictures_by_result(
     recording: Recording, camera: str, applications: Mapping[int, ApplicationRuns]
 ) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
-    """Return the pictures of results with the same bytes, if their order is certain."""
+    """Return the pictures of each result, by its application and bytes.
+
+    Several results with the same bytes have a list, in the order in which the replay sends them;
+    they are left out if that order is not certain.
+    """
     pictures: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
     size = 0
     for result, picture, _ in recording.judged(camera):
@@ -110,21 +114,27 @@ def _by_application(
             row.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
     if size > MAX_REPLAY_BYTES:
         _log.warning(
-            "%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
+            "%s: pictures after the first %d bytes are not shown", camera, MAX_REPLAY_BYTES
         )
-    counts = _in_one_order(applications)
+    counts = _counts_in_certain_order(applications)
     return {key: row for key, row in pictures.items() if counts.get(key) == len(row)}
 
 
-def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int, bytes], int]:
-    """Return the numbers of containers with the same bytes, for those with a certain order.
+def _counts_in_certain_order(
+    applications: Mapping[int, ApplicationRuns],
+) -> dict[tuple[int, bytes], int]:
+    """Return the number of times that each container is sent, if their order is certain.
 
-    Containers of triggers and those without a trigger are replayed in two separate orders.
+    Containers of triggers, and containers without a trigger, are replayed separately. So if a
+    container is among both, it is not known which of the two comes first.
     """
     triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
     untriggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
-    for number, takes in applications.items():
-        for count, runs in ((triggered, takes.triggered), (untriggered, takes.untriggered)):
+    for number, application in applications.items():
+        for count, runs in (
+            (triggered, application.triggered),
+            (untriggered, application.untriggered),
+        ):
             count.update((number, data) for run in runs for data in run.containers)
     both = triggered.keys() & untriggered.keys()
     return {
@@ -135,7 +145,7 @@ def _in_one_order(applications: Mapping[int, ApplicationRuns]) -> dict[tuple[int
 class _ResultPictures(FrameDriver):
     """Delivers the picture of each result that a replay sends, beginning with the last one."""
 
-    times_frames: ClassVar[bool] = True
+    times_frames: ClassVar[bool] = True  # the frames already have their times of capture
 
     def __init__(self, pictures: ReplayedPictures) -> None:
         super().__init__(FrameAddress.parse("replayed://"))
@@ -153,7 +163,7 @@ class _ResultPictures(FrameDriver):
         Raises:
             FrameSourceError: there is no picture.
         """
-        first = self._pictures.first
+        first = self._pictures.first_picture
         if first is None:
             raise FrameSourceError(f"{self.name}: no result has a picture", source=self.name)
         return StreamFormat(first.format, first.width, first.height)
@@ -162,8 +172,8 @@ class _ResultPictures(FrameDriver):
         """Deliver the picture of the last result, and the pictures of the next results."""
         self._sink = sink
         self._pictures.sinks.add(sink)
-        if self._pictures.shown is not None:
-            sink.frame(self._pictures.shown)
+        if self._pictures.current_picture is not None:
+            sink.frame(self._pictures.current_picture)
 
     async def stop(self) -> None:
         """Stop delivering."""

@@ -50,7 +50,7 @@ MAX_SPEED = 1000.0
 """Largest factor of the speed; beyond it the timers' millisecond is too coarse."""
 
 MIN_INSPECTION_TIME = 1e-6
-"""Least seconds of a replayed inspection, whose take is chosen after its beginning."""
+"""Least seconds of a replayed inspection: its recorded run is chosen after it has begun."""
 
 FREE_RUN_RATE = 0.0001
 """Rate of a free-running application, per second; the replay itself sends its containers."""
@@ -65,34 +65,34 @@ class _PendingRuns:
 
     _runs: list[RecordedRun]
     _loop: bool
-    _next: int = 0
+    _next_index: int = 0
 
     @property
-    def head(self) -> RecordedRun | None:
-        """The next take; None after the last one."""
-        return self._runs[self._next] if self._next < len(self._runs) else None
+    def next_run(self) -> RecordedRun | None:
+        """The next run; None after the last one."""
+        return self._runs[self._next_index] if self._next_index < len(self._runs) else None
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Number of remaining runs of this round."""
-        return len(self._runs) - self._next
+        return len(self._runs) - self._next_index
 
     def pop(self) -> RecordedRun | None:
-        """Remove and return the next take."""
-        head = self.head
-        self._next += head is not None
-        if self._loop and self._next >= len(self._runs):
-            self._next = 0
-        return head
+        """Remove and return the next run."""
+        run = self.next_run
+        self._next_index += run is not None
+        if self._loop and self._next_index >= len(self._runs):
+            self._next_index = 0
+        return run
 
 
-class _Numbers(NamedTuple):
-    """The place of the sequence number in a container."""
+class _SequenceField(NamedTuple):
+    """The field of containers that has the sequence number."""
 
     field: Field  # field of the layout
     offset: int  # offset of its first byte
 
-    def put(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
+    def replace(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
         """Return a container with another number; unchanged if it has no number."""
         end = self.offset + self.field.size
         if len(data) < end:
@@ -105,30 +105,32 @@ class _Numbers(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Track:
+class _ApplicationTrack:
     """The parts of a replay that belong to one application."""
 
-    waits: bool  # whether the camera waits for triggers
-    triggered: _PendingRuns  # takes for triggers
+    waits_for_triggers: bool
+    triggered: _PendingRuns  # runs for triggers
     untriggered: _PendingRuns  # runs without a trigger
-    current: RecordedRun | None = None  # the take of the running inspection
+    current: RecordedRun | None = None  # run of the running inspection
     # further containers to be sent
     pending: list[bytes] = field(default_factory=list[bytes])
-    # place of the client's numbers in containers; None: containers keep their own numbers
-    numbers: _Numbers | None = None
-    # function that is called with each recorded container when it is sent
-    on_picture: Callable[[bytes], None] = lambda _: None
+    # field that gets the client's numbers; None: containers keep their own numbers
+    sequence_field: _SequenceField | None = None
+    # function that is called with each recorded container when it is to be sent
+    on_container: Callable[[bytes], None] = lambda _: None
 
-    def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
-        """End the inspection: return its container; None if it sends nothing."""
-        take, self.current = self.current, None
-        if take is None or not take.containers:
+    def end_inspection(self, number: int, byte_order: ByteOrder) -> bytes | None:
+        """End the inspection and return its container; None if it sends nothing."""
+        run, self.current = self.current, None
+        if run is None or not run.containers:
             return None
-        containers = take.containers
+        containers = run.containers
         for data in containers:
-            self.on_picture(data)
-        if self.numbers is not None:
-            containers = [self.numbers.put(data, number, byte_order) for data in containers]
+            self.on_container(data)
+        if self.sequence_field is not None:
+            containers = [
+                self.sequence_field.replace(data, number, byte_order) for data in containers
+            ]
         first, *self.pending = containers
         return first
 
@@ -136,10 +138,10 @@ class _Track:
 class _PlayedApplication(Application):
     """An application that sends the containers of a track."""
 
-    _track: _Track | None = PrivateAttr(default=None)
+    _track: _ApplicationTrack | None = PrivateAttr(default=None)
 
-    def play(self, track: _Track) -> _PlayedApplication:
-        """Use the containers of ``track``."""
+    def with_track(self, track: _ApplicationTrack) -> _PlayedApplication:
+        """Set the track whose containers are sent; return this application."""
         self._track = track
         return self
 
@@ -154,7 +156,7 @@ class _PlayedApplication(Application):
         byte_order: ByteOrder = "little",
     ) -> bytes | None:
         """Return the track's next container."""
-        return None if self._track is None else self._track.give(number, byte_order)
+        return None if self._track is None else self._track.end_inspection(number, byte_order)
 
 
 class ReplayedCamera(EmulatedCamera):
@@ -168,7 +170,7 @@ class ReplayedCamera(EmulatedCamera):
         recording: recording to replay.
         camera: name of the camera in it; default the only one.
         speed: factor by which to replay faster than recorded, 0.001 to 1000.
-        loop: whether to begin again at the end, separately for each application's takes.
+        loop: whether to begin again at the end, separately for each application's runs.
         host: address to listen on.
         port: port to listen on, 0 for a free one.
         transport: default the recorded one.
@@ -212,7 +214,7 @@ class ReplayedCamera(EmulatedCamera):
         self._loop = loop
         self._on_over = None if loop else on_over
         self._tracks = {
-            number: _Track(
+            number: _ApplicationTrack(
                 runs.waits,
                 _PendingRuns(runs.triggered, loop),
                 _PendingRuns(runs.untriggered, loop),
@@ -229,7 +231,7 @@ class ReplayedCamera(EmulatedCamera):
             recorded = dict.fromkeys(self.plan.quirks, True)
         super().__init__(
             [
-                _application(runs, speed).play(self._tracks[number])
+                _application(runs, speed).with_track(self._tracks[number])
                 for number, runs in self.plan.applications.items()
             ],
             builtins=False,
@@ -243,20 +245,22 @@ class ReplayedCamera(EmulatedCamera):
             active=self.plan.active,
             running=self.plan.running,
         )
-        self._numbers = _numbers(recording.camera(camera).interpret_as)
+        self._sequence_field = _sequence_field(recording.camera(camera).interpret_as)
         self.device.set_endian(self.plan.endian)
         self._set_conditions(self.plan.conditions)
-        self._armed: RecordedRun | None = None  # the take before which triggers will be dropped
-        self._ready: int | None = None  # the application that may send without a trigger now
-        self._reference = 0.0  # time from which the next untriggered take is counted
-        self._alarm: TimerHandle | None = None
-        self._due = False  # whether an untriggered take should begin as soon as possible
-        self._round: float | None = None  # time of the start of this round of conditions
-        self._changed = 0  # number of changes of conditions in this round
-        self._change_alarm: TimerHandle | None = None
+        # run before which the device drops triggers
+        self._armed_run: RecordedRun | None = None
+        # application that may send without a trigger now
+        self._free_application: int | None = None
+        self._gap_start = 0.0  # time from which the gap of the next untriggered run is counted
+        self._run_timer: TimerHandle | None = None  # timer of the next untriggered run
+        self._is_run_due = False  # whether an untriggered run should begin as soon as possible
+        self._round_start: float | None = None  # time at which this round of changes began
+        self._change_count = 0  # number of changes of conditions in this round so far
+        self._change_timer: TimerHandle | None = None  # timer of the next change of a condition
         self._pictures: ReplayedPictures | None = None
 
-    def _show_pictures(self, recording: Recording, camera: str) -> ReplayedPictures | None:
+    def _prepare_pictures(self, recording: Recording, camera: str) -> ReplayedPictures | None:
         """Return the recorded pictures, each shown with its result; None without pictures.
 
         Args:
@@ -268,16 +272,19 @@ class ReplayedCamera(EmulatedCamera):
         with from_part("frames", "pictures need"):
             from smartcam.recording._replays.pictures import ReplayedPictures
 
-        shown = ReplayedPictures(recording, camera, self.plan.applications, self.speed)
+        pictures = ReplayedPictures(recording, camera, self.plan.applications, self.speed)
         for number, track in self._tracks.items():
-            track.on_picture = partial(shown.given, number)
-        self._pictures = None if shown.first is None else shown
+            track.on_container = partial(pictures.show_picture_of, number)
+        self._pictures = None if pictures.first_picture is None else pictures
         return self._pictures
 
     @property
     def remaining(self) -> int:
-        """Number of inspections that are left, in this round."""
-        return sum(track.triggered.left + track.untriggered.left for track in self._tracks.values())
+        """Number of remaining inspections of this round."""
+        return sum(
+            track.triggered.remaining + track.untriggered.remaining
+            for track in self._tracks.values()
+        )
 
     async def stop(self) -> None:
         """Close the port and every connection; the replay pauses. Does nothing if stopped.
@@ -285,61 +292,61 @@ class ReplayedCamera(EmulatedCamera):
         Cancellation: everything is still closed.
         """
         self._pause()
-        if self._change_alarm is not None:
-            self._change_alarm.cancel()
-            self._change_alarm = None
+        if self._change_timer is not None:
+            self._change_timer.cancel()
+            self._change_timer = None
         await super().stop()
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """Handle a message of a link, and a sequence number that the client sets."""
+        """Handle a message of a link; once it sets a sequence number, containers get the number."""
         if isinstance(message, m.SetSequenceNumber):
             for track in self._tracks.values():
-                track.numbers = self._numbers
+                track.sequence_field = self._sequence_field
         super().received(link, message)
 
     # ------------------------------------------------------------------ after each step
 
     def _end_step(self) -> None:
         if self._started:
-            self._play()
+            self._follow_device()
         super()._end_step()
 
-    def _play(self) -> None:
-        """Follow the device's state with the replay."""
-        if self._change_alarm is None and self.has_session:
-            self._arm_change()
+    def _follow_device(self) -> None:
+        """Do what the recording does next in the device's present state."""
+        if self._change_timer is None and self.has_session:
+            self._set_change_timer()
         track = self._tracks[self.device.active_application]
         if not self.device.processing:
             track.current = None
-        elif track.waits and track.current is None:
-            self._begin(track, track.triggered.pop())
+        elif track.waits_for_triggers and track.current is None:
+            self._start_inspection(track, track.triggered.pop())
         if track.pending:
             pending, track.pending = track.pending, []
-            self._send(pending)
+            self._send_containers(pending)
         self._arm_drops(track)
-        self._play_unasked(track)
+        self._play_untriggered(track)
         if self._on_over is not None and not self.remaining and not self.device.processing:
             on_over, self._on_over = self._on_over, None
             on_over()
 
-    def _begin(self, track: _Track, take: RecordedRun | None) -> None:
-        """Begin an inspection with the recorded duration."""
-        track.current, self._armed = take, None
+    def _start_inspection(self, track: _ApplicationTrack, run: RecordedRun | None) -> None:
+        """Give the inspection that has begun the duration of its run; None: no run is left."""
+        track.current, self._armed_run = run, None
         if self._pictures is not None:
-            self._pictures.begins()
-        if take is not None:
+            self._pictures.start_inspection()
+        if run is not None:
             self.device.change_inspection(
-                late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME)
+                late=max(0.0, run.seconds / self.speed - MIN_INSPECTION_TIME)
             )
 
-    def _arm_drops(self, track: _Track) -> None:
+    def _arm_drops(self, track: _ApplicationTrack) -> None:
         """Make the device drop the next triggers if the recorded ones were dropped."""
-        head = track.triggered.head
-        if head is not None and head.drops and head is not self._armed:
-            self._armed = head
-            self.device.drop_triggers(head.drops)
+        run = track.triggered.next_run
+        if run is not None and run.drops and run is not self._armed_run:
+            self._armed_run = run
+            self.device.drop_triggers(run.drops)
 
-    def _send(self, containers: list[bytes]) -> None:
+    def _send_containers(self, containers: list[bytes]) -> None:
         """Send containers of the active application, after the device's own messages."""
         self._collect()
         number = self.device.active_application
@@ -348,79 +355,79 @@ class ReplayedCamera(EmulatedCamera):
         ]
         self._send_all(messages, fire_faults=True)
 
-    # ------------------------------------------------------------------ by itself
+    # ------------------------------------------------------------------ without a trigger
 
-    def _play_unasked(self, track: _Track) -> None:
-        """Send the take that is due, and set the timer for the next one."""
-        runs = self.has_session and self.device.running
-        ready = self.device.active_application if runs else None
-        if ready != self._ready:
+    def _play_untriggered(self, track: _ApplicationTrack) -> None:
+        """Begin the untriggered run that is due, and set the timer for the next one."""
+        is_free = self.has_session and self.device.running
+        application = self.device.active_application if is_free else None
+        if application != self._free_application:
             self._pause()
-            self._ready, self._reference = ready, self.clock.now
-        head = track.untriggered.head
-        if ready is None or head is None:
+            self._free_application, self._gap_start = application, self.clock.now
+        run = track.untriggered.next_run
+        if application is None or run is None:
             return
-        if self._due and not (track.waits and self.device.processing):
-            self._begin_untriggered(track, head)
-            head = track.untriggered.head
-        if head is not None and self._alarm is None and not self._due:
-            when = self._reference + head.gap / self.speed
-            self._alarm = self.clock.call_at(max(when, self.clock.now), self._wake_unasked)
+        if self._is_run_due and not (track.waits_for_triggers and self.device.processing):
+            self._begin_untriggered(track, run)
+            run = track.untriggered.next_run
+        if run is not None and self._run_timer is None and not self._is_run_due:
+            when = self._gap_start + run.gap / self.speed
+            self._run_timer = self.clock.call_at(max(when, self.clock.now), self._on_run_timer)
 
-    def _begin_untriggered(self, track: _Track, take: RecordedRun) -> None:
-        if not track.waits:
-            for data in take.containers:
-                track.on_picture(data)
-            self._send(take.containers)
+    def _begin_untriggered(self, track: _ApplicationTrack, run: RecordedRun) -> None:
+        if not track.waits_for_triggers:
+            for data in run.containers:
+                track.on_container(data)
+            self._send_containers(run.containers)
         elif self.device.trigger():
-            self._begin(track, take)
+            self._start_inspection(track, run)
         else:
             return  # the device accepts no trigger now; try later
-        self._due = False
-        self._reference += (take.gap + take.seconds) / self.speed
+        self._is_run_due = False
+        self._gap_start += (run.gap + run.seconds) / self.speed
         track.untriggered.pop()
 
-    def _wake_unasked(self) -> None:
-        self._alarm, self._due = None, True
+    def _on_run_timer(self) -> None:
+        self._run_timer, self._is_run_due = None, True
         with self.step():
             pass
 
     def _pause(self) -> None:
         """Hold back runs without a trigger."""
-        self._ready, self._due = None, False
-        if self._alarm is not None:
-            self._alarm.cancel()
-            self._alarm = None
+        self._free_application, self._is_run_due = None, False
+        if self._run_timer is not None:
+            self._run_timer.cancel()
+            self._run_timer = None
 
     # ------------------------------------------------------------------ conditions
 
-    def _arm_change(self) -> None:
+    def _set_change_timer(self) -> None:
         """Set the timer for the next change; the first session begins the first round."""
-        if self._round is None:
-            self._round = self.clock.now
+        if self._round_start is None:
+            self._round_start = self.clock.now
         changes = self.plan.changes
-        if self._changed == len(changes) and self._loop and changes:
-            self._changed = 0
-            self._round += self.plan.seconds / self.speed
-        if self._changed < len(changes):
-            when = self._round + changes[self._changed].at / self.speed
-            self._change_alarm = self.clock.call_at(when, self._wake_change)
+        if self._change_count == len(changes) and self._loop and changes:
+            self._change_count = 0
+            self._round_start += self.plan.seconds / self.speed
+        if self._change_count < len(changes):
+            when = self._round_start + changes[self._change_count].at / self.speed
+            self._change_timer = self.clock.call_at(when, self._on_change_timer)
 
-    def _wake_change(self) -> None:
-        self._change_alarm = None
-        change = self.plan.changes[self._changed]
-        self._changed += 1
+    def _on_change_timer(self) -> None:
+        self._change_timer = None
+        change = self.plan.changes[self._change_count]
+        self._change_count += 1
         with self.step():
             self.device.set_condition(change.condition, change.on)
-            self._arm_change()
+            self._set_change_timer()
 
     def _set_conditions(self, conditions: Status) -> None:
         for condition in CONDITIONS:
             self.device.set_condition(condition, condition in conditions)
 
 
-def _numbers(interpret_as: str | None) -> _Numbers | None:
-    """Return the place of the sequence number; None if it is unknown, or there is none."""
+def _sequence_field(interpret_as: str | None) -> _SequenceField | None:
+    """Return the field of the sequence number; None if it is unknown, or there is none."""
     try:
         layout = None if interpret_as is None else resolve(interpret_as).layout
     except ConfigurationError:  # a plug-in that is not installed, or a mapping
@@ -430,7 +437,7 @@ def _numbers(interpret_as: str | None) -> _Numbers | None:
     offset = 0
     for part in (*layout.head, *layout.fields):
         if part.sequence:
-            return _Numbers(part, offset)
+            return _SequenceField(part, offset)
         offset += part.size
     return None
 
@@ -477,21 +484,21 @@ def replay(
     check_recording(recording, "replay")
     speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
     on_over = None if on_over is None else check_callable(on_over, "on_over", "replay")
-    known = recording.camera(camera)
-    if not known.url:
+    recorded = recording.camera(camera)
+    if not recorded.url:
         raise ConfigurationError(
-            f"recording {recording.path}: there was no session with camera {known.name!r}"
+            f"recording {recording.path}: there was no session with camera {recorded.name!r}"
         )
-    kind = EmulatedCamera if is_fleet(known.url) else emulated_class(known.protocol)
-    given: dict[str, Any] = {"camera": camera, "speed": speed, "loop": loop, "on_over": on_over}
-    if issubclass(kind, LineCamera):
+    camera_class = EmulatedCamera if is_fleet(recorded.url) else emulated_class(recorded.protocol)
+    common: dict[str, Any] = {"camera": camera, "speed": speed, "loop": loop, "on_over": on_over}
+    if issubclass(camera_class, LineCamera):
         check_options(LineCamera, options)
-        return ReplayedLines(kind, recording, **given, **options)
-    if issubclass(kind, EmulatedCamera):
-        return ReplayedCamera(recording, **given, **options)
+        return ReplayedLines(camera_class, recording, **common, **options)
+    if issubclass(camera_class, EmulatedCamera):
+        return ReplayedCamera(recording, **common, **options)
     raise ConfigurationError(
-        f"recording {recording.path}: cameras of {known.protocol} cannot be replayed; those that "
-        "speak in lines, and bvs, can"
+        f"recording {recording.path}: cameras of {recorded.protocol} cannot be replayed; those "
+        "that speak in lines, and bvs, can"
     )
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
 """Bits that an operator of the emulated camera can set; the others follow from its operation."""
 
-MAX_TIME_BEHIND_FIRST = 0.1
+MAX_TIME_AFTER_FIRST = 0.1
 """Seconds within which an inspection's further containers follow its first one, if the camera
 always reports that it waits for a trigger."""
 
@@ -57,8 +57,8 @@ class RecordedRun:
     # containers that the camera sent, in order; empty if the trigger had no result
     containers: list[bytes]
     seconds: float  # seconds from the run's beginning to its first container, else to its end
-    # seconds from the end of the earlier take, or from the start of the run, to this one; only
-    # for a take without a trigger
+    # seconds from the end of the run before, or from when the camera began to run, to this run;
+    # only for a run without a trigger
     gap: float = 0.0
     drops: int = 0  # triggers that the camera dropped before this run
 
@@ -108,55 +108,57 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
         ConfigurationError: there is no such camera, it had no session, or it cannot be emulated.
         RecordingError: its containers are more than :data:`MAX_REPLAY_BYTES`.
     """
-    known = recording.camera(camera)
-    dialect, transport = _dialect_of(recording, known)
-    items = recording.all_items(known.name)
-    if is_fleet(known.url) or known.facts.get("frames") == "no":
-        steps = _steps_without_frames(items, known.facts.get("endian", "0"))
-        free = _free_running(steps)
-        steps = _settled(steps, free)
+    recorded = recording.camera(camera)
+    dialect, transport = _dialect_of(recording, recorded)
+    items = recording.all_items(recorded.name)
+    if is_fleet(recorded.url) or recorded.facts.get("frames") == "no":
+        steps = _steps_without_frames(items, recorded.facts.get("endian", "0"))
+        free_running = _free_running(steps)
+        steps = _without_single_statuses(steps, free_running)
     else:
-        steps = list(_steps(items, dialect))
-        free = _free_running(steps)
+        steps = list(_steps_of_frames(items, dialect))
+        free_running = _free_running(steps)
     if recording.since is not None:
-        steps = _since(steps, recording.since.timestamp())
-    maker = _ScheduleMaker(free)
+        steps = _steps_since(steps, recording.since.timestamp())
+    maker = _ScheduleMaker(free_running)
     for step in steps:
-        maker.take(step)
+        maker.add_step(step)
     maker.finish()
-    if maker.began is None:
+    if maker.session_start is None:
         raise ConfigurationError(
-            f"recording {recording.path}: no answer of camera {known.name!r} is in it"
+            f"recording {recording.path}: no answer of camera {recorded.name!r} is in it"
         )
-    lists = _fitting(recording, maker.lists, dialect)
+    applications = _emulatable(recording, maker.applications, dialect)
     return ReplayPlan(
         dialect=dialect.name,
         quirks=dialect.quirks,
         transport=transport,
-        applications=lists,
-        active=maker.first if maker.first is not None else next(iter(lists)),
-        running=maker.first is not None or maker.ran_at_first,
+        applications=applications,
+        active=maker.first_application
+        if maker.first_application is not None
+        else next(iter(applications)),
+        running=maker.first_application is not None or maker.ran_at_first,
         endian=maker.endian,
         conditions=maker.conditions,
         changes=tuple(maker.changes),
-        seconds=maker.now - maker.began,
+        seconds=maker.last_time - maker.session_start,
     )
 
 
-def _fitting(
-    recording: Recording, lists: Mapping[int, ApplicationRuns], dialect: FramedDialect
+def _emulatable(
+    recording: Recording, applications: Mapping[int, ApplicationRuns], dialect: FramedDialect
 ) -> dict[int, ApplicationRuns]:
     """Return the applications that can be emulated; others must have no containers."""
-    fitting: dict[int, ApplicationRuns] = {}
-    for number, runs in lists.items():
+    emulatable: dict[int, ApplicationRuns] = {}
+    for number, runs in applications.items():
         if number in dialect.application_ids and number >= 1:
-            fitting[number] = runs
+            emulatable[number] = runs
         elif runs.triggered or runs.untriggered:
             raise ConfigurationError(
                 f"recording {recording.path}: application id {number} cannot be emulated in "
                 f"dialect {dialect.name}"
             )
-    return fitting or {1: ApplicationRuns(1)}
+    return emulatable or {1: ApplicationRuns(1)}
 
 
 def _dialect_of(
@@ -168,14 +170,14 @@ def _dialect_of(
             f"recording {recording.path}: there was no session with camera {camera.name!r}"
         )
     if is_fleet(camera.url):
-        spoken = BVS.dialects.get(camera.dialect or HANDBOOK.name)
-        if spoken is None:
+        dialect = BVS.dialects.get(camera.dialect or HANDBOOK.name)
+        if dialect is None:
             raise ConfigurationError(
                 f"recording {recording.path}: camera {camera.name!r} of a fleet speaks dialect "
                 f"{camera.dialect}, expected one of bvs; no frames of it are recorded, which would "
                 "be played line by line"
             )
-        return spoken, "tcp"
+        return dialect, "tcp"
     address = parse_address(camera.url)
     if address.protocol != "bvs" or address.dialect is None:
         raise ConfigurationError(
@@ -214,7 +216,7 @@ class _ReplayStep(NamedTuple):
     recorded_at: float | None = None
 
 
-_PLAIN = {
+_SIMPLE_STEPS = {
     (">", "Trigger"): _StepKind.TRIGGER,
     (">", "Stop"): _StepKind.ABORT,
     (">", "Reboot"): _StepKind.ABORT,
@@ -223,7 +225,7 @@ _PLAIN = {
 _ANSWERS = {("<", "SwitchAnswer"): _StepKind.SWITCHED, ("<", "QueryAnswer"): _StepKind.NAMED}
 
 
-def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
+def _steps_since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
     """Return steps, where those before a time are replaced by the camera's state at that time."""
     single = {_StepKind.TRIGGER, _StepKind.CONTAINER, _StepKind.SWITCH}
     return [
@@ -265,7 +267,9 @@ class _GapSteps:
         return steps
 
 
-def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Iterator[_ReplayStep]:
+def _steps_of_frames(
+    items: Iterable[Item | RecordedState], dialect: FramedDialect
+) -> Iterator[_ReplayStep]:
     """Yield the steps among the items; their times never go back.
 
     Raises:
@@ -286,7 +290,7 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
             continue
         at = max(at, item.at.timestamp())
         try:
-            step = _step(at, item, dialect)
+            step = _step_of_frame(at, item, dialect)
         except (KeyError, TypeError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"recording: wrong fields of a {item.message}: {item.fields!r:.80}"
@@ -381,28 +385,30 @@ def _on_one_clock(steps: list[_ReplayStep]) -> list[_ReplayStep]:
     return fitted
 
 
-def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
+def _without_single_statuses(
+    steps: Iterable[_ReplayStep], free_running: set[int]
+) -> list[_ReplayStep]:
     """Return steps without statuses of single inspections, whose times are too coarse."""
-    settled: list[_ReplayStep] = []
+    adjusted: list[_ReplayStep] = []
     active: int | None = None
     for step in steps:
         if step.kind in {_StepKind.SWITCHED, _StepKind.NAMED, _StepKind.CONTAINER}:
             active = step.number
         if step.kind is _StepKind.STATUS:
             bits = step.bits & ~(Status.OVERTRIGGERED | Status.WAITING_FOR_TRIGGER)
-            if Status.RUNNING in bits and active not in free:
+            if Status.RUNNING in bits and active not in free_running:
                 bits |= Status.WAITING_FOR_TRIGGER
-            settled.append(step._replace(bits=bits))
+            adjusted.append(step._replace(bits=bits))
         else:
-            settled.append(step)
-    return settled
+            adjusted.append(step)
+    return adjusted
 
 
-def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
+def _step_of_frame(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
     """Return the step of a frame; None if it has none."""
     key, fields = (entry.direction, entry.message), entry.fields
-    if key in _PLAIN:
-        return _ReplayStep(at, _PLAIN[key])
+    if key in _SIMPLE_STEPS:
+        return _ReplayStep(at, _SIMPLE_STEPS[key])
     if key in _ANSWERS:
         done = dialect.code(int(fields.get("code", 0))).verdict is Verdict.DONE
         return _ReplayStep(at, _ANSWERS[key], int(fields["application"])) if done else None
@@ -421,7 +427,7 @@ def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep |
 
 def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
     """Return the applications that ran and never waited for a trigger."""
-    seen: dict[int, Status] = {}
+    bits_by_application: dict[int, Status] = {}
     active: int | None = None
     early = Status(0)  # bits of statuses before the application is known
     for step in steps:
@@ -431,14 +437,14 @@ def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
             elif active is None:
                 early |= step.bits
             else:
-                seen[active] = seen.get(active, Status(0)) | step.bits
+                bits_by_application[active] = bits_by_application.get(active, Status(0)) | step.bits
         elif step.kind in {_StepKind.SWITCHED, _StepKind.NAMED, _StepKind.CONTAINER}:
             active = step.number
-            seen[active] = seen.get(active, Status(0)) | early
+            bits_by_application[active] = bits_by_application.get(active, Status(0)) | early
             early = Status(0)
     return {
         number
-        for number, bits in seen.items()
+        for number, bits in bits_by_application.items()
         if Status.RUNNING in bits and Status.WAITING_FOR_TRIGGER not in bits
     }
 
@@ -446,44 +452,44 @@ def _free_running(steps: Iterable[_ReplayStep]) -> set[int]:
 class _ScheduleMaker:
     """Makes a plan from the steps of a recording."""
 
-    def __init__(self, free: set[int]) -> None:
-        self.lists: dict[int, ApplicationRuns] = {}  # runs so far, by application
-        # time at which the first session began, seconds; None before
-        self.began: float | None = None
-        self.now: float = 0.0  # time of the last step, seconds
-        self.first: int | None = None  # application of the first container; None before
+    def __init__(self, free_running: set[int]) -> None:
+        self.applications: dict[int, ApplicationRuns] = {}  # runs so far, by application
+        # time at which the first session began, seconds since 1970; None before
+        self.session_start: float | None = None
+        self.last_time: float = 0.0  # time of the last step, seconds since 1970
+        self.first_application: int | None = None  # application of the first container; None before
         self.ran_at_first: bool = False  # whether Running was set in the first status
         self.endian: int = 0  # byte order of the last status before the first container
         self.conditions: Status = Status(0)  # conditions of the first status
         self.changes: list[Change] = []  # changes of conditions so far
-        self._free = free  # applications that run free
+        self._free_running = free_running  # applications that run free
         self._active: int | None = None
-        self._status: Status | None = None  # last status in this session
-        self._last: Status | None = None  # last status of all sessions
+        self._session_status: Status | None = None  # last status in this session
+        self._last_status: Status | None = None  # last status of all sessions
         self._triggers: list[float] = []  # times of triggers without a container so far
-        self._drops = 0  # number of triggers dropped since the last take
+        self._drops = 0  # number of triggers dropped since the last run
         self._waits_from = self._waited_until = 0.0  # times at which Waiting for Trigger rose, fell
-        self._open: RecordedRun | None = None  # take whose inspection may send more containers
-        self._opened = 0.0  # time of the first container of that take
-        self._began_untriggered: float | None = None  # start of an inspection without a trigger
-        self._reference = 0.0  # time from which the next untriggered take is counted
+        self._open_run: RecordedRun | None = None  # run whose inspection may send more containers
+        self._open_run_at = 0.0  # time of the first container of that run
+        self._untriggered_start: float | None = None  # start of an inspection without a trigger
+        self._gap_start = 0.0  # time from which the gap of the next untriggered run is counted
         self._switching: tuple[float, int] | None = None
-        self._takers: Mapping[_StepKind, Callable[[_ReplayStep], None]] = {
+        self._handlers: Mapping[_StepKind, Callable[[_ReplayStep], None]] = {
             _StepKind.CONNECTED: self._on_connected,
             _StepKind.LOST: self._on_lost,
             _StepKind.STATUS: self._on_status,
             _StepKind.TRIGGER: self._on_trigger,
-            _StepKind.ABORT: lambda _: self._give_up(),
+            _StepKind.ABORT: lambda _: self._end_inspection(),
             _StepKind.SWITCH: self._on_switch,
             _StepKind.SWITCHED: self._on_switched,
-            _StepKind.NAMED: lambda step: self._name(step.number),
+            _StepKind.NAMED: lambda step: self._set_active(step.number),
             _StepKind.CONTAINER: self._on_container,
         }
 
-    def take(self, step: _ReplayStep) -> None:
+    def add_step(self, step: _ReplayStep) -> None:
         """Add the next step."""
-        self.now = step.at
-        self._takers[step.kind](step)
+        self.last_time = step.at
+        self._handlers[step.kind](step)
 
     def finish(self) -> None:
         """End the plan, without a trigger whose result was not recorded."""
@@ -492,130 +498,133 @@ class _ScheduleMaker:
     # ------------------------------------------------------------------ steps
 
     def _on_connected(self, _: _ReplayStep) -> None:
-        if self.began is None:
-            self.began = self._reference = self.now
-        self._status = None
+        if self.session_start is None:
+            self.session_start = self._gap_start = self.last_time
+        self._session_status = None
 
     def _on_lost(self, _: _ReplayStep) -> None:
         self._triggers.clear()  # their results were lost with the link
-        self._open = self._began_untriggered = self._switching = None
+        self._open_run = self._untriggered_start = self._switching = None
 
     def _on_status(self, step: _ReplayStep) -> None:
-        was, self._status = self._status, step.bits
-        risen = step.bits & ~was if was is not None else Status(0)
-        fallen = was & ~step.bits if was is not None else Status(0)
-        self._note_conditions(step.bits)
-        if self.first is None:
+        before, self._session_status = self._session_status, step.bits
+        risen = step.bits & ~before if before is not None else Status(0)
+        fallen = before & ~step.bits if before is not None else Status(0)
+        self._add_changes(step.bits)
+        if self.first_application is None:
             self.endian = step.number
         if Status.RUNNING in risen:
-            self._reference = self.now
+            self._gap_start = self.last_time
         if Status.WAITING_FOR_TRIGGER in fallen:
-            self._waited_until = self.now
+            self._waited_until = self.last_time
         if Status.OVERTRIGGERED in risen and self._triggers:
-            self._drop(step.bits)
+            self._count_drop(step.bits)
         if Status.SYSTEM_ERROR in risen or Status.RUNNING in fallen:
-            self._give_up()
+            self._end_inspection()
         if Status.WAITING_FOR_TRIGGER in fallen and not self._triggers:
-            self._began_untriggered = self.now
+            self._untriggered_start = self.last_time
         if Status.WAITING_FOR_TRIGGER in risen:
-            self._waits_from = self.now
-            self._open = None
+            self._waits_from = self.last_time
+            self._open_run = None
 
-    def _note_conditions(self, bits: Status) -> None:
-        before, self._last = self._last, bits
+    def _add_changes(self, bits: Status) -> None:
+        before, self._last_status = self._last_status, bits
         if before is None:
             self.conditions = bits & (Status.OVERHEAT | Status.SYSTEM_ERROR)
             self.ran_at_first = Status.RUNNING in bits
             return
         for condition in CONDITIONS:
             on = condition in bits
-            if (condition in before) != on and self.began is not None:
-                self.changes.append(Change(self.now - self.began, condition, on))
+            if (condition in before) != on and self.session_start is not None:
+                self.changes.append(Change(self.last_time - self.session_start, condition, on))
 
-    def _drop(self, bits: Status) -> None:
-        """Note that the camera dropped the last trigger."""
+    def _count_drop(self, bits: Status) -> None:
+        """Count the last trigger as dropped by the camera."""
         self._triggers.pop()
         if self._triggers:
             return  # a triggered inspection is under way: the emulated camera drops it by itself
         if Status.WAITING_FOR_TRIGGER in bits:
             self._drops += 1
-        elif self._began_untriggered is None:  # an untriggered inspection, which shows late
-            self._began_untriggered = self._waited_until
+        elif self._untriggered_start is None:  # an untriggered inspection, which shows late
+            self._untriggered_start = self._waited_until
 
     def _on_trigger(self, _: _ReplayStep) -> None:
-        self._open = None
-        if self._waits:
-            self._give_up()  # since the camera waits, the earlier inspection is over
-        self._triggers.append(self.now)
+        self._open_run = None
+        if self._waits_for_trigger:
+            self._end_inspection()  # since the camera waits, the earlier inspection is over
+        self._triggers.append(self.last_time)
 
     def _on_switch(self, step: _ReplayStep) -> None:
-        self._switching = (self.now, step.number)
+        self._switching = (self.last_time, step.number)
 
     def _on_switched(self, step: _ReplayStep) -> None:
-        self._give_up()
-        self._name(step.number)
+        self._end_inspection()
+        self._set_active(step.number)
         switching, self._switching = self._switching, None
         if switching is not None and switching[1] == step.number:
-            self._list(step.number).load_time = self.now - switching[0]
+            self._runs_of(step.number).load_time = self.last_time - switching[0]
 
     def _on_container(self, step: _ReplayStep) -> None:
-        if self.first is None:
-            self.first = step.number
-        self._name(step.number)
-        runs = self._list(step.number)
+        if self.first_application is None:
+            self.first_application = step.number
+        self._set_active(step.number)
+        runs = self._runs_of(step.number)
         if not runs.waits:
             self._triggers.clear()  # a free-running application ignores them
-            runs.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.now)))
+            runs.untriggered.append(RecordedRun([step.data], 0.0, gap=self._gap(self.last_time)))
         elif self._triggers:
-            began = self._triggers.pop(0)
-            self._open = RecordedRun([step.data], self.now - began, drops=self._drops)
+            start = self._triggers.pop(0)
+            self._open_run = RecordedRun([step.data], self.last_time - start, drops=self._drops)
             self._drops = 0
-            runs.triggered.append(self._open)
-        elif self._open is not None and not self._is_over():
-            self._open.containers.append(step.data)
+            runs.triggered.append(self._open_run)
+        elif self._open_run is not None and not self._is_inspection_over():
+            self._open_run.containers.append(step.data)
         else:
-            seen = self._began_untriggered is not None or not self._waits
-            began = self.now if self._began_untriggered is None else self._began_untriggered
-            take = RecordedRun([step.data], self.now - began, gap=self._gap(began))
-            runs.untriggered.append(take)
-            self._open = take if seen else None
-        if self._open is not None and len(self._open.containers) == 1:
-            self._opened = self.now
-        self._began_untriggered = None
+            start_seen = self._untriggered_start is not None or not self._waits_for_trigger
+            start = self.last_time if self._untriggered_start is None else self._untriggered_start
+            run = RecordedRun([step.data], self.last_time - start, gap=self._gap(start))
+            runs.untriggered.append(run)
+            self._open_run = run if start_seen else None
+        if self._open_run is not None and len(self._open_run.containers) == 1:
+            self._open_run_at = self.last_time
+        self._untriggered_start = None
 
     @property
-    def _waits(self) -> bool:
+    def _waits_for_trigger(self) -> bool:
         """True if the camera waits for a trigger, by its last status."""
-        return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
+        return (
+            self._session_status is not None and Status.WAITING_FOR_TRIGGER in self._session_status
+        )
 
-    def _is_over(self) -> bool:
+    def _is_inspection_over(self) -> bool:
         """Return True if the camera waits, and more results can no longer arrive."""
-        return self._waits and self.now - self._opened > MAX_TIME_BEHIND_FIRST
+        return self._waits_for_trigger and self.last_time - self._open_run_at > MAX_TIME_AFTER_FIRST
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ helper methods
 
-    def _gap(self, began: float) -> float:
-        gap = max(0.0, began - self._reference)
-        self._reference = self.now
+    def _gap(self, start: float) -> float:
+        """Return the gap before an untriggered run; the next gap is counted from now on."""
+        gap = max(0.0, start - self._gap_start)
+        self._gap_start = self.last_time
         return gap
 
-    def _give_up(self) -> None:
+    def _end_inspection(self) -> None:
         """End the running inspection, whose trigger has no result."""
-        if self._active is not None and self._list(self._active).waits:
-            for began in self._triggers:
-                ended = self._waits_from if self._waits_from > began else self.now
-                take = RecordedRun([], ended - began, drops=self._drops)
-                self._list(self._active).triggered.append(take)
+        if self._active is not None and self._runs_of(self._active).waits:
+            for start in self._triggers:
+                end = self._waits_from if self._waits_from > start else self.last_time
+                run = RecordedRun([], end - start, drops=self._drops)
+                self._runs_of(self._active).triggered.append(run)
                 self._drops = 0
         self._triggers.clear()
-        self._open = self._began_untriggered = None
+        self._open_run = self._untriggered_start = None
 
-    def _name(self, number: int) -> None:
+    def _set_active(self, number: int) -> None:
         if number != self._active:
             self._active = number
-            self._list(number)
+            self._runs_of(number)
 
-    def _list(self, number: int) -> ApplicationRuns:
-        return self.lists.setdefault(
-            number, ApplicationRuns(number, waits=number not in self._free)
+    def _runs_of(self, number: int) -> ApplicationRuns:
+        return self.applications.setdefault(
+            number, ApplicationRuns(number, waits=number not in self._free_running)
         )

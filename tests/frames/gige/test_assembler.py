@@ -107,7 +107,7 @@ def test_each_frame_is_whole_or_lost(
     assert stream.numbers == sorted(set(stream.numbers))
     if kept and not stream.inside.counts.restarts:
         begun = seen_id(kept[0][1], extended)
-        spanned = stream.inside._newest - (0 if begun <= MAX_OPEN_BLOCKS else begun - 1)
+        spanned = stream.inside._newest_number - (0 if begun <= MAX_OPEN_BLOCKS else begun - 1)
         assert len(stream.pictures) + stream.lost == spanned
     reported = sum(one.lost for one in stream.pictures) + stream.inside.take_lost()
     assert reported == stream.lost
@@ -122,7 +122,7 @@ def test_the_packets_of_one_frame_in_any_order(order: list[int], extended: bool)
     stream.feed(*(packets[at] for at in order), step=0.0001)
     assert stream.numbers == [9]
     assert stream.lost == 0
-    assert stream.pictures[0].arrived == START + 0.0001
+    assert stream.pictures[0].arrived_at == START + 0.0001
 
 
 @given(st.sets(st.integers(0, 6), min_size=1, max_size=6))
@@ -221,7 +221,7 @@ def test_leader_may_come_long_before_its_pixels() -> None:
     stream.wait(5)
     stream.feed(*packets[1:])
     assert stream.numbers == [1]
-    assert stream.pictures[0].arrived == START + 0.001
+    assert stream.pictures[0].arrived_at == START + 0.001
 
 
 @pytest.mark.parametrize("clock", [True, False])

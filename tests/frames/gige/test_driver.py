@@ -369,7 +369,7 @@ async def test_unsupported_settings_are_errors(
         ("packet_size=100", "576 to 16384"),
         ("resend=maybe", "on or off"),
         ("fps=0", "fps"),
-        ("serial=1", "none beside an address"),
+        ("serial=1", "none together with an address"),
         ("feature.=1", "unknown parameter"),
     ],
 )

@@ -42,14 +42,14 @@ def packet(payload: bytes | str, sequence: int, stamp: int = 0, last: bool = Fal
 
 
 def took(depacketizer: Depacketizer, *packets: RtpPacket) -> list[AccessUnit]:
-    return [made for one in packets for made in depacketizer.take(one)]
+    return [made for one in packets for made in depacketizer.add_packet(one)]
 
 
 def begun() -> Depacketizer:
     """Return a depacketizer after a whole frame: the next sequence number is 1."""
     made = Depacketizer(window=8)
-    first = made.take(packet(KEY, 0, 77, last=True))
-    assert [one.begins for one in first] == [True]
+    first = made.add_packet(packet(KEY, 0, 77, last=True))
+    assert [one.starts_stream for one in first] == [True]
     return made
 
 
@@ -171,7 +171,7 @@ def test_packet_after_a_marker_is_no_frame_of_its_own() -> None:
 
 
 def wary() -> Depacketizer:
-    return Depacketizer(window=8, wary=True)
+    return Depacketizer(window=8, verify_markers=True)
 
 
 def test_marker_ends_frames_only_after_it_proved_reliable() -> None:
@@ -184,9 +184,9 @@ def test_marker_ends_frames_only_after_it_proved_reliable() -> None:
 def test_marker_of_another_stream_has_to_prove_reliable_again() -> None:
     depacketizer = wary()
     took(depacketizer, *(packet(KEY, number, number, True) for number in range(4)))
-    assert depacketizer.proofs == 3
+    assert depacketizer.right_markers == 3
     assert took(depacketizer, packet(KEY, 9, 9, True)._replace(ssrc=2)) == []
-    assert depacketizer.proofs == 0
+    assert depacketizer.right_markers == 0
     took(depacketizer, packet(SLICE, 10, 9, True)._replace(ssrc=2))
     assert took(depacketizer, packet(KEY, 11, 10, True)._replace(ssrc=2))[0].data == annex_b(
         KEY, SLICE
@@ -213,8 +213,8 @@ def test_a_marker_on_parameters_ends_no_frame_whatever_their_timestamp() -> None
 
 def test_frame_with_an_unreliable_marker_ends_after_a_time() -> None:
     depacketizer = wary()
-    assert depacketizer.take(packet(KEY, 0, 7, last=True), 5.0) == []
-    assert (depacketizer.marked_at, depacketizer.tail()) == (5.0, None)
+    assert depacketizer.add_packet(packet(KEY, 0, 7, last=True), 5.0) == []
+    assert (depacketizer.marked_at, depacketizer.next_of_open_frame()) == (5.0, None)
     assert depacketizer.end_marked(5.0) == []
     (made,) = depacketizer.end_marked(5.1)
     assert (made.data, depacketizer.marked_at) == (annex_b(KEY), None)
@@ -235,8 +235,8 @@ def test_a_frame_whose_beginning_may_be_missing_is_damaged() -> None:
     after_loss = begun()
     made = took(after_loss, *(packet(SLICE, 2 + one, 9 + one, last=True) for one in range(9)))
     assert [one.timestamp for one in made] == [*range(10, 18)]
-    assert (made[0].lost, made[0].damaged) == (1, 1)
-    assert all((one.lost, one.damaged) == (0, 0) for one in made[1:])
+    assert (made[0].lost_packets, made[0].damaged_frames) == (1, 1)
+    assert all((one.lost_packets, one.damaged_frames) == (0, 0) for one in made[1:])
 
 
 def test_parameters_can_only_begin_a_frame() -> None:
@@ -244,33 +244,33 @@ def test_parameters_can_only_begin_a_frame() -> None:
     begins = (packet("78 0005 6742c01ea6 0004 68ce0fc8", 3, 9), packet(SLICE, 4, 9, last=True))
     assert took(depacketizer, *begins) == []
     (made,) = depacketizer.give_up(1.0)
-    assert (made.data, made.lost, made.damaged) == (annex_b(SPS, PPS, SLICE), 2, 0)
+    assert (made.data, made.lost_packets, made.damaged_frames) == (annex_b(SPS, PPS, SLICE), 2, 0)
 
 
 def test_waiting_depacketizer_reports_its_first_missing_packet() -> None:
     depacketizer = begun()
-    assert (depacketizer.missing(), depacketizer.waits_since()) == ([], None)
-    assert depacketizer.take(packet(SLICE, 4, 12, last=True), 5.0) == []
-    assert depacketizer.take(packet(SLICE, 2, 9, last=True), 6.0) == []
-    assert (depacketizer.missing(), depacketizer.waits_since()) == ([1, 3], 5.0)
+    assert (depacketizer.missing_sequences(), depacketizer.waiting_since()) == ([], None)
+    assert depacketizer.add_packet(packet(SLICE, 4, 12, last=True), 5.0) == []
+    assert depacketizer.add_packet(packet(SLICE, 2, 9, last=True), 6.0) == []
+    assert (depacketizer.missing_sequences(), depacketizer.waiting_since()) == ([1, 3], 5.0)
     assert depacketizer.give_up(5.0) == []
-    assert depacketizer.take(packet(SLICE, 1, 8, last=True), 7.0)[0].arrived == 7.0
-    assert depacketizer.missing() == [3]
+    assert depacketizer.add_packet(packet(SLICE, 1, 8, last=True), 7.0)[0].arrived_at == 7.0
+    assert depacketizer.missing_sequences() == [3]
     assert depacketizer.give_up(5.1) == []  # frame 4: its beginning may have been in packet 3
     assert (depacketizer.lost, depacketizer.damaged) == (1, 1)
-    assert depacketizer.take(packet(SLICE, 3, 10, last=True), 8.0) == []
+    assert depacketizer.add_packet(packet(SLICE, 3, 10, last=True), 8.0) == []
     assert depacketizer.duplicates == 1
 
 
 def test_incomplete_frame_reports_its_next_packet() -> None:
     depacketizer = begun()
-    assert depacketizer.tail() is None
+    assert depacketizer.next_of_open_frame() is None
     assert took(depacketizer, packet(PPS, 1, 9)) == []
-    assert depacketizer.tail() == 2
+    assert depacketizer.next_of_open_frame() == 2
     assert took(depacketizer, packet(SLICE, 3, 9, last=True)) == []
-    assert (depacketizer.tail(), depacketizer.missing()) == (None, [2])
+    assert (depacketizer.next_of_open_frame(), depacketizer.missing_sequences()) == (None, [2])
     assert len(took(depacketizer, packet(SLICE, 2, 9))) == 1
-    assert depacketizer.tail() is None
+    assert depacketizer.next_of_open_frame() is None
 
 
 def test_another_ssrc_is_a_new_stream() -> None:
@@ -278,7 +278,7 @@ def test_another_ssrc_is_a_new_stream() -> None:
     assert took(depacketizer, packet("7c 85 aa", 1, 9)) == []
     other = [one._replace(ssrc=2) for one in (packet(SPS, 900, 9), packet(SLICE, 901, 9, True))]
     (made,) = took(depacketizer, *other)
-    assert (made.data, made.begins, made.damaged) == (annex_b(SPS, SLICE), True, 1)
+    assert (made.data, made.starts_stream, made.damaged_frames) == (annex_b(SPS, SLICE), True, 1)
     assert depacketizer.streams == 2
 
 
@@ -287,10 +287,10 @@ def test_second_packet_confirms_a_jump_of_numbers() -> None:
         depacketizer = begun()
         assert took(depacketizer, packet(KEY, jump, 9, last=True)) == []
         (here,) = took(depacketizer, packet(SLICE, 1, 8, last=True))
-        assert not here.begins  # a single packet is a stray
+        assert not here.starts_stream  # a single packet is a stray
         strays = [packet(KEY, jump + one, 20 + one, last=True) for one in range(3)]
         made = took(depacketizer, *strays)
-        assert [(one.timestamp, one.begins) for one in made] == [(21, True), (22, False)]
+        assert [(one.timestamp, one.starts_stream) for one in made] == [(21, True), (22, False)]
 
 
 def test_memory_is_bounded() -> None:
@@ -303,7 +303,7 @@ def test_memory_is_bounded() -> None:
     assert (made, depacketizer.damaged) == ([], 1)
     for number in range(0, 100, 2):
         took(depacketizer, packet(SLICE, 404 + number, number))
-        assert len(depacketizer.missing()) <= 8
+        assert len(depacketizer.missing_sequences()) <= 8
 
 
 # any frames, any link
@@ -362,11 +362,11 @@ def test_only_whole_frames_come_in_order_and_losses_are_counted(
     never = len(set(seen) - arrived)
     assert depacketizer.lost >= never
     assert depacketizer.lost + depacketizer.duplicates >= len(seen) - len(arrived)
-    told = sum(one.lost for one in got)
+    told = sum(one.lost_packets for one in got)
     assert told <= depacketizer.lost
     for before, after in itertools.pairwise(got):
         if after.timestamp - before.timestamp > 3000:
-            assert after.lost or after.damaged
+            assert after.lost_packets or after.damaged_frames
 
 
 @given(st.lists(st.binary(max_size=8), max_size=30), st.randoms(use_true_random=False))
@@ -374,10 +374,10 @@ def test_any_payloads_are_accepted(payloads: list[bytes], chance: random.Random)
     depacketizer = Depacketizer(window=4)
     for payload in payloads:
         number, stamp = chance.randrange(40), chance.randrange(3)
-        made = depacketizer.take(packet(payload, number, stamp, chance.random() < 0.3))
+        made = depacketizer.add_packet(packet(payload, number, stamp, chance.random() < 0.3))
         assert all(units(one.data) is not None for one in made if b"\0\0\1" not in payload)
     depacketizer.give_up(1.0)
-    assert depacketizer.waits_since() is None
+    assert depacketizer.waiting_since() is None
 
 
 # parameters

@@ -183,7 +183,7 @@ class Watcher:
         read = RtpPacket.parse(packet)
         self.sequences.append(read.sequence)
         number = None
-        for unit in self.depacketizer.take(read):
+        for unit in self.depacketizer.add_packet(read):
             self.timestamps.append(unit.timestamp)
             form = frame_of(stamped(0, *self.size), "Mono8")
             coded = replace(form, data=unit.data, format=find_format("H264"), stride=0)

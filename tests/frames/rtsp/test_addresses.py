@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError
 from tests.frames.inside import (
-    MAX_WRONG_ANSWERS,
+    MAX_WRONG_PASSWORDS,
     Authentication,
-    PasswordGate,
+    PasswordCheck,
     RequestedTransport,
     RtspError,
     RtspRequest,
@@ -90,7 +90,7 @@ def test_other_transports_are_refused(transport: str) -> None:
     assert caught.value.status == 461
 
 
-def challenged(gate: PasswordGate) -> Reply:
+def challenged(gate: PasswordCheck) -> Reply:
     with pytest.raises(RtspError) as caught:
         gate.check(RtspRequest("DESCRIBE", URL, {}))
     assert caught.value.status == 401
@@ -102,7 +102,7 @@ def asked(authorization: str, method: str = "DESCRIBE", url: str = URL) -> RtspR
 
 
 def test_the_right_password_passes_as_often_as_wanted() -> None:
-    gate = PasswordGate(Authentication("me", "secret"))
+    gate = PasswordCheck(Authentication("me", "secret"))
     challenge = challenged(gate)
     for method in ("DESCRIBE", "SETUP", "PLAY") * 5:
         gate.check(asked(digest(challenge, method, URL, "me", "secret"), method))
@@ -113,7 +113,7 @@ def test_the_right_password_passes_as_often_as_wanted() -> None:
 
 def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
     authentication = Authentication("me", "secret")
-    gate, other = PasswordGate(authentication), PasswordGate(authentication)
+    gate, other = PasswordCheck(authentication), PasswordCheck(authentication)
     challenge = challenged(gate)
     right = digest(challenge, "DESCRIBE", URL, "me", "secret")
     for wrong in (
@@ -126,7 +126,7 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
         asked(right + ", algorithm=SHA-256"),
         asked("Digest"),
     ):
-        fresh = PasswordGate(authentication)
+        fresh = PasswordCheck(authentication)
         fresh._nonce = gate._nonce
         with pytest.raises(RtspError, match="wrong user or password"):
             fresh.check(wrong)
@@ -134,18 +134,18 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
 
 
 def test_tries_are_counted() -> None:
-    gate = PasswordGate(Authentication("me", "secret"))
+    gate = PasswordCheck(Authentication("me", "secret"))
     ends = []
-    for _ in range(MAX_WRONG_ANSWERS):
+    for _ in range(MAX_WRONG_PASSWORDS):
         with pytest.raises(RtspError) as caught:
             gate.check(asked("Digest x=y"))
         ends.append(caught.value.fatal)
-    assert ends == [False] * (MAX_WRONG_ANSWERS - 1) + [True]
+    assert ends == [False] * (MAX_WRONG_PASSWORDS - 1) + [True]
 
 
 @given(st.text(st.characters(max_codepoint=255), max_size=60))
 def test_no_text_is_an_authorization(text: str) -> None:
-    gate = PasswordGate(Authentication("me", "secret", basic=True))
+    gate = PasswordCheck(Authentication("me", "secret", allows_basic=True))
     for scheme in ("Digest ", "Basic ", ""):
         with pytest.raises(RtspError):
             gate.check(asked(scheme + text))
@@ -153,12 +153,15 @@ def test_no_text_is_an_authorization(text: str) -> None:
 
 def test_basic_is_refused_unless_asked_for() -> None:
     request = asked("Basic " + base64.b64encode("me:gehe\u00edm".encode()).decode())
-    PasswordGate(Authentication("me", "gehe\u00edm", basic=True)).check(request)
-    for other in (Authentication("me", "gehe\u00edm"), Authentication("me", "x", basic=True)):
+    PasswordCheck(Authentication("me", "gehe\u00edm", allows_basic=True)).check(request)
+    for other in (
+        Authentication("me", "gehe\u00edm"),
+        Authentication("me", "x", allows_basic=True),
+    ):
         with pytest.raises(RtspError, match="wrong user or password") as caught:
-            PasswordGate(other).check(request)
+            PasswordCheck(other).check(request)
         schemes = [value.partition(" ")[0] for _, value in caught.value.headers]
-        assert schemes == (["Digest", "Basic"] if other.basic else ["Digest"])
+        assert schemes == (["Digest", "Basic"] if other.allows_basic else ["Digest"])
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
                     found.append(message)
             except messages.RtspError as error:
                 return found, error.status if error.fatal else -1
-        assert parser.waiting <= messages.MAX_MESSAGE_BYTES
+        assert parser.unparsed_bytes <= messages.MAX_MESSAGE_BYTES
         return found, 0
 
     data = b"".join(parts)
@@ -127,10 +127,10 @@ def test_half_message_is_recognized() -> None:
     for data, midst in ((b"\r\n", False), (b"OPT", True), (b"IONS * RTSP/1.0\r\n", True)):
         parser.feed(data)
         assert parser.next() is None
-        assert parser.in_midst == midst
+        assert parser.has_partial_message == midst
     parser.feed(b"\r\n")
     assert parser.next() == messages.RtspRequest("OPTIONS", "*", {})
-    assert not parser.in_midst
+    assert not parser.has_partial_message
 
 
 @pytest.mark.parametrize("cseq", [{}, {"cseq": ""}, {"cseq": "-1"}, {"cseq": "1" * 10}])
@@ -140,7 +140,7 @@ def test_a_request_has_a_number(cseq: dict[str, str]) -> None:
 
 
 def test_answers() -> None:
-    assert messages.answer(461, "3", (("A", "b"),), b"c\n") == (
+    assert messages.encode_answer(461, "3", (("A", "b"),), b"c\n") == (
         b"RTSP/1.0 461 Unsupported Transport\r\nCSeq: 3\r\nA: b\r\nContent-Length: 2\r\n\r\nc\n"
     )
-    assert messages.answer(200, "") == b"RTSP/1.0 200 OK\r\n\r\n"
+    assert messages.encode_answer(200, "") == b"RTSP/1.0 200 OK\r\n\r\n"

@@ -33,10 +33,10 @@ class Viewer:
         self.units: list[tuple[int, bool]] = []
         self.error: FrameSourceError | None = None
 
-    def take(self, unit: Frame, key: bool) -> None:
-        self.units.append((unit.sequence, key))
+    def on_frame(self, unit: Frame, is_key_frame: bool) -> None:
+        self.units.append((unit.sequence, is_key_frame))
 
-    def ended(self, error: FrameSourceError) -> None:
+    def on_stream_end(self, error: FrameSourceError) -> None:
         self.error = error
 
 
@@ -72,23 +72,23 @@ async def stream(no_leaks: None) -> AsyncIterator[Stream]:
 async def test_twenty_viewers_are_one_encoder(stream: Stream) -> None:
     viewers = [Viewer() for _ in range(20)]
     for viewer in viewers:
-        stream.shared.join(viewer)
+        stream.shared.add_viewer(viewer)
     await stream.give(1, 2, 3)
     assert [viewer.units for viewer in viewers] == [[(1, True), (2, False), (3, False)]] * 20
-    assert (stream.shared.counts.encoded, stream.shared.counts.keys) == (3, 1)
+    assert (stream.shared.counts.encoded, stream.shared.counts.key_frames) == (3, 1)
 
 
 async def test_without_viewers_the_source_does_not_stream(stream: Stream) -> None:
     assert stream.driver.calls == ["open"]
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(1)
-    stream.shared.leave(viewer)
+    stream.shared.remove_viewer(viewer)
     await asyncio.sleep(LINGER - 0.1)
     assert stream.driver.calls == ["open", "start"]
     await asyncio.sleep(0.2)
     await stream.driver.rests()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(2)
     assert viewer.units == [(1, True), (2, True)]
 
@@ -97,12 +97,12 @@ async def test_returning_viewer_joins_a_running_stream_that_encoded_nothing(
     stream: Stream,
 ) -> None:
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(1)
-    stream.shared.leave(viewer)
+    stream.shared.remove_viewer(viewer)
     stream.driver.give(drawn(2))
     await asyncio.sleep(LINGER / 2)
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await asyncio.sleep(LINGER * 2)
     await stream.give(3)
     assert viewer.units == [(1, True), (3, True)]
@@ -114,12 +114,12 @@ async def test_key_frames_for_new_viewers_keep_the_least_interval(
     stream: Stream,
 ) -> None:
     first, second, third = Viewer(), Viewer(), Viewer()
-    stream.shared.join(first)
+    stream.shared.add_viewer(first)
     await stream.give(1, 2)
-    stream.shared.join(second)
+    stream.shared.add_viewer(second)
     await stream.give(3)
-    stream.shared.join(third)
-    stream.shared.key_frame()
+    stream.shared.add_viewer(third)
+    stream.shared.request_key_frame()
     await stream.give(4)
     await asyncio.sleep(KEY_FRAME_INTERVAL)
     await stream.give(5, 6)
@@ -130,7 +130,7 @@ async def test_key_frames_for_new_viewers_keep_the_least_interval(
 
 async def test_a_slow_encoder_skips_and_never_lags(stream: Stream) -> None:
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.driver.streams()
     for number in (1, 2, 3, 4):
         stream.driver.give(drawn(number))
@@ -142,11 +142,11 @@ async def test_a_slow_encoder_skips_and_never_lags(stream: Stream) -> None:
 async def test_description_is_made_once_before_the_first_viewer(
     stream: Stream,
 ) -> None:
-    asking = [asyncio.create_task(stream.shared.first(5.0)) for _ in range(3)]
+    asking = [asyncio.create_task(stream.shared.first_key_frame(5.0)) for _ in range(3)]
     await stream.give(1)
     units = [await one for one in asking]
     assert [unit.sequence for unit in units] == [1, 1, 1]
-    assert (await stream.shared.first(0.0)).sequence == 1
+    assert (await stream.shared.first_key_frame(0.0)).sequence == 1
     assert stream.shared.counts.encoded == 1
     await asyncio.sleep(LINGER + 0.1)
     await stream.driver.rests()
@@ -155,7 +155,7 @@ async def test_description_is_made_once_before_the_first_viewer(
 async def test_silent_source_is_reported_in_time(stream: Stream) -> None:
     before = asyncio.get_running_loop().time()
     with pytest.raises(FrameTimeoutError, match="scripted: no frame came within 5 s"):
-        await stream.shared.first(5.0)
+        await stream.shared.first_key_frame(5.0)
     assert asyncio.get_running_loop().time() - before == pytest.approx(5.0, abs=0.1)
 
 
@@ -163,25 +163,25 @@ async def test_ended_source_ends_its_viewers_and_is_reopened(
     stream: Stream,
 ) -> None:
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(1)
     assert stream.driver.sink is not None
     stream.driver.sink.ended(GoneError("it was unplugged"))
     await until(lambda: viewer.error)
     assert isinstance(viewer.error, GoneError)
-    assert stream.shared.viewers == 0
+    assert stream.shared.viewer_count == 0
     stream.driver.fails["start"] = GoneError("it is not there")
     with pytest.raises(GoneError, match="not there"):
-        await stream.shared.first(5.0)
+        await stream.shared.first_key_frame(5.0)
     del stream.driver.fails["start"]
-    asking = asyncio.create_task(stream.shared.first(5.0))
+    asking = asyncio.create_task(stream.shared.first_key_frame(5.0))
     await stream.give(2)
     assert (await asking).sequence == 2
 
 
 async def test_the_end_of_a_recording_is_an_end(stream: Stream) -> None:
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(1)
     assert stream.driver.sink is not None
     stream.driver.sink.ended(None)
@@ -191,7 +191,7 @@ async def test_the_end_of_a_recording_is_an_end(stream: Stream) -> None:
 
 async def test_one_damaged_frame_is_left_out_but_not_all(stream: Stream) -> None:
     viewer = Viewer()
-    stream.shared.join(viewer)
+    stream.shared.add_viewer(viewer)
     await stream.give(1)
     await stream.driver.streams()
     for _ in range(MAX_FAILURES - 1):
@@ -213,12 +213,12 @@ async def test_closed_source_is_reported(no_leaks: None) -> None:
     async with Codecs(threads=1) as codecs:
         shared = SharedH264(source, codecs.h264_encoder())
         with pytest.raises(FrameSourceError, match="is not open"):
-            await shared.first(5.0)
+            await shared.first_key_frame(5.0)
         await shared.close()
 
 
 async def test_closing_answers_waiting_requests(stream: Stream) -> None:
-    asking = asyncio.create_task(stream.shared.first(5.0))
+    asking = asyncio.create_task(stream.shared.first_key_frame(5.0))
     await stream.driver.streams()
     await stream.shared.close()
     with pytest.raises(FrameSourceError, match="its stream was closed"):

@@ -15,7 +15,7 @@ import pytest
 
 from smartcam.frames import Codecs, RtspServer
 from smartcam.frames._streaming.rtsp.session import (
-    CLOCK,
+    CLOCK_RATE,
     REPORT_INTERVAL,
     SESSION_TIMEOUT,
 )
@@ -33,8 +33,8 @@ from tests.frames.inside import (
     SourceDescription,
     compound,
     delivery,
+    open_port_pair,
     parse_rtcp,
-    port_pair,
 )
 from tests.frames.pictures import frame_of, stamped, write_stamp
 from tests.frames.rtsp.client import Client, Watcher
@@ -111,7 +111,7 @@ class Ports:
     """The two UDP ports of a client."""
 
     def __init__(self) -> None:
-        self.sockets = port_pair("127.0.0.1", socket.AF_INET)
+        self.sockets = open_port_pair("127.0.0.1", socket.AF_INET)
         self.ports = [one.getsockname()[1] for one in self.sockets]
         self.transport = f"RTP/AVP;unicast;client_port={self.ports[0]}-{self.ports[1]}"
 
@@ -144,7 +144,7 @@ async def test_pictures_over_the_connection(stage: Stage) -> None:
         first = int(begins["seq"])
         assert watcher.sequences == [first + n & 0xFFFF for n in range(len(watcher.sequences))]
         steps = {b - a & 0xFFFFFFFF for a, b in pairwise(watcher.timestamps)}
-        assert steps == {CLOCK}  # the pictures were exposed a second after each other
+        assert steps == {CLOCK_RATE}  # the pictures were exposed a second after each other
         await client.ask("PAUSE")
         before = stage.counts.sent
         await asyncio.sleep(1)
@@ -286,7 +286,9 @@ async def test_reports_map_timestamps_to_utc(stage: Stage) -> None:
         assert isinstance(a, SenderReport)
         assert isinstance(b, SenderReport)
         passed = (b.ntp - a.ntp) / (1 << 32)
-        assert (b.timestamp - a.timestamp & 0xFFFFFFFF) / CLOCK == pytest.approx(passed, abs=1e-3)
+        assert (b.timestamp - a.timestamp & 0xFFFFFFFF) / CLOCK_RATE == pytest.approx(
+            passed, abs=1e-3
+        )
         assert (a.packets, a.octets) == (b.packets, b.octets)
         assert a.packets >= 1
 
@@ -370,11 +372,11 @@ async def test_datagrams_beyond_the_buffer_are_dropped_and_a_key_frame_follows(
     made: list[Full] = []
 
     def pair(*args: Any) -> tuple[Any, Any]:
-        rtp, rtcp = port_pair(*args)
+        rtp, rtcp = open_port_pair(*args)
         made.append(Full(rtp, 1_000_000))
         return made[0], rtcp
 
-    monkeypatch.setattr("smartcam.frames._streaming.rtsp.requests.port_pair", pair)
+    monkeypatch.setattr("smartcam.frames._streaming.rtsp.requests.open_port_pair", pair)
     async with staged(crf=5) as stage:
         watcher = stage.watcher(SMALL)
         async with await Client.connect(stage.server) as client:
@@ -394,7 +396,7 @@ async def test_datagrams_beyond_the_buffer_are_dropped_and_a_key_frame_follows(
 
 def test_report_of_another_host_does_not_count() -> None:
     heard: list[bytes] = []
-    port = delivery._ControlPort("192.0.2.1", heard.append)
+    port = delivery._RtcpReceiver("192.0.2.1", heard.append)
     port.datagram_received(b"theirs", ("192.0.2.2", 5001))
     port.datagram_received(b"its own", ("192.0.2.1", 5001))
     port.error_received(OSError("no such port"))
@@ -403,7 +405,7 @@ def test_report_of_another_host_does_not_count() -> None:
 
 async def test_port_pairs_are_even_and_odd(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(10):
-        one, two = port_pair("127.0.0.1", socket.AF_INET)
+        one, two = open_port_pair("127.0.0.1", socket.AF_INET)
         with one, two:
             first = one.getsockname()[1]
             assert (first % 2, two.getsockname()[1]) == (0, first + 1)
@@ -416,8 +418,8 @@ async def test_port_pairs_are_even_and_odd(monkeypatch: pytest.MonkeyPatch) -> N
         return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     asked: list[int] = []
-    monkeypatch.setattr(delivery, "_bound", taken)
+    monkeypatch.setattr(delivery, "_bound_socket", taken)
     monkeypatch.setattr(socket.socket, "getsockname", lambda _: ("127.0.0.1", 4000))
     with pytest.raises(OSError, match="no two ports"):
-        port_pair("127.0.0.1", socket.AF_INET)
+        open_port_pair("127.0.0.1", socket.AF_INET)
     assert len(asked) == 2 * delivery.MAX_TRIES

@@ -142,7 +142,7 @@ async def test_refusals_of_a_camera_are_errors(encoded: list[bytes]) -> None:
     [
         ("405 Method Not Allowed", UnsupportedError, "no such request: GET_PARAMETER: 405"),
         ("501 Not Implemented", UnsupportedError, "no such request: GET_PARAMETER: 501"),
-        ("", FrameFeatureError, "got none: the camera only takes the request"),
+        ("", FrameFeatureError, "got none: the camera uses the request only"),
         ("403 Forbidden", FrameFeatureError, "it refuses that: GET_PARAMETER: 403 Forbidden"),
         (None, FrameTimeoutError, "an answer to GET_PARAMETER, got none within 1 s"),
     ],

@@ -35,7 +35,7 @@ def press(name: str, value: int = 1) -> None:
     """Set a control as another program would."""
     device = CaptureDevice.open("/dev/video0")
     try:
-        device.ask(abi.S_CTRL, CONTROLS[name], value)
+        device.checked_ioctl(abi.S_CTRL, CONTROLS[name], value)
     finally:
         device.close()
 

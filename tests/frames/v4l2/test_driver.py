@@ -224,7 +224,7 @@ async def _reading(expected: type[Exception]) -> str:
 async def test_half_a_picture_is_never_delivered(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "MAX_BAD_IN_A_ROW", 3)
+    monkeypatch.setattr(stream, "MAX_CONSECUTIVE_BAD", 3)
     changed(play("stream"), monkeypatch, used=57600)
     message = await _reading(FrameFormatError)
     assert "expected YUV422_8 320x180, 115200 bytes or more, got 57600 bytes 3 times" in message
@@ -233,7 +233,7 @@ async def test_half_a_picture_is_never_delivered(
 async def test_a_device_with_nothing_but_errors_ends(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "MAX_BAD_IN_A_ROW", 3)
+    monkeypatch.setattr(stream, "MAX_CONSECUTIVE_BAD", 3)
     changed(play("stream"), monkeypatch, flags=abi.BUF_ERROR | abi.TIMESTAMP_MONOTONIC)
     assert "got an error of the device 3 times" in await _reading(FrameFormatError)
 
@@ -331,11 +331,13 @@ def test_colours_are_those_of_the_device(
     code = abi.fourcc(fourcc)
     layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
     read = layout._replace(quantization=quantization)
-    assert device._coloured(FORMATS[code], read).name == name
+    assert device._with_matrix_and_range(FORMATS[code], read).name == name
     # an older kernel leaves any values in these fields
     unset = read._replace(private=0)
     by_colorspace = read._replace(ycbcr_enc=0, quantization=0)
-    assert device._coloured(FORMATS[code], unset) is device._coloured(FORMATS[code], by_colorspace)
+    assert device._with_matrix_and_range(FORMATS[code], unset) is device._with_matrix_and_range(
+        FORMATS[code], by_colorspace
+    )
 
 
 @pytest.mark.parametrize(("colorspace", "encoding"), [(2, 0), (8, 8), (10, 7)])
@@ -345,7 +347,7 @@ def test_unknown_matrix_is_refused(colorspace: int, encoding: int) -> None:
     code = abi.fourcc("YUYV")
     layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
     with pytest.raises(FrameFormatError, match=r"BT.601, BT.709 or BT.2020, the device has"):
-        device._coloured(FORMATS[code], layout)
+        device._with_matrix_and_range(FORMATS[code], layout)
 
 
 # ------------------------------------------------------------------ colours, through the whole path

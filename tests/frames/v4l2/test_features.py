@@ -41,7 +41,7 @@ class Webcam:
 
     async def set_control(self, name: str, value: int | str) -> int:
         control = self.has[name]
-        number = control.number_of(value)
+        number = control.parse_value(value)
         assert number is not None
         if control.kind == "button":
             self.pressed.append(name)

@@ -386,7 +386,7 @@ async def colours_are_what_the_device_says_they_are() -> None:
 async def a_format_that_another_program_set_is_set_back() -> None:
     async with smartcam.frames.open(URL.format(0)) as source:
         device = CaptureDevice.open("/dev/video0")
-        device.ask(abi.S_FMT, 1, 0, 640, 480, abi.fourcc("GREY"), 1)
+        device.checked_ioctl(abi.S_FMT, 1, 0, 640, 480, abi.fourcc("GREY"), 1)
         device.close()
         frame = await source.newest()
         assert (frame.format.name, frame.width, len(frame.data)) == ("YUV422_8", 320, 115200)
@@ -396,7 +396,7 @@ async def a_format_that_another_program_set_is_set_back() -> None:
 async def a_device_that_changed_says_what_it_has_now() -> None:
     async with smartcam.frames.open(URL.format(0)) as source:
         device = CaptureDevice.open("/dev/video0")
-        device.ask(S_INPUT, 1)  # a tuner, of 720 columns
+        device.checked_ioctl(S_INPUT, 1)  # a tuner, of 720 columns
         for one in SCALERS:
             set_control(device, one, 0)
         device.close()
@@ -405,7 +405,7 @@ async def a_device_that_changed_says_what_it_has_now() -> None:
         device = CaptureDevice.open("/dev/video0")
         for one in SCALERS:
             set_control(device, one, 1)
-        device.ask(S_INPUT, 0)
+        device.checked_ioctl(S_INPUT, 0)
         device.close()
         await source.newest()
 

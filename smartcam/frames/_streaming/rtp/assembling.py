@@ -24,159 +24,167 @@ class AccessUnit(NamedTuple):
     Attributes:
         data: bytes as in a file (annex B, or a JPEG).
         timestamp: ticks of 90 kHz.
-        lost: number of packets lost since the last complete frame.
-        damaged: number of incomplete frames since then.
-        arrived: time of arrival of the first packet; 0.0: unknown.
-        begins: whether the first packet is the first of a stream.
+        lost_packets: number of packets lost since the last complete frame.
+        damaged_frames: number of incomplete frames since the last complete one.
+        arrived_at: time of arrival of the first packet; 0.0: unknown.
+        starts_stream: whether this is the first complete frame of a stream.
     """
 
     data: bytes
     timestamp: int
-    lost: int = 0
-    damaged: int = 0
-    arrived: float = 0.0
-    begins: bool = False
+    lost_packets: int = 0
+    damaged_frames: int = 0
+    arrived_at: float = 0.0
+    starts_stream: bool = False
 
 
 class OpenUnit(ABC):
     """An access unit whose packets are still coming.
 
     Attributes:
-        whole: whether no packet is missing so far.
+        is_intact: whether no packet is missing and every payload is valid so far.
         has_picture: whether picture data came, and not only parameters.
         parts: received bytes, in order.
     """
 
-    def __init__(self, timestamp: int, unbroken: bool, arrived: float) -> None:
-        self.timestamp, self.whole, self.arrived = timestamp, unbroken, arrived
+    def __init__(self, timestamp: int, unbroken: bool, arrived_at: float) -> None:
+        self.timestamp, self.is_intact, self.arrived_at = timestamp, unbroken, arrived_at
         self.parts: list[bytes] = []
         self.size = 0
         self.has_picture = False
 
     def add(self, payload: bytes) -> None:
         """Add a packet's payload; an invalid payload makes the unit damaged."""
-        if self.whole:
+        if self.is_intact:
             self.size += len(payload) + len(START_CODE)
-            self.whole = self.size <= MAX_ACCESS_UNIT_BYTES and (
-                not payload or self._added(payload)
+            self.is_intact = self.size <= MAX_ACCESS_UNIT_BYTES and (
+                not payload or self._add_payload(payload)
             )
-        if not self.whole:
+        if not self.is_intact:
             self.parts.clear()
 
-    def ended(self) -> bool:
+    def is_complete(self) -> bool:
         """Return True if the unit is complete."""
-        return self.whole and bool(self.parts)
+        return self.is_intact and bool(self.parts)
 
     def data(self) -> bytes:
         """Return the bytes of the encoded frame."""
         return b"".join(self.parts)
 
     @abstractmethod
-    def _added(self, payload: bytes) -> bool:
-        """Add a payload that is not empty; return False if it is not valid."""
+    def _add_payload(self, payload: bytes) -> bool:
+        """Add a payload that is not empty; return False if the payload is not valid."""
 
 
-class UnitKind(Protocol):
-    """Rules by which the access units in a stream's payloads begin and are assembled."""
+class PayloadFormat(Protocol):
+    """An RTP payload format: where an access unit starts, and how it is assembled."""
 
-    def new_unit(self, timestamp: int, unbroken: bool, arrived: float, /) -> OpenUnit:
+    def new_unit(self, timestamp: int, unbroken: bool, arrived_at: float, /) -> OpenUnit:
         """Return a new access unit."""
         ...
 
-    def begins(self, payload: bytes, /) -> bool:
+    def is_frame_start(self, payload: bytes, /) -> bool:
         """Return True if a packet is certainly the first of a frame."""
         ...
 
 
-class NalUnit(OpenUnit):
-    """An access unit of NAL units, several in a packet or one in fragments."""
+class NalAccessUnit(OpenUnit):
+    """An access unit that consists of NAL units.
+
+    A packet carries one NAL unit, several of them, or a fragment of one.
+    """
 
     HEADER_SIZE: ClassVar[int]
-    """Number of bytes of a unit's header."""
+    """Number of bytes of a NAL unit's header."""
     AGGREGATION: ClassVar[int]
-    """Kind of a packet with several units."""
+    """Type of a packet with several NAL units."""
     FRAGMENT: ClassVar[int]
-    """Kind of a packet with a fragment of a unit."""
+    """Type of a packet with a fragment of a NAL unit."""
 
-    def __init__(self, timestamp: int, unbroken: bool, arrived: float) -> None:
-        super().__init__(timestamp, unbroken, arrived)
-        self._part_of = -1  # kind of the current fragmented unit; -1: none
-
-    @staticmethod
-    @abstractmethod
-    def kind_of(head: int) -> int:
-        """Return a unit's kind by its first byte; -1: not valid."""
+    def __init__(self, timestamp: int, unbroken: bool, arrived_at: float) -> None:
+        super().__init__(timestamp, unbroken, arrived_at)
+        self._fragmented_type = -1  # type of the NAL unit whose fragments come now; -1: none
 
     @staticmethod
     @abstractmethod
-    def is_picture(kind: int) -> bool:
-        """Return True if units of a kind have picture data."""
+    def unit_type(head: int) -> int:
+        """Return a NAL unit's type, which its first byte holds; -1: not valid."""
+
+    @staticmethod
+    @abstractmethod
+    def is_picture(unit_type: int) -> bool:
+        """Return True if NAL units of this type have picture data."""
 
     @classmethod
     @abstractmethod
-    def whole_head(cls, payload: bytes) -> bytes:
-        """Return the header of the unit whose fragment is in a packet."""
+    def fragmented_header(cls, payload: bytes) -> bytes:
+        """Return the header of the NAL unit whose fragment is in a packet."""
 
     @classmethod
-    def leading(cls, access_unit: bytes) -> Iterator[bytes]:
-        """Yield the units before a frame's picture, without start codes, and its header."""
-        place = access_unit.find(b"\0\0\1")
-        while place >= 0:
-            head = access_unit[place + 3 : place + 3 + cls.HEADER_SIZE]
-            kind = cls.kind_of(head[0]) if len(head) == cls.HEADER_SIZE else -1
-            if cls.is_picture(kind):  # the search for its end would be long and is not needed
+    def leading_units(cls, access_unit: bytes) -> Iterator[bytes]:
+        """Yield the NAL units before a frame's picture, and then the header of the picture's first.
+
+        Start codes are left out.
+        """
+        offset = access_unit.find(b"\0\0\1")
+        while offset >= 0:
+            head = access_unit[offset + 3 : offset + 3 + cls.HEADER_SIZE]
+            unit_type = cls.unit_type(head[0]) if len(head) == cls.HEADER_SIZE else -1
+            if cls.is_picture(unit_type):  # finding the picture's end would take long for nothing
                 yield head
                 return
-            after = access_unit.find(b"\0\0\1", place + 3)
-            if kind >= 0:
-                end = after if after >= 0 else len(access_unit)
-                yield access_unit[place + 3 : end].rstrip(b"\0")
-            place = after
+            next_start = access_unit.find(b"\0\0\1", offset + 3)
+            if unit_type >= 0:
+                end = next_start if next_start >= 0 else len(access_unit)
+                yield access_unit[offset + 3 : end].rstrip(b"\0")
+            offset = next_start
 
-    def ended(self) -> bool:
+    def is_complete(self) -> bool:
         """Return True if the unit is complete."""
-        return super().ended() and self._part_of < 0
+        return super().is_complete() and self._fragmented_type < 0
 
-    def _added(self, payload: bytes) -> bool:
-        kind = self.kind_of(payload[0])
-        if kind == self.FRAGMENT:
-            return self._part(payload)
-        if self._part_of >= 0:
+    def _add_payload(self, payload: bytes) -> bool:
+        unit_type = self.unit_type(payload[0])
+        if unit_type == self.FRAGMENT:
+            return self._add_fragment(payload)
+        if self._fragmented_type >= 0:
             return False
-        if kind == self.AGGREGATION:
-            return self._several(payload)
-        return self._unit(payload)
+        if unit_type == self.AGGREGATION:
+            return self._add_aggregate(payload)
+        return self._add_nal_unit(payload)
 
-    def _unit(self, unit: bytes) -> bool:
-        kind = self.kind_of(unit[0]) if len(unit) >= self.HEADER_SIZE else -1
-        if not 0 <= kind < self.AGGREGATION:
+    def _add_nal_unit(self, unit: bytes) -> bool:
+        unit_type = self.unit_type(unit[0]) if len(unit) >= self.HEADER_SIZE else -1
+        if not 0 <= unit_type < self.AGGREGATION:
             return False
-        self.has_picture |= self.is_picture(kind)
+        self.has_picture |= self.is_picture(unit_type)
         self.parts += (START_CODE, unit)
         return True
 
-    def _several(self, payload: bytes) -> bool:
-        place = self.HEADER_SIZE
-        while place < len(payload):
-            end = place + 2 + int.from_bytes(payload[place : place + 2], "big")
-            if end > len(payload) or not self._unit(payload[place + 2 : end]):
+    def _add_aggregate(self, payload: bytes) -> bool:
+        offset = self.HEADER_SIZE
+        while offset < len(payload):
+            end = offset + 2 + int.from_bytes(payload[offset : offset + 2], "big")
+            if end > len(payload) or not self._add_nal_unit(payload[offset + 2 : end]):
                 return False
-            place = end
+            offset = end
         return len(payload) > self.HEADER_SIZE
 
-    def _part(self, payload: bytes) -> bool:
+    def _add_fragment(self, payload: bytes) -> bool:
         if len(payload) < self.HEADER_SIZE + 2:
             return False
-        head = self.whole_head(payload)
-        second, kind = payload[self.HEADER_SIZE], self.kind_of(head[0])
-        start = bool(second & START)
-        if start != (self._part_of < 0) or (start and second & END):
+        head = self.fragmented_header(payload)
+        fragment_header, unit_type = payload[self.HEADER_SIZE], self.unit_type(head[0])
+        is_start = bool(fragment_header & START)
+        if is_start != (self._fragmented_type < 0) or (is_start and fragment_header & END):
             return False
-        if not 0 <= kind < self.AGGREGATION or (not start and kind != self._part_of):
+        if not 0 <= unit_type < self.AGGREGATION:
             return False
-        if start:
-            self.has_picture |= self.is_picture(kind)
+        if not is_start and unit_type != self._fragmented_type:
+            return False
+        if is_start:
+            self.has_picture |= self.is_picture(unit_type)
             self.parts += (START_CODE, head)
         self.parts.append(payload[self.HEADER_SIZE + 1 :])
-        self._part_of = -1 if second & END else kind
+        self._fragmented_type = -1 if fragment_header & END else unit_type
         return True

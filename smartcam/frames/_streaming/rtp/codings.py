@@ -6,25 +6,25 @@ from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
 
 from smartcam.frames._codecs.h264 import H264Decoder
 from smartcam.frames._streaming.rtp import h265, jpeg, parameters
-from smartcam.frames._streaming.rtp.h264 import H264Units
-from smartcam.frames._streaming.rtp.h265 import H265Unit, H265Units
-from smartcam.frames._streaming.rtp.jpeg import JpegUnits
+from smartcam.frames._streaming.rtp.h264 import H264PayloadFormat
+from smartcam.frames._streaming.rtp.h265 import H265AccessUnit, H265PayloadFormat
+from smartcam.frames._streaming.rtp.jpeg import JpegPayloadFormat
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.frames._streaming.rtp.assembling import UnitKind
+    from smartcam.frames._streaming.rtp.assembling import PayloadFormat
 
 
 class H265Decoder(H264Decoder):
-    """Decoder of a stream of H.265, which begins at key frames only."""
+    """Decoder of a stream of H.265; decoding can start at key frames only."""
 
     CODEC: ClassVar = "hevc"
     NAME: ClassVar = "H265"
 
     def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
-        kinds = [H265Unit.kind_of(unit[0]) for unit in H265Unit.leading(data)]
-        return bool(kinds) and kinds[-1] in h265.KEYS, None
+        types = [H265AccessUnit.unit_type(unit[0]) for unit in H265AccessUnit.leading_units(data)]
+        return bool(types) and types[-1] in h265.KEY_SLICES, None
 
 
 class JpegDecoder(H264Decoder):
@@ -43,19 +43,19 @@ class Coding(NamedTuple):
     Attributes:
         name: name of the codec.
         format: name of the encoded frames' format.
-        kind: function that returns an object that assembles the payloads.
-        size_in: function that returns the size of the pictures from an encoded frame; None if it
-            lacks parameters.
-        decoder: function that returns a decoder for a stream.
+        payload_format: class of the RTP payload format.
+        size_in: function that returns the size of the pictures from an encoded frame; None if the
+            frame lacks parameters.
+        decoder: class of the decoder.
     """
 
     name: str
     format: str
-    kind: Callable[[], UnitKind]
+    payload_format: Callable[[], PayloadFormat]
     size_in: Callable[[bytes], tuple[int, int] | None]
     decoder: type[H264Decoder]
 
 
-H264: Final = Coding("H264", "H264", H264Units, parameters.size_in, H264Decoder)
-H265: Final = Coding("H265", "H264", H265Units, h265.size_in, H265Decoder)
-JPEG: Final = Coding("JPEG", "MJPEG", JpegUnits, jpeg.size_in, JpegDecoder)
+H264: Final = Coding("H264", "H264", H264PayloadFormat, parameters.size_in, H264Decoder)
+H265: Final = Coding("H265", "H264", H265PayloadFormat, h265.size_in, H265Decoder)
+JPEG: Final = Coding("JPEG", "MJPEG", JpegPayloadFormat, jpeg.size_in, JpegDecoder)

@@ -12,7 +12,7 @@ from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._streaming.rtp.codings import H264
 from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
 from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
-from smartcam.frames._streaming.rtp.sockets import SocketPair, resolved
+from smartcam.frames._streaming.rtp.sockets import SocketPair, resolve
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtp.sockets import Endpoint
 
 
-KNOWN: Final = ("delay", "from", "name", "payload", "repair", "size", "timeout")
+PARAMETERS: Final = ("delay", "from", "name", "payload", "repair", "size", "timeout")
 
 
 class RtpDriver(FrameDriver):
@@ -49,20 +49,20 @@ class RtpDriver(FrameDriver):
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        given = address.parameters(KNOWN)
+        parameters = address.parameters(PARAMETERS)
         number = address.number
-        self._wanted = address.size(given["size"]) if "size" in given else None
+        self._size = address.size(parameters["size"]) if "size" in parameters else None
         self._plan = _RtpPlan(
-            given.get("name") or address.shown.partition("?")[0],
-            int(number("payload", given.get("payload", "96"), 0, 127)),
-            number("repair", given.get("repair", "0.1"), 0, 1),
-            number("timeout", given.get("timeout", "5"), 0.1, 600),
-            number("delay", given.get("delay", "1"), 0, 600),
+            parameters.get("name") or address.shown.partition("?")[0],
+            int(number("payload", parameters.get("payload", "96"), 0, 127)),
+            number("repair", parameters.get("repair", "0.1"), 0, 1),
+            number("timeout", parameters.get("timeout", "5"), 0.1, 600),
+            number("delay", parameters.get("delay", "1"), 0, 600),
         )
-        self._from = given.get("from", "")
+        self._sender_host = parameters.get("from", "")
         if not address.host or not 1 <= (address.port or 5004) < 65535:
             raise address.wrong("address", "HOST:PORT with a port below 65535", address.shown)
-        self._where = (address.host, address.port or 5004)
+        self._host_and_port = (address.host, address.port or 5004)
         self._endpoint: Endpoint | None = None
         self._stream: _RtpStream | None = None
 
@@ -84,13 +84,13 @@ class RtpDriver(FrameDriver):
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
-        self._endpoint = await resolved(*self._where, self.name)
-        if self._from:
-            only = await resolved(self._from, 0, self.name)
-            self._plan = self._plan._replace(only=only.host.partition("%")[0])
-        if self._wanted is not None:
-            self._listening(self._endpoint).close()
-            return StreamFormat(find_format("I420"), *self._wanted)
+        self._endpoint = await resolve(*self._host_and_port, self.name)
+        if self._sender_host:
+            sender = await resolve(self._sender_host, 0, self.name)
+            self._plan = self._plan._replace(only_host=sender.host.partition("%")[0])
+        if self._size is not None:
+            self._open_sockets(self._endpoint).close()
+            return StreamFormat(find_format("I420"), *self._size)
         first = FirstPicture()
         try:
             await self.start(first)
@@ -105,12 +105,12 @@ class RtpDriver(FrameDriver):
             ) from None
         finally:
             await self.stop()
-        self._wanted = (frame.width, frame.height)
-        return StreamFormat(frame.format, *self._wanted)
+        self._size = (frame.width, frame.height)
+        return StreamFormat(frame.format, *self._size)
 
-    def _listening(self, endpoint: Endpoint) -> SocketPair:
+    def _open_sockets(self, endpoint: Endpoint) -> SocketPair:
         try:
-            return SocketPair.listening(endpoint)
+            return SocketPair.open_listening(endpoint)
         except OSError as exc:
             raise FrameSourceError(
                 f"{self.name}: cannot listen on this port and, for RTCP, on the next: {exc}",
@@ -126,15 +126,15 @@ class RtpDriver(FrameDriver):
         await self.stop()
         if self._endpoint is None:
             raise LocalProtocolError(f"{self.name} is not open")
-        pair = self._listening(self._endpoint)
-        self._stream = stream = _RtpStream(self._plan, self._wanted, pair, sink)
-        await stream.begin()
+        pair = self._open_sockets(self._endpoint)
+        self._stream = stream = _RtpStream(self._plan, self._size, pair, sink)
+        await stream.start()
 
     async def stop(self) -> None:
         """Stop listening."""
         stream, self._stream = self._stream, None
         if stream is not None:
-            await stream.end()
+            await stream.stop()
 
     async def close(self) -> None:
         """Release everything. Idempotent."""
@@ -168,7 +168,7 @@ class _RtpPlan(NamedTuple):
     repair: float
     timeout: float
     delay: float
-    only: str = ""  # address of the only accepted host; "": any host
+    only_host: str = ""  # address of the only accepted host; "": any host
 
 
 class _RtpStream:
@@ -181,49 +181,51 @@ class _RtpStream:
     def __init__(
         self, plan: _RtpPlan, size: tuple[int, int] | None, pair: SocketPair, sink: FrameSink
     ) -> None:
-        self._plan, self._watched = plan, size is not None
+        self._plan, self._has_size = plan, size is not None
         self._decoding = UnitDecoding(DecodingPlan(plan.name, H264, plan.delay, size), sink)
-        self._watching: asyncio.Task[None] | None = None
+        self._silence_task: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
             pair,
             plan.payload,
             plan.repair,
-            self._decoding.take,
+            self._decoding.queue_units,
             self._on_goodbye,
-            (plan.only,) * bool(plan.only),
+            (plan.only_host,) * bool(plan.only_host),
         )
 
-    async def begin(self) -> None:
+    async def start(self) -> None:
         """Start receiving and decoding."""
-        await self._decoding.begin(self._receiver)
-        if self._watched:  # open() has its own timeout with a fuller error
+        await self._decoding.start(self._receiver)
+        if self._has_size:  # without a size, open() waits for a picture with a timeout of its own
             name = f"silence of {self._plan.name}"
-            self._watching = asyncio.create_task(self._watch(), name=name)
+            self._silence_task = asyncio.create_task(self._watch_silence(), name=name)
 
-    async def end(self) -> None:
+    async def stop(self) -> None:
         """Stop; the sink is not called any more."""
         self._receiver.close()
-        watching, self._watching = self._watching, None
-        if watching is not None:
-            watching.cancel()
+        silence_task, self._silence_task = self._silence_task, None
+        if silence_task is not None:
+            silence_task.cancel()
         try:
-            if watching is not None:
-                await asyncio.wait([watching])
+            if silence_task is not None:
+                await asyncio.wait([silence_task])
         finally:
-            await self._decoding.end()
+            await self._decoding.stop()
 
     def statistics(self) -> RtpStatistics:
         """Return the counts of packets received."""
         return self._receiver.statistics(self._decoding.overflows)
 
     def _on_goodbye(self, reason: str) -> None:
-        why = f" ({reason})" if reason else ""
-        self._decoding.over(FrameSourceError(f"{self._plan.name}: the sender said goodbye{why}"))
+        suffix = f" ({reason})" if reason else ""
+        self._decoding.report_end(
+            FrameSourceError(f"{self._plan.name}: the sender said goodbye{suffix}")
+        )
 
-    async def _watch(self) -> None:
-        receiver, longest = self._receiver, self._plan.timeout
+    async def _watch_silence(self) -> None:
+        receiver, timeout = self._receiver, self._plan.timeout
         loop = asyncio.get_running_loop()
-        while (left := receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
-            await asyncio.sleep(left)
+        while (remaining := receiver.last_packet_at + timeout - loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(remaining)
         text = f"{self._plan.name}: no packet came for {self._plan.timeout:g} s"
-        self._decoding.over(FrameSourceError(text))
+        self._decoding.report_end(FrameSourceError(text))

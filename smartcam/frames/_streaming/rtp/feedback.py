@@ -1,4 +1,4 @@
-"""Keep a sender's receivers with their reports, and packets to send again."""
+"""Store the reports of a sender's receivers, and recent packets that may be sent again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from smartcam.frames._streaming.rtp.packets import ReceiverReport, ReportBlock
 from smartcam.frames._streaming.rtp.parameters import CLOCK_RATE
-from smartcam.frames._streaming.rtp.reception import middle, ntp_time
+from smartcam.frames._streaming.rtp.reception import middle_bits, ntp_time
 
 RECEIVER_TIMEOUT: Final = 10.0
 """Seconds without a report after which a receiver is forgotten."""
@@ -33,7 +33,7 @@ class RtpReceiver:
 
     Attributes:
         address: address of the receiver's reports, ``HOST:PORT``.
-        loss: share of packets lost since the report before, 0 to 1.
+        loss: share of packets lost since the receiver's previous report, 0 to 1.
         lost: packets lost since the beginning, minus repaired ones.
         jitter: jitter of the arrival, seconds.
         round_trip: round-trip time, seconds; None: unknown.
@@ -52,35 +52,35 @@ class _ReportingReceiver(NamedTuple):
     address: str
     block: ReportBlock
     round_trip: float | None
-    at: float
+    reported_at: float
 
 
-class Audience:
-    """The receivers of a stream.
+class ReceiverReports:
+    """The last reports of a stream's receivers.
 
     Args:
         ssrc: SSRC of the stream.
     """
 
     def __init__(self, ssrc: int) -> None:
-        self._ssrc, self._no_report = ssrc, ReportBlock(ssrc, 0, 0, 0, 0)
+        self._ssrc, self._empty_block = ssrc, ReportBlock(ssrc, 0, 0, 0, 0)
         self._receivers: dict[int, _ReportingReceiver] = {}
 
     def record(self, report: ReceiverReport, address: str) -> bool:
         """Record a report; return True if it is the first of its receiver."""
         now = time.monotonic()
-        self._forget(now)
-        new = report.ssrc not in self._receivers
-        if new and len(self._receivers) >= MAX_RECEIVERS:
+        self._forget_silent(now)
+        is_new = report.ssrc not in self._receivers
+        if is_new and len(self._receivers) >= MAX_RECEIVERS:
             return False
-        known = self._receivers.get(
-            report.ssrc, _ReportingReceiver(address, self._no_report, None, now)
+        receiver = self._receivers.get(
+            report.ssrc, _ReportingReceiver(address, self._empty_block, None, now)
         )
         block = next((block for block in report.blocks if block.ssrc == self._ssrc), None)
         if block is not None:  # feedback packets have no report block
-            known = _ReportingReceiver(address, block, _round_trip(block), now)
-        self._receivers[report.ssrc] = known._replace(at=now)
-        return new
+            receiver = _ReportingReceiver(address, block, _round_trip(block), now)
+        self._receivers[report.ssrc] = receiver._replace(reported_at=now)
+        return is_new
 
     def remove(self, ssrc: int) -> None:
         """Forget a receiver that said goodbye."""
@@ -89,7 +89,7 @@ class Audience:
     def receivers(self) -> tuple[RtpReceiver, ...]:
         """Return the reporting receivers."""
         now = time.monotonic()
-        self._forget(now)
+        self._forget_silent(now)
         return tuple(
             RtpReceiver(
                 receiver.address,
@@ -97,16 +97,16 @@ class Audience:
                 receiver.block.lost,
                 receiver.block.jitter / CLOCK_RATE,
                 receiver.round_trip,
-                now - receiver.at,
+                now - receiver.reported_at,
             )
             for receiver in self._receivers.values()
         )
 
-    def _forget(self, now: float) -> None:
+    def _forget_silent(self, now: float) -> None:
         self._receivers = {
             ssrc: receiver
             for ssrc, receiver in self._receivers.items()
-            if now - receiver.at < RECEIVER_TIMEOUT
+            if now - receiver.reported_at < RECEIVER_TIMEOUT
         }
 
 
@@ -114,15 +114,15 @@ def _round_trip(block: ReportBlock) -> float | None:
     """Return RFC 3550's round-trip time, seconds; None if the block names no sender report."""
     if not block.last_report:
         return None
-    ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
+    ticks = middle_bits(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
     return ticks / 65536 if ticks < 1 << 31 else 0.0  # negative after a clock was set
 
 
 class _SentPacket:
-    __slots__ = ("at", "data", "resends")
+    __slots__ = ("data", "resends", "sent_at")
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.resends, self.at = data, 0, time.monotonic()
+        self.data, self.resends, self.sent_at = data, 0, time.monotonic()
 
 
 class PacketHistory:
@@ -143,7 +143,7 @@ class PacketHistory:
         if (
             packet is None
             or packet.resends >= MAX_RESENDS
-            or time.monotonic() - packet.at > MAX_RESEND_AGE
+            or time.monotonic() - packet.sent_at > MAX_RESEND_AGE
         ):
             return None
         packet.resends += 1

@@ -6,7 +6,7 @@ import secrets
 from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
-from smartcam.frames._streaming.rtp.assembling import END, START, NalUnit
+from smartcam.frames._streaming.rtp.assembling import END, START, NalAccessUnit
 from smartcam.frames._streaming.rtp.packets import RtpPacket
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MTU_PAYLOAD: Final = 1380
 """Largest payload of a packet, bytes; with headers and a tunnel it fits into Ethernet's 1500."""
 
-SLICES, KEY, SPS, PPS, DELIMITER = range(1, 6), 5, 7, 8, 9
+SLICES, KEY_SLICE, SPS, PPS, DELIMITER = range(1, 6), 5, 7, 8, 9
 """Types of NAL units (ITU-T H.264, table 7-1)."""
 
 STAP_A, FU_A = 24, 28
@@ -30,20 +30,20 @@ def units(access_unit: bytes) -> list[bytes]:
         access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: there is no start code first, or a unit has an unknown type.
+        FrameFormatError: the bytes do not begin with a start code, or a unit has an unknown type.
     """
     data = bytes(access_unit)
-    place = data.find(b"\0\0\1")
-    if place < 0 or data[:place].strip(b"\0"):
+    start = data.find(b"\0\0\1")
+    if start < 0 or data[:start].strip(b"\0"):
         raise _format_error("a start code first", data)
     nal_units = []
-    while place >= 0:
-        after = data.find(b"\0\0\1", place + 3)
-        unit = data[place + 3 : after if after >= 0 else len(data)].rstrip(b"\0")
+    while start >= 0:
+        next_start = data.find(b"\0\0\1", start + 3)
+        unit = data[start + 3 : next_start if next_start >= 0 else len(data)].rstrip(b"\0")
         if not unit or unit[0] & 0x80 or not 1 <= unit[0] & 0x1F < STAP_A:
             raise _format_error("units of kinds 1 to 23", unit)
         nal_units.append(unit)
-        place = after
+        start = next_start
     return nal_units
 
 
@@ -116,18 +116,18 @@ class H264Packetizer:
         payloads = [
             part for group in self._groups(units(access_unit)) for part in self._payloads(group)
         ]
-        made: list[bytes] = []
+        packets: list[bytes] = []
         for payload in payloads:
-            last = len(made) == len(payloads) - 1
-            head = (last, self.payload_type, self._sequence, timestamp & 0xFFFFFFFF, self.ssrc)
-            made.append(RtpPacket(*head, payload).pack())
+            marker = len(packets) == len(payloads) - 1
+            head = (marker, self.payload_type, self._sequence, timestamp & 0xFFFFFFFF, self.ssrc)
+            packets.append(RtpPacket(*head, payload).pack())
             self._sequence = self._sequence + 1 & 0xFFFF
-        self.packets_made += len(made)
+        self.packets_made += len(packets)
         self.octets_made += sum(map(len, payloads))
-        return made
+        return packets
 
     def _groups(self, nal_units: list[bytes]) -> Iterator[list[bytes]]:
-        """Yield groups of units for one packet: parameter sets and messages, as far as they fit."""
+        """Yield the units of each packet: a slice alone, other units together while they fit."""
         group: list[bytes] = []
         for unit in nal_units:
             fits = 1 + sum(2 + len(member) for member in (*group, unit)) <= self._mtu
@@ -145,19 +145,21 @@ class H264Packetizer:
         first = group[0]
         if len(group) > 1:
             importance = max(unit[0] & 0x60 for unit in group)
-            sized = (len(unit).to_bytes(2, "big") + unit for unit in group)
-            yield bytes((importance | STAP_A,)) + b"".join(sized)
+            sized_units = (len(unit).to_bytes(2, "big") + unit for unit in group)
+            yield bytes((importance | STAP_A,)) + b"".join(sized_units)
         elif len(first) <= self._mtu:
             yield first
         else:
-            room = self._mtu - 2
-            for at in range(1, len(first), room):
-                start, end = START * (at == 1), END * (at + room >= len(first))
-                second = start | end | first[0] & 0x1F
-                yield bytes((first[0] & 0x60 | FU_A, second)) + first[at : at + room]
+            size = self._mtu - 2
+            for offset in range(1, len(first), size):
+                start_bit, end_bit = START * (offset == 1), END * (offset + size >= len(first))
+                fragment_header = start_bit | end_bit | first[0] & 0x1F
+                yield (
+                    bytes((first[0] & 0x60 | FU_A, fragment_header)) + first[offset : offset + size]
+                )
 
 
-class H264Unit(NalUnit):
+class H264AccessUnit(NalAccessUnit):
     """An access unit of H.264."""
 
     HEADER_SIZE = 1
@@ -165,39 +167,39 @@ class H264Unit(NalUnit):
     FRAGMENT = 28
 
     @staticmethod
-    def kind_of(head: int) -> int:
-        """Return a unit's kind."""
+    def unit_type(head: int) -> int:
+        """Return a NAL unit's type; -1: not valid."""
         return -1 if head & 0x80 or not head & 0x1F else head & 0x1F
 
     @staticmethod
-    def is_picture(kind: int) -> bool:
+    def is_picture(unit_type: int) -> bool:
         """Return True for slices."""
-        return kind in SLICES
+        return unit_type in SLICES
 
     @classmethod
-    def whole_head(cls, payload: bytes) -> bytes:
-        """Return the header of the unit whose fragment is in a packet."""
+    def fragmented_header(cls, payload: bytes) -> bytes:
+        """Return the header of the NAL unit whose fragment is in a packet."""
         return bytes((payload[0] & 0xE0 | payload[1] & 0x1F,))
 
 
-class H264Units:
-    """Rules by which access units of H.264 begin and are assembled."""
+class H264PayloadFormat:
+    """The RTP payload format of H.264."""
 
-    new_unit = H264Unit
+    new_unit = H264AccessUnit
 
     @staticmethod
-    def begins(payload: bytes) -> bool:
-        """Return True if a packet begins a frame by its type, or as a key frame's first slice."""
-        kind = payload[0] & 0x1F if payload else 0
-        if kind == STAP_A and len(payload) > 3:
+    def is_frame_start(payload: bytes) -> bool:
+        """Return True if a packet has parameters, a delimiter, or a key frame's first slice."""
+        unit_type = payload[0] & 0x1F if payload else 0
+        if unit_type == STAP_A and len(payload) > 3:
             payload = payload[3:]
-            kind = payload[0] & 0x1F
-        elif kind == FU_A and len(payload) > 2 and payload[1] & START:
+            unit_type = payload[0] & 0x1F
+        elif unit_type == FU_A and len(payload) > 2 and payload[1] & START:
             payload = payload[1:]
-            kind = payload[0] & 0x1F
-        if kind == KEY:  # first_mb_in_slice is the first field; 0 is coded as one bit
+            unit_type = payload[0] & 0x1F
+        if unit_type == KEY_SLICE:  # first_mb_in_slice is the first field; 0 is coded as one bit
             return len(payload) > 1 and bool(payload[1] & 0x80)
-        return kind in (SPS, DELIMITER)
+        return unit_type in (SPS, DELIMITER)
 
 
 def _format_error(expected: str, actual: bytes) -> FrameFormatError:

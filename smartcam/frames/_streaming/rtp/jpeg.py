@@ -8,7 +8,7 @@ from typing import Final
 from smartcam.frames._streaming.rtp.assembling import OpenUnit
 
 HEAD_BYTES: Final = 8
-"""Number of bytes of the header of a packet's piece of a picture."""
+"""Number of bytes of the header before each piece of a picture."""
 
 RESTARTS: Final = range(64, 128)
 """Types of pictures with restart markers."""
@@ -29,8 +29,8 @@ _CHROMA: Final = (
 """Quantization tables of quality 50 in zigzag order (ITU-T T.81, annex K.1)."""
 
 _HUFFMAN: Final = tuple(
-    (place, bytes.fromhex(counts), bytes.fromhex(values))
-    for place, counts, values in (
+    (table_id, bytes.fromhex(counts), bytes.fromhex(values))
+    for table_id, counts, values in (
         (0x00, "00010501010101010100000000000000", "000102030405060708090a0b"),
         (
             0x10,
@@ -54,99 +54,108 @@ _HUFFMAN: Final = tuple(
 """Huffman tables of all these pictures (annex K.3): class and id, counts, values."""
 
 
-class JpegUnits:
-    """Rules by which access units of JPEGs begin and are assembled; keeps tables that come once.
+class JpegPayloadFormat:
+    """The RTP payload format of JPEG; it remembers tables that a sender sends only once.
 
     Args:
-        size: size of the pictures, for sizes above 2040 pixels, which packets do not have.
+        size: size of the pictures, for sizes above 2040 pixels, which packets cannot hold.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:
         self.size = size
         self.tables: dict[int, tuple[bytes, ...]] = {}
 
-    def new_unit(self, timestamp: int, unbroken: bool, arrived: float) -> JpegUnit:
+    def new_unit(self, timestamp: int, unbroken: bool, arrived_at: float) -> JpegAccessUnit:
         """Return a new picture."""
-        return JpegUnit(self, timestamp, unbroken, arrived)
+        return JpegAccessUnit(self, timestamp, unbroken, arrived_at)
 
     @staticmethod
-    def begins(payload: bytes) -> bool:
+    def is_frame_start(payload: bytes) -> bool:
         """Return True if a packet has the first piece of a picture."""
         return len(payload) > HEAD_BYTES and payload[1:4] == b"\0\0\0"
 
 
-class JpegUnit(OpenUnit):
+class JpegAccessUnit(OpenUnit):
     """One picture."""
 
-    def __init__(self, kind: JpegUnits, timestamp: int, unbroken: bool, arrived: float) -> None:
-        super().__init__(timestamp, unbroken, arrived)
-        self._of = kind
-        self._next = 0  # offset of the next piece in the picture
+    def __init__(
+        self,
+        payload_format: JpegPayloadFormat,
+        timestamp: int,
+        unbroken: bool,
+        arrived_at: float,
+    ) -> None:
+        super().__init__(timestamp, unbroken, arrived_at)
+        self._payload_format = payload_format
+        self._next_offset = 0  # offset of the next piece in the picture
 
     def data(self) -> bytes:
         """Return the picture as a file."""
         end = b"" if self.parts[-1].endswith(b"\xff\xd9") else b"\xff\xd9"
         return b"".join((*self.parts, end))
 
-    def _added(self, payload: bytes) -> bool:
-        if len(payload) <= HEAD_BYTES or int.from_bytes(payload[1:4], "big") != self._next:
+    def _add_payload(self, payload: bytes) -> bool:
+        if len(payload) <= HEAD_BYTES or int.from_bytes(payload[1:4], "big") != self._next_offset:
             return False
-        place = HEAD_BYTES
-        restart = b""
+        offset = HEAD_BYTES
+        restart_interval = b""
         if payload[4] in RESTARTS:
-            restart, place = payload[place : place + 2], place + 4
-        if not self._next:
-            read = self._tables(payload, place)
-            if read is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
+            restart_interval, offset = payload[offset : offset + 2], offset + 4
+        if not self._next_offset:
+            found = self._read_tables(payload, offset)
+            if found is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
                 return False
-            place, tables = read
-            self.parts.append(self._head(payload, tables, restart))
-        piece = payload[place:]
-        self._next += len(piece)
+            offset, tables = found
+            self.parts.append(self._jpeg_header(payload, tables, restart_interval))
+        piece = payload[offset:]
+        self._next_offset += len(piece)
         self.parts.append(piece)
         self.has_picture = True
         return bool(piece)
 
-    def _tables(self, payload: bytes, place: int) -> tuple[int, tuple[bytes, ...]] | None:
+    def _read_tables(self, payload: bytes, offset: int) -> tuple[int, tuple[bytes, ...]] | None:
         """Return the offset after the tables, and the tables; None: the tables are unknown."""
         quality = payload[5]
         if quality < 128:
-            return (place, scaled(quality)) if 1 <= quality < 100 else None
-        if len(payload) < place + 4:
+            return (offset, scaled_tables(quality)) if 1 <= quality < 100 else None
+        if len(payload) < offset + 4:
             return None
-        _, wide, length = struct.unpack_from("!BBH", payload, place)
-        place += 4
+        _, wide_bits, length = struct.unpack_from("!BBH", payload, offset)
+        offset += 4
         if not length:
-            known = self._of.tables.get(quality)
-            return None if known is None else (place, known)
-        tables = cut(payload[place : place + length], wide)
-        if len(tables) < 1 or place + length > len(payload):
+            remembered = self._payload_format.tables.get(quality)
+            return None if remembered is None else (offset, remembered)
+        tables = split_tables(payload[offset : offset + length], wide_bits)
+        if len(tables) < 1 or offset + length > len(payload):
             return None
-        if quality < 255 and len(self._of.tables) < MAX_QUANTIZATION_TABLES:
-            self._of.tables[quality] = tables
-        return place + length, tables
+        if quality < 255 and len(self._payload_format.tables) < MAX_QUANTIZATION_TABLES:
+            self._payload_format.tables[quality] = tables
+        return offset + length, tables
 
-    def _head(self, payload: bytes, tables: tuple[bytes, ...], restart: bytes) -> bytes:
+    def _jpeg_header(
+        self, payload: bytes, tables: tuple[bytes, ...], restart_interval: bytes
+    ) -> bytes:
         width, height = payload[6] * 8, payload[7] * 8
-        if self._of.size is not None and not (width and height):
-            width, height = self._of.size
+        if self._payload_format.size is not None and not (width and height):
+            width, height = self._payload_format.size
         parts = [b"\xff\xd8"]
         for number, table in enumerate(tables[:2]):
-            wide = len(table) > 64
-            parts.append(_segment(0xDB, bytes((wide << 4 | number,)) + table))
-        if any(restart):
-            parts.append(_segment(0xDD, restart))
+            is_wide = len(table) > 64
+            parts.append(_segment(0xDB, bytes((is_wide << 4 | number,)) + table))
+        if any(restart_interval):
+            parts.append(_segment(0xDD, restart_interval))
         sampling = 0x22 if payload[4] & 1 else 0x21
         chroma = min(1, len(tables) - 1)
         frame = struct.pack("!BHHB", 8, height, width, 3)
         parts.append(_segment(0xC0, frame + bytes((1, sampling, 0, 2, 17, chroma, 3, 17, chroma))))
-        parts += (_segment(0xC4, bytes((at,)) + counts + codes) for at, counts, codes in _HUFFMAN)
+        for table_id, counts, values in _HUFFMAN:
+            parts.append(_segment(0xC4, bytes((table_id,)) + counts + values))
         parts.append(_segment(0xDA, bytes((3, 1, 0, 2, 0x11, 3, 0x11, 0, 63, 0))))
         return b"".join(parts)
 
 
-def scaled(quality: int) -> tuple[bytes, ...]:
-    """Return the tables of a quality from 1 to 99."""
+def scaled_tables(quality: int) -> tuple[bytes, ...]:
+    """Return the quantization tables of a quality from 1 to 99."""
     factor = 5000 // quality if quality < 50 else 200 - 2 * quality
     return tuple(
         bytes(min(255, max(1, (int(number) * factor + 50) // 100)) for number in table.split())
@@ -154,11 +163,14 @@ def scaled(quality: int) -> tuple[bytes, ...]:
     )
 
 
-def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
-    """Return the tables in ``data``: each has 64 bytes, or 128 if its bit in ``wide`` is set."""
+def split_tables(data: bytes, wide_bits: int) -> tuple[bytes, ...]:
+    """Return the tables in ``data``: each has 64 bytes, or 128 if its bit in ``wide_bits`` is set.
+
+    Empty: a table is cut off.
+    """
     tables: list[bytes] = []
     while data and len(tables) < 4:
-        size = 128 if wide >> len(tables) & 1 else 64
+        size = 128 if wide_bits >> len(tables) & 1 else 64
         if len(data) < size:
             return ()
         tables.append(data[:size])
@@ -168,10 +180,10 @@ def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
 
 def size_in(picture: bytes) -> tuple[int, int] | None:
     """Return the size from the header of an assembled picture."""
-    place = picture.find(b"\xff\xc0\0\x11\x08")
-    if place < 0 or len(picture) < place + 9:
+    offset = picture.find(b"\xff\xc0\0\x11\x08")
+    if offset < 0 or len(picture) < offset + 9:
         return None
-    height, width = struct.unpack_from("!HH", picture, place + 5)
+    height, width = struct.unpack_from("!HH", picture, offset + 5)
     return (width, height) if width and height else None
 
 

@@ -31,7 +31,7 @@ class RtpPacket(NamedTuple):
     """One packet of a stream.
 
     Attributes:
-        marker: True for the last packet of a picture, in video.
+        marker: True for the last packet of a picture, in a video stream.
         payload_type: payload type, 0 to 127.
         sequence: sequence number, 0 to 65535.
         timestamp: timestamp, 0 to 2**32 - 1; for video in ticks of 90 kHz.
@@ -94,7 +94,7 @@ class ReportBlock(NamedTuple):
         highest: highest sequence number, with the count of wraps above the 16 bits.
         jitter: jitter of the arrival, ticks of the stream's clock.
         last_report: middle 32 bits of the last sender report's NTP time; 0: no report.
-        delay: time since this report, in 65536ths of a second.
+        delay: time since that sender report, in 65536ths of a second.
     """
 
     ssrc: int
@@ -201,15 +201,15 @@ class PacketsMissing(NamedTuple):
     def pack(self) -> bytes:
         """Return the request's bytes, with one entry for up to 17 neighbouring packets."""
         body = struct.pack("!II", self.ssrc, self.media)
-        left = list(self.sequences)
-        while left:
-            first = left[0]
+        remaining = list(self.sequences)
+        while remaining:
+            first = remaining[0]
             mask = sum(
                 1 << distance - 1
-                for number in left
-                if 1 <= (distance := number - first & 0xFFFF) <= 16
+                for sequence in remaining
+                if 1 <= (distance := sequence - first & 0xFFFF) <= 16
             )
-            left = [number for number in left if number - first & 0xFFFF > 16]
+            remaining = [sequence for sequence in remaining if sequence - first & 0xFFFF > 16]
             body += struct.pack("!HH", first, mask)
         return _packet(RTPFB, NACK, body)
 
@@ -242,35 +242,35 @@ def parse_rtcp(data: bytes) -> list[Report]:
         MessageError: a length or count is wrong, or the first packet is no report.
     """
     reports: list[Report] = []
-    place = 0
-    while place < len(data) or not place:
-        if len(data) - place < 4:
-            raise _cut_off_error("RTCP head", place + 4, data)
-        first, kind = data[place], data[place + 1]
-        end = place + 4 + 4 * int.from_bytes(data[place + 2 : place + 4], "big")
+    offset = 0
+    while offset < len(data) or not offset:
+        if len(data) - offset < 4:
+            raise _cut_off_error("RTCP head", offset + 4, data)
+        first, kind = data[offset], data[offset + 1]
+        end = offset + 4 + 4 * int.from_bytes(data[offset + 2 : offset + 4], "big")
         if first >> 6 != VERSION or not 192 <= kind <= 223:
             raise MessageError(
                 f"RTCP: expected version 2 and a type from 192 to 223, got {first >> 6} and {kind}",
-                offset=place,
-                data=data[place:],
+                offset=offset,
+                data=data[offset:],
             )
         if end > len(data):
             raise _cut_off_error("RTCP packet", end, data)
-        body = data[place + 4 : end]
+        body = data[offset + 4 : end]
         if first & 0x20:
-            body = _unpadded(body, end == len(data), place, data)
-        read = _READERS.get(kind)
-        if read is not None:
+            body = _without_padding(body, end == len(data), offset, data)
+        parse = _PARSERS.get(kind)
+        if parse is not None:
             try:
-                reports += read(first & 0x1F, body)
+                reports += parse(first & 0x1F, body)
             except (struct.error, IndexError) as exc:
                 raise MessageError(
                     f"RTCP: a packet of type {kind} with a count of {first & 0x1F}: its "
                     f"{len(body)} bytes are too few",
-                    offset=place,
-                    data=data[place:end],
+                    offset=offset,
+                    data=data[offset:end],
                 ) from exc
-        place = end
+        offset = end
     return reports
 
 
@@ -286,31 +286,32 @@ def _sender_report(count: int, body: bytes) -> Iterable[Report]:
 
 
 def _receiver_report(count: int, body: bytes) -> Iterable[Report]:
-    yield ReceiverReport(_number(body, 0), _blocks(count, body[4:]))
+    yield ReceiverReport(_read_uint32(body, 0), _blocks(count, body[4:]))
 
 
 def _blocks(count: int, data: bytes) -> tuple[ReportBlock, ...]:
     size = _BLOCK.size
-    return tuple(ReportBlock.parse(data[at : at + size]) for at in range(0, count * size, size))
+    starts = range(0, count * size, size)
+    return tuple(ReportBlock.parse(data[start : start + size]) for start in starts)
 
 
 def _descriptions(count: int, body: bytes) -> Iterable[Report]:
-    place = 0
+    offset = 0
     for _ in range(count):
-        ssrc = _number(body, place)
-        place += 4
-        while body[place]:
-            item, size = body[place], body[place + 1]
-            place += 2 + size
-            if place > len(body):
+        ssrc = _read_uint32(body, offset)
+        offset += 4
+        while body[offset]:
+            item, size = body[offset], body[offset + 1]
+            offset += 2 + size
+            if offset > len(body):
                 raise IndexError
             if item == CNAME:
-                yield SourceDescription(ssrc, body[place - size : place].decode(errors="replace"))
-        place += 4 - place % 4
+                yield SourceDescription(ssrc, body[offset - size : offset].decode(errors="replace"))
+        offset += 4 - offset % 4
 
 
 def _goodbye(count: int, body: bytes) -> Iterable[Report]:
-    ssrcs = tuple(_number(body, 4 * place) for place in range(count))
+    ssrcs = tuple(_read_uint32(body, 4 * index) for index in range(count))
     reason = body[4 * count :]
     size = reason[0] if reason else 0
     if 1 + size > len(reason) > 0:
@@ -318,39 +319,39 @@ def _goodbye(count: int, body: bytes) -> Iterable[Report]:
     yield Goodbye(ssrcs, reason[1 : 1 + size].decode(errors="replace"))
 
 
-def _missing(kind: int, body: bytes) -> Iterable[Report]:
-    ssrc, media = _number(body, 0), _number(body, 4)
+def _packets_missing(kind: int, body: bytes) -> Iterable[Report]:
+    ssrc, media = _read_uint32(body, 0), _read_uint32(body, 4)
     if kind != NACK:
         return
     sequences: dict[int, None] = {}
     for first, mask in struct.iter_unpack("!HH", body[8:]):
-        following = [place + 1 for place in range(16) if mask >> place & 1]
-        sequences |= dict.fromkeys(first + offset & 0xFFFF for offset in (0, *following))
+        distances = [bit + 1 for bit in range(16) if mask >> bit & 1]
+        sequences |= dict.fromkeys(first + distance & 0xFFFF for distance in (0, *distances))
     yield PacketsMissing(ssrc, media, tuple(sequences))
 
 
 def _picture_lost(kind: int, body: bytes) -> Iterable[Report]:
-    ssrc, media = _number(body, 0), _number(body, 4)
+    ssrc, media = _read_uint32(body, 0), _read_uint32(body, 4)
     if kind == PLI:
         yield PictureLost(ssrc, media)
 
 
-_READERS: Final[dict[int, Callable[[int, bytes], Iterable[Report]]]] = {
+_PARSERS: Final[dict[int, Callable[[int, bytes], Iterable[Report]]]] = {
     SR: _sender_report,
     RR: _receiver_report,
     SDES: _descriptions,
     BYE: _goodbye,
-    RTPFB: _missing,
+    RTPFB: _packets_missing,
     PSFB: _picture_lost,
 }
-"""Readers by type of packet, which get the count (or kind of feedback) and the body."""
+"""Parser of each packet type, called with the header's count (or feedback type) and the body."""
 
 _MASKS: Final = (0xFFFFFFFF, (1 << 64) - 1, 0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF)
 
 
-def _number(data: bytes, place: int) -> int:
-    number: int = struct.unpack_from("!I", data, place)[0]
-    return number
+def _read_uint32(data: bytes, offset: int) -> int:
+    value: int = struct.unpack_from("!I", data, offset)[0]
+    return value
 
 
 def _packet(kind: int, count: int, body: bytes) -> bytes:
@@ -359,14 +360,14 @@ def _packet(kind: int, count: int, body: bytes) -> bytes:
     return struct.pack("!BBH", VERSION << 6 | count, kind, len(body) // 4) + body
 
 
-def _unpadded(body: bytes, last: bool, place: int, data: bytes) -> bytes:
+def _without_padding(body: bytes, is_last: bool, offset: int, data: bytes) -> bytes:
     padding = body[-1] if body else 0
-    if not last or not 4 <= padding <= len(body) or padding % 4:
+    if not is_last or not 4 <= padding <= len(body) or padding % 4:
         raise MessageError(
             f"RTCP: padding: expected a multiple of 4 up to {len(body)} in the last packet, got "
             f"{padding}",
-            offset=place,
-            data=data[place:],
+            offset=offset,
+            data=data[offset:],
         )
     return body[:-padding]
 

@@ -17,7 +17,7 @@ from smartcam.frames._streaming.rtp.reception import Reception
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.frames._streaming.rtp.assembling import AccessUnit, UnitKind
+    from smartcam.frames._streaming.rtp.assembling import AccessUnit, PayloadFormat
     from smartcam.frames._streaming.rtp.packets import RtpPacket
 
 
@@ -88,17 +88,17 @@ class RtpStatistics:
 class PacketChannels(Protocol):
     """Two channels of a stream, such as sockets: one for packets, one for reports."""
 
-    def read(
+    def start_reading(
         self,
-        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
-        rtcp: Callable[[bytes, tuple[Any, ...]], None],
-        read: Callable[[], None],
+        on_rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        on_rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        on_batch_read: Callable[[], None],
         /,
     ) -> None:
-        """Call ``rtp`` and ``rtcp`` for each packet and report, and ``read`` after each batch."""
+        """Call a function for each packet, for each report, and after each batch of datagrams."""
         ...
 
-    def report(self, data: bytes, to: tuple[Any, ...], /) -> None:
+    def send_rtcp(self, data: bytes, address: tuple[Any, ...], /) -> None:
         """Send a report, or drop it if it cannot be sent now."""
         ...
 
@@ -114,13 +114,13 @@ class StreamReceiver:
         pair: unused channels.
         payload_type: payload type of the stream's packets.
         repair: seconds to wait for a missing packet after a request.
-        done: function that is called with complete encoded frames.
-        gone: function that is called with the reason when the sender ends the stream.
-        only: addresses of accepted hosts; empty: any host.
-        kind: kind of the payloads; None: H.264.
-        agreed: whether the stream was negotiated: then a new stream of the same host replaces it at
-            once, and missing packets are not requested.
-        proofs: number of earlier frames of the sender with a right marker.
+        on_units: function that is called with complete encoded frames.
+        on_goodbye: function that is called with the reason when the sender ends the stream.
+        only_hosts: addresses of accepted hosts; empty: any host.
+        payload_format: format of the payloads; None: H.264.
+        is_negotiated: whether RTSP negotiated the stream: then a new stream of the same host
+            replaces it at once, and the wait for missing packets is short.
+        right_markers: number of earlier frames of the sender with a right marker.
 
     Attributes:
         last_packet_at: time of the stream's last packet, on the loop's clock.
@@ -131,40 +131,41 @@ class StreamReceiver:
         pair: PacketChannels,
         payload_type: int,
         repair: float,
-        done: Callable[[list[AccessUnit]], None],
-        gone: Callable[[str], None],
-        only: tuple[str, ...] = (),
-        kind: UnitKind | None = None,
+        on_units: Callable[[list[AccessUnit]], None],
+        on_goodbye: Callable[[str], None],
+        only_hosts: tuple[str, ...] = (),
+        payload_format: PayloadFormat | None = None,
         *,
-        agreed: bool = False,
-        proofs: int = 0,
+        is_negotiated: bool = False,
+        right_markers: int = 0,
     ) -> None:
         self._pair, self._payload_type, self._repair = pair, payload_type, repair
-        self._done, self._on_goodbye, self._only = done, gone, only
-        self._agreed = agreed
+        self._on_units, self._on_goodbye, self._only_hosts = on_units, on_goodbye, only_hosts
+        self._is_negotiated = is_negotiated
         self._loop = asyncio.get_running_loop()
-        self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, kind, wary=True)
-        self._depacketizer.proofs = proofs
+        self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, payload_format, verify_markers=True)
+        self._depacketizer.right_markers = right_markers
         self._reception: Reception | None = None
-        self._early: tuple[wire.SenderReport, float] | None = None  # before the first packet
-        self._sender: tuple[Any, ...] = ()
-        self._reports_to: tuple[Any, ...] = ()
+        # report that came before the first packet, and its time
+        self._early_report: tuple[wire.SenderReport, float] | None = None
+        self._sender_address: tuple[Any, ...] = ()
+        self._report_address: tuple[Any, ...] = ()
         self._ssrc = secrets.randbits(32)
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
         self._requested_at: dict[int, float] = {}
-        self._vain = 0
+        self._unanswered_requests = 0
         self._repaired = self._strange = self._packets = 0
-        self._made: list[AccessUnit] = []
-        self._tick: asyncio.TimerHandle | None = None
-        self._next_report: asyncio.TimerHandle | None = None
-        self._picture_asked = float("-inf")
-        self._began = self._shown_at = float("-inf")
+        self._completed: list[AccessUnit] = []
+        self._check_timer: asyncio.TimerHandle | None = None
+        self._report_timer: asyncio.TimerHandle | None = None
+        self._key_frame_requested_at = float("-inf")
+        self._started_at = self._decoded_at = float("-inf")
         self.last_packet_at = self._loop.time()
-        pair.read(self._packet, self._report_came, self._read)
+        pair.start_reading(self._on_packet, self._on_rtcp, self._on_batch_read)
 
     def close(self) -> None:
         """Send the RTCP message BYE and stop receiving. Idempotent."""
-        for timer in (self._tick, self._next_report):
+        for timer in (self._check_timer, self._report_timer):
             if timer is not None:
                 timer.cancel()
         if self._reception is not None:
@@ -174,192 +175,199 @@ class StreamReceiver:
 
     def statistics(self, overflows: int) -> RtpStatistics:
         """Return the counts of packets received."""
-        taken = self._depacketizer
+        depacketizer = self._depacketizer
         return RtpStatistics(
             self._packets,
-            taken.lost,
+            depacketizer.lost,
             self._repaired,
-            taken.duplicates,
-            taken.damaged,
+            depacketizer.duplicates,
+            depacketizer.damaged,
             overflows,
             self._strange,
             0.0 if self._reception is None else self._reception.jitter,
         )
 
     @property
-    def proofs(self) -> int:
+    def right_markers(self) -> int:
         """Number of the sender's frames with a right marker."""
-        return self._depacketizer.proofs
+        return self._depacketizer.right_markers
 
     def utc(self, timestamp: int) -> float | None:
         """Return a time on the sender's wall clock; None if the sender has not reported it yet."""
         return None if self._reception is None else self._reception.utc(timestamp)
 
-    def want_picture(self) -> None:
+    def request_key_frame(self) -> None:
         """Request a key frame, unless one was requested recently."""
         now = self._loop.time()
-        if self._reception is not None and now - self._picture_asked >= KEY_FRAME_REQUEST_INTERVAL:
-            self._picture_asked = now
+        since_request = now - self._key_frame_requested_at
+        if self._reception is not None and since_request >= KEY_FRAME_REQUEST_INTERVAL:
+            self._key_frame_requested_at = now
             self._send_report(wire.PictureLost(self._ssrc, self._reception.ssrc))
 
-    def shown(self) -> None:
-        """Note that a picture of the stream was decoded."""
-        self._shown_at = self._loop.time()
+    def note_decoded(self) -> None:
+        """Record that a picture of the stream was decoded."""
+        self._decoded_at = self._loop.time()
 
     # received data
 
-    def _packet(self, data: bytes, sender: tuple[Any, ...]) -> None:
+    def _on_packet(self, data: bytes, sender: tuple[Any, ...]) -> None:
         try:
             packet = wire.RtpPacket.parse(data)
         except MessageError:
             self._strange += 1
             return
-        ours = self._stream_of(packet, sender)
-        if ours is None:
+        reception = self._reception_of(packet, sender)
+        if reception is None:
             self._strange += 1
             return
         self.last_packet_at = now = self._loop.time()
         self._packets += 1
-        ours.packet(packet, now)
+        reception.count_packet(packet, now)
         if self._requested_at.pop(packet.sequence, None) is not None:
             self._repaired += 1
-            self._vain = 0
-        self._made += self._depacketizer.take(packet, now)
+            self._unanswered_requests = 0
+        self._completed += self._depacketizer.add_packet(packet, now)
 
-    def _stream_of(self, packet: RtpPacket, sender: tuple[Any, ...]) -> Reception | None:
-        """Return the stream of a packet; the first stream is used until it is silent."""
-        if packet.payload_type != self._payload_type or not self._may_speak(sender):
+    def _reception_of(self, packet: RtpPacket, sender: tuple[Any, ...]) -> Reception | None:
+        """Return the reception that counts a packet; None: the packet is not accepted.
+
+        The first stream is received until it is silent.
+        """
+        if packet.payload_type != self._payload_type or not self._is_accepted(sender):
             return None
         now = self._loop.time()
-        if (ours := self._reception) is not None:
-            same = self._agreed or sender == self._sender
-            if packet.ssrc == ours.ssrc and same:
-                return ours
-            if self._holds_against(sender, now):
+        if (reception := self._reception) is not None:
+            is_same_sender = self._is_negotiated or sender == self._sender_address
+            if packet.ssrc == reception.ssrc and is_same_sender:
+                return reception
+            if self._keeps_current_stream(sender, now):
                 return None
-        self._reception = ours = Reception(packet.ssrc)
-        if self._early is not None and self._early[0].ssrc == ours.ssrc:
-            ours.sender(*self._early)
-        self._began, self._shown_at = now, float("-inf")
-        self._sender = sender
-        if self._reports_to[:1] != sender[:1]:
-            self._reports_to = (sender[0], sender[1] + 1, *sender[2:])
+        self._reception = reception = Reception(packet.ssrc)
+        if self._early_report is not None and self._early_report[0].ssrc == reception.ssrc:
+            reception.set_sender_report(*self._early_report)
+        self._started_at, self._decoded_at = now, float("-inf")
+        self._sender_address = sender
+        if self._report_address[:1] != sender[:1]:
+            self._report_address = (sender[0], sender[1] + 1, *sender[2:])
         self._requested_at.clear()
-        self._vain = 0
-        self._report()
-        self.want_picture()
-        return ours
+        self._unanswered_requests = 0
+        self._report_regularly()
+        self.request_key_frame()
+        return reception
 
-    def _holds_against(self, sender: tuple[Any, ...], now: float) -> bool:
+    def _keeps_current_stream(self, sender: tuple[Any, ...], now: float) -> bool:
         """Return True if the stream is kept although another sender sends packets.
 
         A stream without a decoded picture may be replaced, since any host can send packets.
         """
-        if self._agreed:
+        if self._is_negotiated:
             return (
-                now - self._began < NEW_STREAM_DELAY
+                now - self._started_at < NEW_STREAM_DELAY
                 and now - self.last_packet_at < KEY_FRAME_REQUEST_INTERVAL
             )
-        if now - self._shown_at >= NEW_HOST_DELAY:
-            return now - self._began < NEW_STREAM_DELAY
+        if now - self._decoded_at >= NEW_HOST_DELAY:
+            return now - self._started_at < NEW_STREAM_DELAY
         return now - self.last_packet_at < (
-            NEW_STREAM_DELAY if sender[0] == self._sender[0] else NEW_HOST_DELAY
+            NEW_STREAM_DELAY if sender[0] == self._sender_address[0] else NEW_HOST_DELAY
         )
 
-    def _may_speak(self, sender: tuple[Any, ...]) -> bool:
-        return not self._only or str(sender[0]).partition("%")[0] in self._only
+    def _is_accepted(self, sender: tuple[Any, ...]) -> bool:
+        return not self._only_hosts or str(sender[0]).partition("%")[0] in self._only_hosts
 
-    def _read(self) -> None:
+    def _on_batch_read(self) -> None:
         """Pass on complete frames, and check again later if packets are missing."""
-        made, self._made = self._made, []
-        taken = self._depacketizer
-        waits = taken.waits_since() is not None or taken.marked_at is not None
-        if self._tick is None and (waits or self._tail_due()):
-            self._tick = self._loop.call_later(CHECK_INTERVAL, self._look)
-        if made:
-            self._done(made)
+        completed, self._completed = self._completed, []
+        depacketizer = self._depacketizer
+        must_check = depacketizer.waiting_since() is not None or depacketizer.marked_at is not None
+        if self._check_timer is None and (must_check or self._awaits_frame_end()):
+            self._check_timer = self._loop.call_later(CHECK_INTERVAL, self._check_missing)
+        if completed:
+            self._on_units(completed)
 
-    def _look(self) -> None:
-        self._tick = None
+    def _check_missing(self) -> None:
+        self._check_timer = None
         now = self._loop.time()
-        missing = self._depacketizer.missing()
+        missing = self._depacketizer.missing_sequences()
         lost = self._depacketizer.lost
-        self._made += self._depacketizer.give_up(now - self._patience())
-        self._made += self._depacketizer.end_marked(now - MARKER_GRACE)
+        self._completed += self._depacketizer.give_up(now - self._missing_timeout())
+        self._completed += self._depacketizer.end_marked(now - MARKER_GRACE)
         if self._depacketizer.lost > lost:
-            self._vain += 1
+            self._unanswered_requests += 1
             self._requested_at.clear()
-            self.want_picture()
+            self.request_key_frame()
         elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
-            tail = self._depacketizer.tail()
+            next_sequence = self._depacketizer.next_of_open_frame()
             if (
-                tail is not None
-                and self._tail_due()
+                next_sequence is not None
+                and self._awaits_frame_end()
                 and now - self.last_packet_at >= MAX_PACKET_INTERVAL
             ):
-                missing = [tail]
-            self._ask(missing, now)
-        self._read()
+                missing = [next_sequence]
+            self._request_packets(missing, now)
+        self._on_batch_read()
 
-    def _patience(self) -> float:
-        if self._agreed:
+    def _missing_timeout(self) -> float:
+        if self._is_negotiated:
             return REORDER_GRACE
-        repeats = self._vain < MAX_UNANSWERED_REQUESTS
+        repeats = self._unanswered_requests < MAX_UNANSWERED_REQUESTS
         return self._repair if repeats else min(self._repair, REORDER_GRACE)
 
-    def _tail_due(self) -> bool:
+    def _awaits_frame_end(self) -> bool:
         """Return True if the rest of a frame is missing and the sender repairs such losses."""
         if not self._repaired or self._loop.time() - self.last_packet_at > self._repair:
             return False
-        return self._depacketizer.tail() is not None
+        return self._depacketizer.next_of_open_frame() is not None
 
-    def _ask(self, missing: list[int], now: float) -> None:
+    def _request_packets(self, missing: list[int], now: float) -> None:
         requested = self._requested_at
         due = [
-            number
-            for number in missing
-            if now - requested.get(number, float("-inf")) >= RESEND_INTERVAL
+            sequence
+            for sequence in missing
+            if now - requested.get(sequence, float("-inf")) >= RESEND_INTERVAL
         ]
         if due and self._reception is not None:
             self._requested_at = {
-                number: requested.get(number, now) for number in missing
+                sequence: requested.get(sequence, now) for sequence in missing
             } | dict.fromkeys(due, now)
             self._send_report(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
 
-    def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
-        if not self._may_speak(sender):
+    def _on_rtcp(self, data: bytes, sender: tuple[Any, ...]) -> None:
+        if not self._is_accepted(sender):
             self._strange += 1
             return
         with contextlib.suppress(MessageError):  # other hosts may send invalid data
             for report in wire.parse_rtcp(data):
-                self._take(report, sender)
+                self._on_report(report, sender)
 
-    def _take(self, report: wire.Report, sender: tuple[Any, ...]) -> None:
-        ours = self._reception
-        if isinstance(report, wire.SenderReport) and ours is None:
-            self._reports_to = sender
-            self._early = (report, self._loop.time()) if report.ntp >> 32 else None
-        if ours is None or sender[0] != self._sender[0]:
+    def _on_report(self, report: wire.Report, sender: tuple[Any, ...]) -> None:
+        reception = self._reception
+        if isinstance(report, wire.SenderReport) and reception is None:
+            self._report_address = sender
+            self._early_report = (report, self._loop.time()) if report.ntp >> 32 else None
+        if reception is None or sender[0] != self._sender_address[0]:
             return
-        if isinstance(report, wire.SenderReport) and report.ssrc == ours.ssrc:
-            self._reports_to = sender
+        if isinstance(report, wire.SenderReport) and report.ssrc == reception.ssrc:
+            self._report_address = sender
             if report.ntp >> 32:  # a sender without a clock sends 0
-                ours.sender(report, self._loop.time())
-        elif isinstance(report, wire.Goodbye) and ours.ssrc in report.ssrcs:
+                reception.set_sender_report(report, self._loop.time())
+        elif isinstance(report, wire.Goodbye) and reception.ssrc in report.ssrcs:
             self._on_goodbye(report.reason)
 
-    def _report(self) -> None:
+    def _report_regularly(self) -> None:
         self._send_report()
-        if self._next_report is not None:
-            self._next_report.cancel()
-        self._next_report = self._loop.call_later(REPORT_INTERVAL, self._report)
+        if self._report_timer is not None:
+            self._report_timer.cancel()
+        self._report_timer = self._loop.call_later(REPORT_INTERVAL, self._report_regularly)
 
     def _send_report(self, *more: wire.Report) -> None:
-        """Send a compound report: reception, name, and further requests."""
+        """Send a compound report: reception, name, and further messages.
+
+        The counts of the reception are left out if the first message is a request.
+        """
         if self._reception is None:
             return
-        full = not more or not isinstance(more[0], wire.PacketsMissing | wire.PictureLost)
-        blocks = (self._reception.block(self._loop.time()),) if full else ()
+        is_request = bool(more) and isinstance(more[0], wire.PacketsMissing | wire.PictureLost)
+        blocks = () if is_request else (self._reception.block(self._loop.time()),)
         report = wire.ReceiverReport(self._ssrc, blocks)
         name = wire.SourceDescription(self._ssrc, self._cname)
-        self._pair.report(wire.compound(report, name, *more), self._reports_to)
+        self._pair.send_rtcp(wire.compound(report, name, *more), self._report_address)

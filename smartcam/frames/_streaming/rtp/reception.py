@@ -19,7 +19,7 @@ def ntp_time(utc: float) -> int:
     return int((utc + SECONDS_FROM_1900_TO_1970) * (1 << 32)) & 0xFFFF_FFFF_FFFF_FFFF
 
 
-def middle(ntp: int) -> int:
+def middle_bits(ntp: int) -> int:
     """Return the middle 32 bits of an NTP time, which reports use."""
     return ntp >> 16 & 0xFFFF_FFFF
 
@@ -30,11 +30,11 @@ class Reception:
     def __init__(self, ssrc: int) -> None:
         self.ssrc = ssrc
         self.packets = 0
-        self._first: int | None = None
-        self._highest = 0  # highest sequence number with wraps counted
+        self._first_sequence: int | None = None
+        self._highest_sequence = 0  # highest sequence number with wraps counted
         self._transit: int | None = None
         self._jitter = 0.0
-        self._before = (0, 0)  # expected and received packets at the last report
+        self._last_counts = (0, 0)  # numbers of expected and received packets at the last report
         self._sender_report: tuple[SenderReport, float] | None = None
 
     @property
@@ -42,43 +42,49 @@ class Reception:
         """Jitter of the arrival, seconds."""
         return self._jitter / CLOCK_RATE
 
-    def packet(self, packet: RtpPacket, now: float) -> None:
+    def count_packet(self, packet: RtpPacket, now: float) -> None:
         """Count a packet that arrived at a moment, in seconds."""
         self.packets += 1
-        if self._first is None:
-            self._first = self._highest = packet.sequence
-        ahead = (packet.sequence - self._highest + 0x8000 & 0xFFFF) - 0x8000
-        if ahead < 0 or (ahead == 0 and self.packets > 1):
+        if self._first_sequence is None:
+            self._first_sequence = self._highest_sequence = packet.sequence
+        advance = (packet.sequence - self._highest_sequence + 0x8000 & 0xFFFF) - 0x8000
+        if advance < 0 or (advance == 0 and self.packets > 1):
             return  # a late or repeated packet has no useful delay
-        self._highest += ahead
+        self._highest_sequence += advance
         transit = int(now * CLOCK_RATE) - packet.timestamp
         if self._transit is not None:
             difference = (transit - self._transit + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
             self._jitter += (abs(difference) - self._jitter) / 16
         self._transit = transit
 
-    def sender(self, report: SenderReport, now: float) -> None:
-        """Record a sender report that came at a moment."""
+    def set_sender_report(self, report: SenderReport, now: float) -> None:
+        """Set the last sender report, which came at a moment."""
         self._sender_report = (report, now)
 
     def block(self, now: float) -> ReportBlock:
         """Return a report block for the time since the last report."""
-        expected = 0 if self._first is None else self._highest - self._first + 1
-        expected_now, received_now = expected - self._before[0], self.packets - self._before[1]
-        self._before = (expected, self.packets)
-        lost_now = expected_now - received_now
-        fraction = min(255, 256 * lost_now // expected_now) if lost_now > 0 < expected_now else 0
-        last, delay = 0, 0
+        expected = (
+            0 if self._first_sequence is None else self._highest_sequence - self._first_sequence + 1
+        )
+        expected_before, received_before = self._last_counts
+        expected_since, received_since = expected - expected_before, self.packets - received_before
+        self._last_counts = (expected, self.packets)
+        lost_since = expected_since - received_since
+        fraction = 0
+        if lost_since > 0 < expected_since:
+            fraction = min(255, 256 * lost_since // expected_since)
+        last_report, delay = 0, 0
         if self._sender_report is not None:
-            report, at = self._sender_report
-            last, delay = middle(report.ntp), int(max(0.0, now - at) * 65536) & 0xFFFF_FFFF
+            report, received_at = self._sender_report
+            last_report = middle_bits(report.ntp)
+            delay = int(max(0.0, now - received_at) * 65536) & 0xFFFF_FFFF
         return ReportBlock(
             self.ssrc,
             fraction,
             expected - self.packets,
-            self._highest & 0xFFFF_FFFF,
+            self._highest_sequence & 0xFFFF_FFFF,
             int(self._jitter),
-            last,
+            last_report,
             delay,
         )
 
@@ -90,5 +96,5 @@ class Reception:
         if self._sender_report is None:
             return None
         report = self._sender_report[0]
-        since = (timestamp - report.timestamp + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
-        return report.ntp / (1 << 32) - SECONDS_FROM_1900_TO_1970 + since / CLOCK_RATE
+        ticks = (timestamp - report.timestamp + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+        return report.ntp / (1 << 32) - SECONDS_FROM_1900_TO_1970 + ticks / CLOCK_RATE

@@ -19,14 +19,14 @@ from smartcam.exceptions import (
     MessageError,
 )
 from smartcam.frames._codecs.h264 import H264Encoder
-from smartcam.frames._codecs.threads import Codecs, StreamRuns
+from smartcam.frames._codecs.threads import Codecs, StreamRunner
 from smartcam.frames._source import FrameSource
 from smartcam.frames._streaming.rtp import packets as wire
-from smartcam.frames._streaming.rtp.feedback import Audience, PacketHistory
+from smartcam.frames._streaming.rtp.feedback import PacketHistory, ReceiverReports
 from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets
 from smartcam.frames._streaming.rtp.parameters import CLOCK_RATE, description
 from smartcam.frames._streaming.rtp.reception import ntp_time
-from smartcam.frames._streaming.rtp.sockets import SocketPair, host_and_port, resolved
+from smartcam.frames._streaming.rtp.sockets import SocketPair, host_and_port, resolve
 
 if TYPE_CHECKING:
     from typing import Self
@@ -48,7 +48,7 @@ SPS_START: Final = b"\0\0\1\x67"
 """Start code and header of a sequence parameter set, as x264 writes them."""
 
 FULL_SOCKET_TIMEOUT: Final = 1.0
-"""Longest wait for a full socket, seconds, before the next frame is sent."""
+"""Longest wait until a full socket accepts data again, seconds; then the next frame is sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +59,9 @@ class RtpSenderStatistics:
         frames: completely sent frames.
         packets: packets sent for the first time.
         bytes: bytes of these packets, with the headers of RTP.
-        cut: incompletely sent frames, since the socket was full.
+        cut: frames that were sent only in part, since the socket was full.
         resent: packets sent again on request.
-        anew: key frames for receivers that joined or lost packets, or after a cut frame.
+        anew: key frames encoded because a receiver joined or lost packets, or after a cut frame.
         receivers: last reports of the receivers.
     """
 
@@ -75,7 +75,7 @@ class RtpSenderStatistics:
 
 
 class _RtpOutlet(NamedTuple):
-    """The sender's sockets, and the destination."""
+    """The sender's sockets, and the stream's destination."""
 
     pair: SocketPair
     to: Endpoint
@@ -98,7 +98,7 @@ class RtpSender:
         to: ``HOST:PORT`` of the receiver, or of a multicast group.
         fps: frames per second, for the bit rate; None: the source's, or 30.
         crf: quality, 0 (best) to 51.
-        bitrate: bits per second to keep to, instead of a quality.
+        bitrate: bits per second to aim at, instead of a quality.
         keyint: number of frames within which every part of the picture is refreshed.
         payload_type: payload type, 96 to 127.
         ttl: time to live of multicast.
@@ -128,25 +128,27 @@ class RtpSender:
         self._ttl = check_integer(ttl, "ttl", 0, 255, "RTP")
         self._fps, self._options = fps, {"crf": crf, "bitrate": bitrate, "keyint": keyint}
         self._codecs = Codecs(threads=1)
-        self._encoder = self._made_encoder(fps or 30.0)
+        self._encoder = self._new_encoder(fps or 30.0)
         self._packetizer = H264Packetizer(payload_type)
-        self._first = secrets.randbits(32)  # RTP timestamp at 0 of the clock
+        self._first_timestamp = secrets.randbits(
+            32
+        )  # RTP timestamp at time 0 of the monotonic clock
         self._ticks = 0
         self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
         self._history = PacketHistory()
-        self._audience = Audience(self._packetizer.ssrc)
-        self._sets: tuple[bytes, bytes] | None = None
-        self._frames = self._packets = self._bytes = self._cut = self._resent = self._anew = 0
+        self._reports = ReceiverReports(self._packetizer.ssrc)
+        self._parameter_sets: tuple[bytes, bytes] | None = None
+        self._frames = self._packets = self._bytes = self._cut = self._resent = self._key_frames = 0
         self._octets = 0
-        self._wanted = False  # whether the next frame must be a key frame
-        self._made_anew = float("-inf")
+        self._key_frame_wanted = False  # whether the next frame must be a key frame
+        self._key_frame_at = float("-inf")
         self._endpoint: Endpoint | None = None
         self._link: _RtpOutlet | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._entered = False
 
-    def _made_encoder(self, fps: float) -> H264Encoder:
-        return H264Encoder(StreamRuns(self._codecs), fps=fps, **self._options)  # type: ignore[arg-type]
+    def _new_encoder(self, fps: float) -> H264Encoder:
+        return H264Encoder(StreamRunner(self._codecs), fps=fps, **self._options)  # type: ignore[arg-type]
 
     @property
     def sdp(self) -> str:
@@ -164,8 +166,8 @@ class RtpSender:
             self._endpoint.port,
             self._packetizer.payload_type,
             session=self._packetizer.ssrc,
-            ttl=self._ttl if self._endpoint.multicast else None,
-            sets=self._sets,
+            ttl=self._ttl if self._endpoint.is_multicast else None,
+            sets=self._parameter_sets,
             name=self._source.name,
         )
 
@@ -177,8 +179,8 @@ class RtpSender:
             self._bytes,
             self._cut,
             self._resent,
-            self._anew,
-            self._audience.receivers(),
+            self._key_frames,
+            self._reports.receivers(),
         )
 
     async def __aenter__(self) -> Self:
@@ -195,20 +197,23 @@ class RtpSender:
         rates = self._source.format.rates
         self._entered = True
         if self._fps is None and rates:
-            self._encoder = self._made_encoder(min(max(rates[0], 0.01), 1000.0))
+            self._encoder = self._new_encoder(min(max(rates[0], 0.01), 1000.0))
         host, port = self._to
         label = f"RTP to {host}:{port}"
-        self._endpoint = to = await resolved(host, port, label)
+        self._endpoint = to = await resolve(host, port, label)
         try:
-            self._link = link = _RtpOutlet(SocketPair.sending(to, self._ttl), to)
+            self._link = link = _RtpOutlet(SocketPair.open_sending(to, self._ttl), to)
         except OSError as exc:
             raise FrameSourceError(f"{label}: {exc}", source=self._source.name) from exc
         try:
             await self._codecs.__aenter__()
-            link.pair.read(None, partial(self._reported, link))
+            link.pair.start_reading(None, partial(self._on_rtcp, link))
             self._tasks = [
                 asyncio.create_task(work, name=f"{protocol} to {to}")
-                for work, protocol in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
+                for work, protocol in (
+                    (self._send(link), "RTP"),
+                    (self._report_regularly(link), "RTCP"),
+                )
             ]
         except BaseException:
             self._link = None
@@ -261,15 +266,15 @@ class RtpSender:
             async with self._source.reader(timeout=None) as reader:
                 async for frame in reader:
                     if (
-                        self._wanted
-                        and time.monotonic() - self._made_anew >= MIN_KEY_FRAME_INTERVAL
+                        self._key_frame_wanted
+                        and time.monotonic() - self._key_frame_at >= MIN_KEY_FRAME_INTERVAL
                     ):
-                        self._begin_anew()
+                        self._request_key_frame()
                     encoded = await self._encoder.encode(frame)
-                    if not self._put(link, encoded):
+                    if not self._send_frame(link, encoded):
                         self._cut += 1
-                        self._wanted = True
-                        await link.pair.writable(FULL_SOCKET_TIMEOUT)
+                        self._key_frame_wanted = True
+                        await link.pair.wait_writable(FULL_SOCKET_TIMEOUT)
         except FrameSourceError as error:
             _log.warning("! RTP to %s: %s", link.to, error)
             raise
@@ -279,20 +284,20 @@ class RtpSender:
         finally:
             self._send_report(link, wire.Goodbye((self._packetizer.ssrc,)))
 
-    def _begin_anew(self) -> None:
-        self._wanted, self._made_anew = False, time.monotonic()
-        self._anew += 1
+    def _request_key_frame(self) -> None:
+        self._key_frame_wanted, self._key_frame_at = False, time.monotonic()
+        self._key_frames += 1
         self._encoder.begin_anew()
 
-    def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
-        """Send a frame's packets; return whether the socket accepted all."""
+    def _send_frame(self, link: _RtpOutlet, encoded: Frame) -> bool:
+        """Send a frame's packets; return False if the socket did not accept all of them."""
         data = bytes(encoded.data)
         if SPS_START in data:
-            self._sets = parameter_sets(data) or self._sets
+            self._parameter_sets = parameter_sets(data) or self._parameter_sets
         self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
         sequence = self._packetizer.sequence
         to = link.to[1:]
-        for packet in self._packetizer.packets(data, self._first + self._ticks):
+        for packet in self._packetizer.packets(data, self._first_timestamp + self._ticks):
             try:
                 link.pair.rtp.sendto(packet, to)
             except OSError:  # the socket is full, or there is no route now
@@ -305,42 +310,42 @@ class RtpSender:
         self._frames += 1
         return True
 
-    async def _report(self, link: _RtpOutlet) -> None:
+    async def _report_regularly(self, link: _RtpOutlet) -> None:
         while True:
             self._send_report(link)
             await asyncio.sleep(REPORT_INTERVAL)
 
     def _send_report(self, link: _RtpOutlet, *more: wire.Report) -> None:
-        now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
+        now = int(time.monotonic() * CLOCK_RATE) + self._first_timestamp & 0xFFFF_FFFF
         report = wire.SenderReport(
             self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
         )
         name = wire.SourceDescription(self._packetizer.ssrc, self._cname)
-        link.pair.report(wire.compound(report, name, *more), link.to.reports)
+        link.pair.send_rtcp(wire.compound(report, name, *more), link.to.rtcp_address)
 
     # receivers' reports
 
-    def _reported(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
-        if not link.to.multicast and sender[0] != link.to.host:
+    def _on_rtcp(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
+        if not link.to.is_multicast and sender[0] != link.to.host:
             return
         with contextlib.suppress(MessageError):  # other hosts may send invalid data
             for report in wire.parse_rtcp(data):
-                self._take(link, report, f"{sender[0]}:{sender[1]}")
+                self._on_report(link, report, f"{sender[0]}:{sender[1]}")
 
-    def _take(self, link: _RtpOutlet, report: wire.Report, address: str) -> None:
-        ours = self._packetizer.ssrc
-        if isinstance(report, wire.PacketsMissing) and report.media == ours:
-            self._send_again(link, report.sequences)
-        elif isinstance(report, wire.PictureLost) and report.media == ours:
-            self._wanted = True
+    def _on_report(self, link: _RtpOutlet, report: wire.Report, address: str) -> None:
+        ssrc = self._packetizer.ssrc
+        if isinstance(report, wire.PacketsMissing) and report.media == ssrc:
+            self._resend(link, report.sequences)
+        elif isinstance(report, wire.PictureLost) and report.media == ssrc:
+            self._key_frame_wanted = True
         elif isinstance(report, wire.Goodbye):
-            for ssrc in report.ssrcs:
-                self._audience.remove(ssrc)
-        elif isinstance(report, wire.ReceiverReport) and self._audience.record(report, address):
-            self._wanted = True
+            for receiver in report.ssrcs:
+                self._reports.remove(receiver)
+        elif isinstance(report, wire.ReceiverReport) and self._reports.record(report, address):
+            self._key_frame_wanted = True
             self._send_report(link)  # the receiver needs the sender's clock
 
-    def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
+    def _resend(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
         for sequence in sequences:
             packet = self._history.packet_to_resend(sequence)
             if packet is None:

@@ -32,7 +32,7 @@ MAX_TRIES: Final = 32
 
 
 class Endpoint(NamedTuple):
-    """An address with its kind.
+    """An address with its family.
 
     Attributes:
         family: family of the sockets.
@@ -45,12 +45,12 @@ class Endpoint(NamedTuple):
     port: int
 
     @property
-    def multicast(self) -> bool:
+    def is_multicast(self) -> bool:
         """True for a multicast group."""
         return ipaddress.ip_address(self.host.partition("%")[0]).is_multicast
 
     @property
-    def reports(self) -> tuple[str, int]:
+    def rtcp_address(self) -> tuple[str, int]:
         """Address for RTCP."""
         return self.host, self.port + 1
 
@@ -59,7 +59,7 @@ class Endpoint(NamedTuple):
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-async def resolved(host: str, port: int, label: str) -> Endpoint:
+async def resolve(host: str, port: int, label: str) -> Endpoint:
     """Return a host's address.
 
     Raises:
@@ -72,8 +72,8 @@ async def resolved(host: str, port: int, label: str) -> Endpoint:
         raise FrameSourceError(
             f"{label}: no address of {host!r} is known: {exc}", source=label
         ) from exc
-    family, *_, where = addresses[0]
-    return Endpoint(family, str(where[0]), port)
+    family, *_, address = addresses[0]
+    return Endpoint(family, str(address[0]), port)
 
 
 def host_and_port(text: str) -> tuple[str, int]:
@@ -103,92 +103,99 @@ class SocketPair:
         self._closed = False
 
     @classmethod
-    def listening(cls, at: Endpoint) -> SocketPair:
+    def open_listening(cls, endpoint: Endpoint) -> SocketPair:
         """Return the sockets of a receiver; a multicast group is joined.
 
         Raises:
             OSError: the port is in use, or this machine has no such address.
         """
         with contextlib.ExitStack() as stack:
-            made = []
-            for port in (at.port, at.port + 1):
-                sock = stack.enter_context(_socket(at.family))
-                _grown(sock)
-                if at.multicast:
+            socks = []
+            for port in (endpoint.port, endpoint.port + 1):
+                sock = stack.enter_context(_udp_socket(endpoint.family))
+                _enlarge_receive_buffer(sock)
+                if endpoint.is_multicast:
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                sock.bind((at.host if sys.platform == "linux" or not at.multicast else "", port))
-                if at.multicast:
-                    _join(sock, at)
-                made.append(sock)
+                sock.bind(
+                    (
+                        endpoint.host
+                        if sys.platform == "linux" or not endpoint.is_multicast
+                        else "",
+                        port,
+                    )
+                )
+                if endpoint.is_multicast:
+                    _join_group(sock, endpoint)
+                socks.append(sock)
             stack.pop_all()
-        return cls(*made)
+        return cls(*socks)
 
     @classmethod
-    def waiting(cls, at: Endpoint) -> SocketPair:
+    def open_even_port(cls, endpoint: Endpoint) -> SocketPair:
         """Return sockets for receiving on an even port of an address, and the next port.
 
         Raises:
             OSError: no ports are free.
         """
-        for left in reversed(range(MAX_TRIES)):
-            with _socket(at.family) as probe:
-                probe.bind((at.host, 0))
+        for tries_left in reversed(range(MAX_TRIES)):
+            with _udp_socket(endpoint.family) as probe:
+                probe.bind((endpoint.host, 0))
                 even = probe.getsockname()[1] & ~1
             try:
-                return cls.listening(at._replace(port=even))
+                return cls.open_listening(endpoint._replace(port=even))
             except OSError:
-                if not left:
+                if not tries_left:
                     raise
         raise AssertionError("unreachable")
 
     @classmethod
-    def sending(cls, to: Endpoint, ttl: int) -> SocketPair:
+    def open_sending(cls, to: Endpoint, ttl: int) -> SocketPair:
         """Return the sockets of a sender.
 
         Raises:
             OSError: no ports are free.
         """
-        for left in reversed(range(MAX_TRIES)):
+        for tries_left in reversed(range(MAX_TRIES)):
             with contextlib.ExitStack() as stack:
-                rtp, rtcp = (stack.enter_context(_socket(to.family)) for _ in range(2))
+                rtp, rtcp = (stack.enter_context(_udp_socket(to.family)) for _ in range(2))
                 rtp.bind(("", 0))
                 port = rtp.getsockname()[1]
                 try:
                     rtcp.bind(("", port + 1 if port < 65535 else 0))
                 except OSError:
-                    if not left:
+                    if not tries_left:
                         raise
                     continue
                 rtp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
                 for sock in (rtp, rtcp):
-                    if to.multicast:
-                        _hops(sock, to.family, ttl)
+                    if to.is_multicast:
+                        _set_hop_limit(sock, to.family, ttl)
                 stack.pop_all()
                 return cls(rtp, rtcp)
         raise AssertionError("unreachable")
 
-    def read(
+    def start_reading(
         self,
-        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
-        rtcp: Callable[[bytes, tuple[Any, ...]], None],
-        read: Callable[[], None] = lambda: None,
+        on_rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        on_rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        on_batch_read: Callable[[], None] = lambda: None,
     ) -> None:
         """Call a function for each datagram with its sender, until :meth:`close`.
 
         Args:
-            rtp: function for the stream's packets; None: do not read them.
-            rtcp: function for reports.
-            read: function that is called after each batch.
+            on_rtp: function for the stream's packets; None: packets are not read.
+            on_rtcp: function for reports.
+            on_batch_read: function that is called after each batch of datagrams.
         """
-        for sock, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
-            if take is not None:
-                self._loop.add_reader(sock, self._readable, sock, take, read)
+        for sock, on_datagram in ((self.rtp, on_rtp), (self.rtcp, on_rtcp)):
+            if on_datagram is not None:
+                self._loop.add_reader(sock, self._read_batch, sock, on_datagram, on_batch_read)
 
-    def _readable(
+    def _read_batch(
         self,
         sock: socket.socket,
-        take: Callable[[bytes, tuple[Any, ...]], None],
-        read: Callable[[], None],
+        on_datagram: Callable[[bytes, tuple[Any, ...]], None],
+        on_batch_read: Callable[[], None],
     ) -> None:
         for _ in range(MAX_DATAGRAMS_PER_TURN):
             if self._closed:
@@ -199,22 +206,22 @@ class SocketPair:
                 break
             except OSError:  # an error of an earlier sent datagram; reading goes on
                 continue
-            take(data, sender)
+            on_datagram(data, sender)
         if not self._closed:
-            read()
+            on_batch_read()
 
-    def report(self, data: bytes, to: tuple[Any, ...]) -> None:
+    def send_rtcp(self, data: bytes, address: tuple[Any, ...]) -> None:
         """Send RTCP; drop it if the system does not accept it, since reports are repeated."""
         with contextlib.suppress(OSError):
-            self.rtcp.sendto(data, to)
+            self.rtcp.sendto(data, address)
 
-    async def writable(self, within: float) -> None:
+    async def wait_writable(self, timeout: float) -> None:
         """Wait until the stream's socket accepts data, or until a time limit."""
-        free = asyncio.Event()
-        self._loop.add_writer(self.rtp, free.set)
+        writable = asyncio.Event()
+        self._loop.add_writer(self.rtp, writable.set)
         try:
-            async with asyncio.timeout(within):
-                await free.wait()
+            async with asyncio.timeout(timeout):
+                await writable.wait()
         except TimeoutError:
             pass
         finally:
@@ -222,7 +229,7 @@ class SocketPair:
                 self._loop.remove_writer(self.rtp)
 
     def close(self) -> None:
-        """Close both. Idempotent."""
+        """Close both sockets. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -232,19 +239,19 @@ class SocketPair:
             sock.close()
 
 
-def _socket(family: socket.AddressFamily) -> socket.socket:
-    made = socket.socket(family, socket.SOCK_DGRAM)
-    made.setblocking(False)
-    return made
+def _udp_socket(family: socket.AddressFamily) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    return sock
 
 
-def _grown(sock: socket.socket) -> None:
+def _enlarge_receive_buffer(sock: socket.socket) -> None:
     for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
         with contextlib.suppress(OSError):  # the second option is for privileged processes
             sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
 
 
-def _join(sock: socket.socket, group: Endpoint) -> None:
+def _join_group(sock: socket.socket, group: Endpoint) -> None:
     address = socket.inet_pton(group.family, group.host.partition("%")[0])
     if group.family == socket.AF_INET6:
         scope = group.host.partition("%")[2]
@@ -256,7 +263,7 @@ def _join(sock: socket.socket, group: Endpoint) -> None:
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, address + struct.pack("=I", 0))
 
 
-def _hops(sock: socket.socket, family: socket.AddressFamily, ttl: int) -> None:
+def _set_hop_limit(sock: socket.socket, family: socket.AddressFamily, ttl: int) -> None:
     if family == socket.AF_INET6:
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, ttl)
     else:

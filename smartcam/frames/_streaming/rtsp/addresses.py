@@ -11,7 +11,7 @@ from smartcam.frames._streaming.rtsp.messages import RtspError
 TRACK: Final = "track1"
 """Name of the only track of each stream."""
 
-NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
+STREAM_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
 """Allowed names of streams, which need no escapes in a URL."""
 
 
@@ -21,12 +21,12 @@ class RtspTarget(NamedTuple):
     Attributes:
         base: the stream's URL as the client writes it, without a slash at the end.
         name: name of the stream.
-        track: whether the URL names the stream's track, and not the whole stream.
+        is_track: whether the URL names the stream's track, and not the whole stream.
     """
 
     base: str
     name: str
-    track: bool
+    is_track: bool
 
 
 def target_of(url: str) -> RtspTarget:
@@ -44,23 +44,23 @@ def target_of(url: str) -> RtspTarget:
     if parts is None or parts.scheme != "rtsp" or not host:
         raise RtspError(400, f"URL: expected rtsp://HOST/NAME, got {url[:80]!r}")
     names = [unquote(part) for part in parts.path.split("/") if part]
-    track = len(names) > 1 and names[-1] == TRACK
-    name = "/".join(names[:-1] if track else names)
-    where = f"[{host}]" if ":" in host else host
-    base = f"rtsp://{where}{'' if port is None else f':{port}'}/{name}"
-    return RtspTarget(base, name, track)
+    is_track = len(names) > 1 and names[-1] == TRACK
+    name = "/".join(names[:-1] if is_track else names)
+    url_host = f"[{host}]" if ":" in host else host
+    base = f"rtsp://{url_host}{'' if port is None else f':{port}'}/{name}"
+    return RtspTarget(base, name, is_track)
 
 
 class RequestedTransport(NamedTuple):
-    """A transport requested by a client: channels of the connection, or a pair of ports.
+    """A transport requested by a client: channels of its RTSP connection, or a pair of ports.
 
     Attributes:
-        tcp: True for channels of the connection, False for ports.
+        is_tcp: True for channels of the connection, False for ports.
         rtp: channel or port of the client for RTP; None: the server chooses a channel.
         rtcp: channel or port of the client for RTCP.
     """
 
-    tcp: bool
+    is_tcp: bool
     rtp: int | None
     rtcp: int | None
 
@@ -76,7 +76,7 @@ def requested_transport(header: str, client: str) -> RequestedTransport:
         RtspError: the list has no supported transport.
     """
     for text in header.split(","):
-        requested = _read(text, client)
+        requested = _parse_transport(text, client)
         if requested is not None:
             return requested
     raise RtspError(
@@ -86,24 +86,24 @@ def requested_transport(header: str, client: str) -> RequestedTransport:
     )
 
 
-def _read(text: str, client: str) -> RequestedTransport | None:
+def _parse_transport(text: str, client: str) -> RequestedTransport | None:
     protocol, *parts = (part.strip() for part in text.split(";"))
     options = {key.lower(): value for key, _, value in (option.partition("=") for option in parts)}
-    tcp = protocol.upper() == "RTP/AVP/TCP"
-    if not tcp and protocol.upper() not in ("RTP/AVP", "RTP/AVP/UDP"):
+    is_tcp = protocol.upper() == "RTP/AVP/TCP"
+    if not is_tcp and protocol.upper() not in ("RTP/AVP", "RTP/AVP/UDP"):
         return None
     if "multicast" in options or options.get("destination", client) != client:
         return None
     if options.get("mode", "play").strip('"').lower() != "play":
         return None
-    if tcp and "interleaved" not in options:
+    if is_tcp and "interleaved" not in options:
         return RequestedTransport(True, None, None)
-    least, most = (0, 255) if tcp else (1, 65535)
-    pair = _pair(options.get("interleaved" if tcp else "client_port", ""), least, most)
-    return None if pair is None else RequestedTransport(tcp, *pair)
+    least, most = (0, 255) if is_tcp else (1, 65535)
+    pair = _parse_pair(options.get("interleaved" if is_tcp else "client_port", ""), least, most)
+    return None if pair is None else RequestedTransport(is_tcp, *pair)
 
 
-def _pair(text: str, least: int, most: int) -> tuple[int, int] | None:
+def _parse_pair(text: str, least: int, most: int) -> tuple[int, int] | None:
     match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text, re.ASCII)
     if match is None:
         return None

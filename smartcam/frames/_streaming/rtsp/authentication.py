@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 REALM: Final = "smartcam"
 
-MAX_WRONG_ANSWERS: Final = 10
-"""Largest number of wrong passwords of a connection."""
+MAX_WRONG_PASSWORDS: Final = 10
+"""Number of wrong passwords after which a connection is closed."""
 
-_PART: Final = re.compile(r'([A-Za-z]{1,32})=(?:"([^"\\]*)"|([^\s",=]+))\s*(?:,\s*|$)')
+_PARAMETER: Final = re.compile(r'([A-Za-z]{1,32})=(?:"([^"\\]*)"|([^\s",=]+))\s*(?:,\s*|$)')
 
 
 class Authentication:
@@ -31,43 +31,45 @@ class Authentication:
     Args:
         user: name of the user; None: no password is needed.
         password: password of the user.
-        basic: whether to accept Basic, for clients without Digest.
+        allows_basic: whether Basic is accepted, for clients without Digest.
 
     Raises:
         ConfigurationError: user or password is missing, or has characters that cannot be sent.
     """
 
-    def __init__(self, user: str | None, password: str | None, *, basic: bool = False) -> None:
+    def __init__(
+        self, user: str | None, password: str | None, *, allows_basic: bool = False
+    ) -> None:
         if (user is None) != (password is None):
             raise ConfigurationError("RTSP: expected user and password, got one of them")
         if user is not None and (not user or not password or re.search(r'[:"\\]|[^ -~]', user)):
             raise ConfigurationError(
                 'RTSP: expected a user of ASCII characters without : " and \\, and a password'
             )
-        self.wanted: bool = user is not None
-        self.basic = basic
+        self.is_required: bool = user is not None
+        self.allows_basic = allows_basic
         self._user, self._secret = (user or "").encode(), (password or "").encode()
-        self._hashed = _md5(self._user, REALM.encode(), self._secret)
+        self._hashed_secret = _md5(self._user, REALM.encode(), self._secret)
 
     def accepts(self, request: RtspRequest, nonce: str) -> bool:
         """Return True if a request proves the user's password for the connection's nonce."""
         scheme, _, header = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "digest":
             return self._accepts_digest(request, nonce, header)
-        return scheme.lower() == "basic" and self.basic and self._accepts_basic(header)
+        return scheme.lower() == "basic" and self.allows_basic and self._accepts_basic(header)
 
     def _accepts_digest(self, request: RtspRequest, nonce: str, header: str) -> bool:
-        parts = _parts(header)
+        parameters = _digest_parameters(header)
         expected = {"username": self._user.decode(), "realm": REALM, "nonce": nonce}
-        same = [_same(parts.get(name, ""), value) for name, value in expected.items()]
-        if parts.get("algorithm", "MD5").upper() != "MD5" or "qop" in parts:
+        matches = [_is_equal(parameters.get(name, ""), value) for name, value in expected.items()]
+        if parameters.get("algorithm", "MD5").upper() != "MD5" or "qop" in parameters:
             return False
-        uri = parts.get("uri", "")
+        uri = parameters.get("uri", "")
         if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
             return False  # live555 names the stream also in requests for its track
         hash_of_request = _md5(request.method.encode(), uri.encode())
-        response = _md5(self._hashed.encode(), nonce.encode(), hash_of_request.encode())
-        return _same(parts.get("response", "").lower(), response) and all(same)
+        response = _md5(self._hashed_secret.encode(), nonce.encode(), hash_of_request.encode())
+        return _is_equal(parameters.get("response", "").lower(), response) and all(matches)
 
     def _accepts_basic(self, header: str) -> bool:
         try:
@@ -81,16 +83,16 @@ class Authentication:
         digest = f'Digest realm="{REALM}", nonce="{nonce}", algorithm="MD5"'
         challenges = (("WWW-Authenticate", digest),)
         basic = (("WWW-Authenticate", f'Basic realm="{REALM}"'),)
-        return challenges + basic if self.basic else challenges
+        return challenges + basic if self.allows_basic else challenges
 
 
-class PasswordGate:
+class PasswordCheck:
     """The password check of one connection, with a nonce and a limited number of tries."""
 
     def __init__(self, authentication: Authentication) -> None:
         self._authentication = authentication
         self._nonce = secrets.token_hex(16)
-        self._wrong = 0
+        self._wrong_passwords = 0
 
     def check(self, request: RtspRequest) -> None:
         """Check a request's authorization.
@@ -98,34 +100,36 @@ class PasswordGate:
         Raises:
             RtspError: authorization is missing or wrong; after too many tries the error is fatal.
         """
-        if not self._authentication.wanted or self._authentication.accepts(request, self._nonce):
+        if not self._authentication.is_required or self._authentication.accepts(
+            request, self._nonce
+        ):
             return
-        given = "authorization" in request.headers
-        self._wrong += given
-        text = "wrong user or password" if given else "a password is required"
+        has_authorization = "authorization" in request.headers
+        self._wrong_passwords += has_authorization
+        text = "wrong user or password" if has_authorization else "a password is required"
         raise RtspError(
             401,
             text,
             self._authentication.challenge(self._nonce),
-            fatal=self._wrong >= MAX_WRONG_ANSWERS,
+            fatal=self._wrong_passwords >= MAX_WRONG_PASSWORDS,
         )
 
 
-def _parts(header: str) -> dict[str, str]:
-    """Return the parts of a Digest; empty if it is malformed."""
-    parts: dict[str, str] = {}
-    place = 0
+def _digest_parameters(header: str) -> dict[str, str]:
+    """Return the parameters of a Digest header; empty if the header is malformed."""
+    parameters: dict[str, str] = {}
+    offset = 0
     header = header.strip()
-    while place < len(header):
-        match = _PART.match(header, place)
-        if match is None or match[1].lower() in parts:
+    while offset < len(header):
+        match = _PARAMETER.match(header, offset)
+        if match is None or match[1].lower() in parameters:
             return {}
-        parts[match[1].lower()] = match[2] if match[2] is not None else match[3]
-        place = match.end()
-    return parts
+        parameters[match[1].lower()] = match[2] if match[2] is not None else match[3]
+        offset = match.end()
+    return parameters
 
 
-def _same(given: str, expected: str) -> bool:
+def _is_equal(given: str, expected: str) -> bool:
     return hmac.compare_digest(given.encode(), expected.encode())
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 CATCH_UP_TIME: Final = 0.5
 """Seconds after a key frame, which is large, during which frames may wait. At other times a frame
-is skipped while a part of an earlier one waits."""
+is skipped while a part of an earlier frame waits."""
 
 MAX_WAITING_BYTES: Final = 4 << 20
 """Largest number of bytes that wait after a key frame."""
@@ -36,20 +36,20 @@ class PacketDelivery(Protocol):
     transport: str
     """Header Transport of the answer to SETUP."""
 
-    def ready(self, now: float) -> bool:
-        """Return True if a frame's packets would be sent without waiting."""
+    def can_send(self, now: float) -> bool:
+        """Return True if a frame may be sent now, and must not be skipped."""
         ...
 
-    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
-        """Send a frame; return whether it was sent completely."""
+    def send(self, packets: list[bytes], is_key_frame: bool, now: float) -> bool:
+        """Send a frame; return False if only a part was sent."""
         ...
 
-    def report(self, data: bytes) -> None:
-        """Send RTCP, if possible without waiting."""
+    def send_rtcp(self, data: bytes) -> None:
+        """Send RTCP; drop it if it would have to wait."""
         ...
 
-    def alive(self, now: float) -> bool | None:
-        """Return True if the client accepts data; None: unknown."""
+    def is_alive(self, now: float) -> bool | None:
+        """Return True if the client accepted data lately, False if it stalls; None: unknown."""
         ...
 
     def close(self) -> None:
@@ -64,42 +64,44 @@ class ChannelDelivery:
         self.transport = f"RTP/AVP/TCP;unicast;interleaved={rtp}-{rtcp}"
         self.channels = (rtp, rtcp)
         self._connection = connection
-        self._patient_until = -1.0
-        self._waited = 0  # waiting bytes at the last check
-        self._progress: float | None = None  # time at which the client last accepted bytes
+        self._catch_up_until = -1.0
+        self._last_waiting = 0  # waiting bytes at the last check
+        self._progress_at: float | None = None  # time at which the client last accepted bytes
 
-    def ready(self, now: float) -> bool:
+    def can_send(self, now: float) -> bool:
         waiting = self._connection.get_write_buffer_size()
-        return not waiting or (waiting < MAX_WAITING_BYTES and now < self._patient_until)
+        return not waiting or (waiting < MAX_WAITING_BYTES and now < self._catch_up_until)
 
-    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
-        if key:
-            self._patient_until = now + CATCH_UP_TIME
+    def send(self, packets: list[bytes], is_key_frame: bool, now: float) -> bool:
+        if is_key_frame:
+            self._catch_up_until = now + CATCH_UP_TIME
         self._write(0, packets)
         return True
 
-    def report(self, data: bytes) -> None:
+    def send_rtcp(self, data: bytes) -> None:
         if not self._connection.get_write_buffer_size():
             self._write(1, [data])
 
-    def _write(self, which: int, packets: list[bytes]) -> None:
-        head = bytes((ord("$"), self.channels[which]))
+    def _write(self, channel_index: int, packets: list[bytes]) -> None:
+        head = bytes((ord("$"), self.channels[channel_index]))
         pieces = (head + len(packet).to_bytes(2, "big") + packet for packet in packets)
         self._connection.write(b"".join(pieces))
 
-    def alive(self, now: float) -> bool | None:
+    def is_alive(self, now: float) -> bool | None:
         waiting = self._connection.get_write_buffer_size()
-        if not waiting or waiting < self._waited or self._progress is None:
-            self._progress = now
-        self._waited = waiting
-        return now - self._progress < STALL_TIMEOUT
+        if not waiting or waiting < self._last_waiting or self._progress_at is None:
+            self._progress_at = now
+        self._last_waiting = waiting
+        return now - self._progress_at < STALL_TIMEOUT
 
     def close(self) -> None:
         pass  # the connection is closed by its owner
 
 
 class DatagramDelivery:
-    """Delivery from two ports to two of the client's; packets that would wait are dropped.
+    """Delivery as datagrams, from two ports to two ports of the client.
+
+    Packets that would have to wait are dropped.
 
     Args:
         sockets: bound sockets for RTP and RTCP.
@@ -115,55 +117,58 @@ class DatagramDelivery:
         ports: tuple[int, int],
         on_rtcp: Callable[[bytes], None],
     ) -> None:
-        self._socket, control = sockets
-        ours = f"{self._socket.getsockname()[1]}-{control.getsockname()[1]}"
-        self.transport = f"RTP/AVP;unicast;client_port={ports[0]}-{ports[1]};server_port={ours}"
-        self._to, self._control_to = ((client[0], port, *client[2:]) for port in ports)
-        self._control_socket = control
-        self._control: asyncio.DatagramTransport | None = None
+        self._rtp_socket, control_socket = sockets
+        server_ports = f"{self._rtp_socket.getsockname()[1]}-{control_socket.getsockname()[1]}"
+        self.transport = (
+            f"RTP/AVP;unicast;client_port={ports[0]}-{ports[1]};server_port={server_ports}"
+        )
+        self._rtp_address, self._rtcp_address = ((client[0], port, *client[2:]) for port in ports)
+        self._control_socket = control_socket
+        self._control_transport: asyncio.DatagramTransport | None = None
         self._on_rtcp = on_rtcp
 
     async def open(self) -> None:
         """Start receiving the client's reports.
 
-        Cancellation: closes it.
+        Cancellation: the sockets are closed.
         """
         loop = asyncio.get_running_loop()
         try:
-            self._control, _ = await loop.create_datagram_endpoint(
-                lambda: _ControlPort(str(self._to[0]), self._on_rtcp), sock=self._control_socket
+            self._control_transport, _ = await loop.create_datagram_endpoint(
+                lambda: _RtcpReceiver(str(self._rtp_address[0]), self._on_rtcp),
+                sock=self._control_socket,
             )
         except BaseException:
             self.close()
             raise
 
-    def ready(self, now: float) -> bool:
+    def can_send(self, now: float) -> bool:
         return True
 
-    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
+    def send(self, packets: list[bytes], is_key_frame: bool, now: float) -> bool:
         try:
             for packet in packets:
-                self._socket.sendto(packet, self._to)
+                self._rtp_socket.sendto(packet, self._rtp_address)
         except OSError:  # the socket is full, or there is no route now
             return False
         return True
 
-    def report(self, data: bytes) -> None:
+    def send_rtcp(self, data: bytes) -> None:
         with contextlib.suppress(OSError):
-            self._control_socket.sendto(data, self._control_to)
+            self._control_socket.sendto(data, self._rtcp_address)
 
-    def alive(self, now: float) -> bool | None:
+    def is_alive(self, now: float) -> bool | None:
         return None
 
     def close(self) -> None:
-        self._socket.close()
-        if self._control is not None:
-            self._control.abort()
+        self._rtp_socket.close()
+        if self._control_transport is not None:
+            self._control_transport.abort()
         else:
             self._control_socket.close()
 
 
-class _ControlPort(asyncio.DatagramProtocol):
+class _RtcpReceiver(asyncio.DatagramProtocol):
     """Pass on the datagrams of one host."""
 
     def __init__(self, host: str, on_rtcp: Callable[[bytes], None]) -> None:
@@ -177,17 +182,17 @@ class _ControlPort(asyncio.DatagramProtocol):
         """Ignore ICMP errors, which any host can send."""
 
 
-def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, socket.socket]:
-    """Return two sockets on an even port and the next.
+def open_port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, socket.socket]:
+    """Return two sockets, on an even port and on the next port.
 
     Raises:
         OSError: there is no pair of free ports.
     """
     for _ in range(MAX_TRIES):
-        first = _bound(host, 0, family)
+        first = _bound_socket(host, 0, family)
         port = first.getsockname()[1]
         try:
-            second = _bound(host, port ^ 1, family)
+            second = _bound_socket(host, port ^ 1, family)
         except OSError:
             first.close()
             continue
@@ -202,12 +207,12 @@ def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, s
     raise OSError(f"{host}: no two ports next to each other are free")
 
 
-def _bound(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
-    made = socket.socket(family, socket.SOCK_DGRAM)
+def _bound_socket(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_DGRAM)
     try:
-        made.setblocking(False)
-        made.bind((host, port))
+        sock.setblocking(False)
+        sock.bind((host, port))
     except BaseException:
-        made.close()
+        sock.close()
         raise
-    return made
+    return sock

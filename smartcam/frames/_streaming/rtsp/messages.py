@@ -23,9 +23,9 @@ MAX_DIGITS: Final = 9
 
 _REQUEST: Final = re.compile(rb"([A-Z_]{1,32}) ([\x21-\x7e]{1,2048}) RTSP/(\d\.\d)")
 _HEADER: Final = re.compile(rb"([A-Za-z0-9!#$%&'*+.^_`|~-]{1,64}):[ \t]*([\t\x20-\x7e\x80-\xff]*)")
-_ONCE: Final = ("authorization", "content-length", "cseq", "session", "transport")
+_SINGLE_HEADERS: Final = ("authorization", "content-length", "cseq", "session", "transport")
 
-_WORDS: Final[Mapping[int, str]] = {
+_REASONS: Final[Mapping[int, str]] = {
     453: "Not Enough Bandwidth",
     454: "Session Not Found",
     455: "Method Not Valid in This State",
@@ -42,7 +42,7 @@ class RtspError(Exception):
 
     Args:
         status: status of RFC 2326, section 7.1.1.
-        text: reason, which is the body of the answer.
+        text: reason, which is sent as the body of the answer.
         headers: headers of the answer.
         fatal: whether the connection must be closed.
     """
@@ -75,11 +75,18 @@ class ChannelData(NamedTuple):
     data: bytes
 
 
-def answer(
+def encode_answer(
     status: int, cseq: str, headers: tuple[tuple[str, str], ...] = (), body: bytes = b""
 ) -> bytes:
-    """Return an answer's bytes; without CSeq if the request's was not readable."""
-    lines = [f"RTSP/1.0 {status} {_WORDS.get(status) or HTTPStatus(status).phrase}"]
+    """Return an answer's bytes.
+
+    Args:
+        status: status code.
+        cseq: CSeq of the request; "": it was not readable, so the answer has none.
+        headers: further headers.
+        body: body.
+    """
+    lines = [f"RTSP/1.0 {status} {_REASONS.get(status) or HTTPStatus(status).phrase}"]
     if cseq:
         lines.append(f"CSeq: {cseq}")
     lines += (f"{name}: {value}" for name, value in headers)
@@ -89,15 +96,16 @@ def answer(
 
 
 class RequestParser:
-    """Cut requests and packets from a stream of bytes.
+    """Parse requests and packets from a stream of bytes.
 
-    The parser keeps at most :data:`MAX_MESSAGE_BYTES`, and bytes fed since the last :meth:`next`.
+    The parser keeps at most :data:`MAX_MESSAGE_BYTES`, and the bytes that were fed since the last
+    call of :meth:`next`.
     """
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._searched = 0  # number of searched bytes without an end of line
-        self._start: tuple[str, str] | None = None  # method and URL
+        self._searched_bytes = 0  # number of bytes that were searched and have no line end
+        self._request_line: tuple[str, str] | None = None  # method and URL
         self._headers: dict[str, str] = {}
 
     def feed(self, data: bytes) -> None:
@@ -105,41 +113,41 @@ class RequestParser:
         self._data += data
 
     @property
-    def waiting(self) -> int:
+    def unparsed_bytes(self) -> int:
         """Number of unparsed bytes."""
         return len(self._data)
 
     @property
-    def in_midst(self) -> bool:
+    def has_partial_message(self) -> bool:
         """True while a message is incomplete."""
-        return self._start is not None or bool(self._data)
+        return self._request_line is not None or bool(self._data)
 
     def next(self) -> RtspRequest | ChannelData | None:
-        """Return the next complete message; None if it is incomplete.
+        """Return the next message; None if no complete message is left.
 
         Raises:
             RtspError: the bytes are no request; the error is fatal.
         """
-        while self._start is None:
+        while self._request_line is None:
             if self._data[:1] == b"$":
                 return self._channel_data()
-            line = self._line()
+            line = self._next_line()
             if line is None:
                 return None
             if line:
-                self._start = _start_line(line)
-        return self._request(*self._start)
+                self._request_line = _parse_request_line(line)
+        return self._request(*self._request_line)
 
     def _request(self, method: str, url: str) -> RtspRequest | None:
-        while (line := self._line(self._size())) is not None:
+        while (line := self._next_line(self._body_size())) is not None:
             if line:
                 self._add_header(line)
                 continue
-            size = self._size()
+            size = self._body_size()
             body = bytes(self._data[:size])
             del self._data[:size]
             request = RtspRequest(method, url, self._headers, body)
-            self._start, self._headers = None, {}
+            self._request_line, self._headers = None, {}
             return request
         return None
 
@@ -153,38 +161,41 @@ class RequestParser:
         del self._data[:end]
         return packet
 
-    def _line(self, body: int = 0) -> bytes | None:
-        """Return the next line, the last of a header only with its complete body; else None."""
-        end = self._data.find(b"\n", self._searched)
+    def _next_line(self, body_size: int = 0) -> bytes | None:
+        """Return the next line; None if it is incomplete.
+
+        The empty line that ends the headers is returned only when the body is complete, too.
+        """
+        end = self._data.find(b"\n", self._searched_bytes)
         if end < 0 or end > MAX_LINE_BYTES:
-            self._searched = len(self._data)
-            if end > 0 or self._searched > MAX_LINE_BYTES:
-                _refuse(f"a line: expected {MAX_LINE_BYTES} bytes at most, got more")
+            self._searched_bytes = len(self._data)
+            if end > 0 or self._searched_bytes > MAX_LINE_BYTES:
+                _raise_error(f"a line: expected {MAX_LINE_BYTES} bytes at most, got more")
             return None
         line = bytes(self._data[:end]).removesuffix(b"\r")
-        if not line and len(self._data) - end - 1 < body:
+        if not line and len(self._data) - end - 1 < body_size:
             return None
         del self._data[: end + 1]
-        self._searched = 0
+        self._searched_bytes = 0
         return line
 
     def _add_header(self, line: bytes) -> None:
         match = _HEADER.fullmatch(line)
         if match is None:
-            _refuse(f"a header: expected NAME: VALUE, got {line[:60]!r}")
+            _raise_error(f"a header: expected NAME: VALUE, got {line[:60]!r}")
         name = match[1].decode("ascii").lower()
         value = match[2].decode("latin-1").strip()
         if name in self._headers:
-            if name in _ONCE:
-                _refuse(f"{name}: expected once, got it twice")
+            if name in _SINGLE_HEADERS:
+                _raise_error(f"{name}: expected once, got it twice")
             value = f"{self._headers.pop(name)}, {value}"
         if len(self._headers) == MAX_HEADERS or len(value) > MAX_LINE_BYTES:
-            _refuse(f"headers: expected {MAX_HEADERS} at most, got more")
+            _raise_error(f"headers: expected {MAX_HEADERS} at most, got more")
         if name == "content-length" and (not _is_number(value) or int(value) > MAX_BODY_BYTES):
-            _refuse(f"Content-Length: expected 0 to {MAX_BODY_BYTES}, got {value[:20]!r}", 413)
+            _raise_error(f"Content-Length: expected 0 to {MAX_BODY_BYTES}, got {value[:20]!r}", 413)
         self._headers[name] = value
 
-    def _size(self) -> int:
+    def _body_size(self) -> int:
         return int(self._headers.get("content-length", "0"))
 
 
@@ -192,12 +203,12 @@ MAX_MESSAGE_BYTES: Final = 4 + 0xFFFF
 """Size of the largest message, a packet of a channel, bytes."""
 
 
-def _start_line(line: bytes) -> tuple[str, str]:
+def _parse_request_line(line: bytes) -> tuple[str, str]:
     match = _REQUEST.fullmatch(line)
     if match is None:
-        _refuse(f"expected METHOD URL RTSP/1.0, got {line[:60]!r}")
+        _raise_error(f"expected METHOD URL RTSP/1.0, got {line[:60]!r}")
     if match[3] != b"1.0":
-        _refuse(f"expected RTSP/1.0, got RTSP/{match[3].decode()}", 505)
+        _raise_error(f"expected RTSP/1.0, got RTSP/{match[3].decode()}", 505)
     return match[1].decode(), match[2].decode()
 
 
@@ -217,5 +228,5 @@ def cseq_of(request: RtspRequest) -> str:
     return cseq
 
 
-def _refuse(text: str, status: int = 400) -> NoReturn:
+def _raise_error(text: str, status: int = 400) -> NoReturn:
     raise RtspError(status, text, fatal=True)

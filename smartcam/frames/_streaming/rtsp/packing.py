@@ -20,31 +20,31 @@ PAYLOAD_TYPE: Final = 96
 _HEAD: Final = struct.Struct("!BBHII")
 
 
-class UnitCutter:
-    """Packetize the encoded frames of one stream; the last frame's payloads are kept."""
+class FramePacketizer:
+    """Packetize the encoded frames of one stream; the last frame's payloads are cached."""
 
     def __init__(self) -> None:
         self._packetizer = H264Packetizer(PAYLOAD_TYPE, 0, 0)
         self._unit: Frame | None = None
-        self._pieces: list[tuple[int, bytes]] = []
+        self._payloads: list[tuple[int, bytes]] = []
 
-    def pieces(self, unit: Frame) -> list[tuple[int, bytes]]:
-        """Return a frame's packets as the second byte of each header, and the payload.
+    def payloads(self, unit: Frame) -> list[tuple[int, bytes]]:
+        """Return each packet of a frame, as the second byte of its header and its payload.
 
         Raises:
             FrameFormatError: the frame is not valid.
         """
         if unit is not self._unit:
             packets = self._packetizer.packets(bytes(unit.data), 0)
-            self._unit, self._pieces = (
+            self._unit, self._payloads = (
                 unit,
                 [(packet[1], packet[_HEAD.size :]) for packet in packets],
             )
-        return self._pieces
+        return self._payloads
 
 
-class PacketNumbers:
-    """Numbering of one viewer's packets.
+class PacketHeaders:
+    """Write the packet headers of one viewer, and count the packets.
 
     Attributes:
         ssrc: SSRC of the viewer's stream.
@@ -59,15 +59,15 @@ class PacketNumbers:
         self.packets: int = 0
         self.octets: int = 0
 
-    def numbered(self, pieces: list[tuple[int, bytes]], timestamp: int) -> list[bytes]:
-        """Return a frame's packets for the viewer."""
-        made = []
+    def packets_of(self, payloads: list[tuple[int, bytes]], timestamp: int) -> list[bytes]:
+        """Return the viewer's packets of a frame, from the frame's payloads."""
+        packets = []
         pack, ssrc, sequence, octets = _HEAD.pack, self.ssrc, self.sequence, 0
-        for second, payload in pieces:
-            made.append(pack(0x80, second, sequence, timestamp, ssrc) + payload)
+        for marker_and_type, payload in payloads:
+            packets.append(pack(0x80, marker_and_type, sequence, timestamp, ssrc) + payload)
             sequence = sequence + 1 & 0xFFFF
             octets += len(payload)
         self.sequence = sequence
-        self.packets += len(made)
+        self.packets += len(packets)
         self.octets += octets
-        return made
+        return packets

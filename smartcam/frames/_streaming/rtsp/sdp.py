@@ -20,21 +20,21 @@ def describe(
         payload_type: payload type of the packets.
         rate: frames per second.
     """
-    kind = "IP6" if ":" in host else "IP4"
-    nothing = "::" if kind == "IP6" else "0.0.0.0"  # noqa: S104 - "any", to SDP
-    coded = ",".join(base64.b64encode(parameter_set).decode() for parameter_set in sets)
+    address_type = "IP6" if ":" in host else "IP4"
+    any_address = "::" if address_type == "IP6" else "0.0.0.0"  # noqa: S104 - "any", to SDP
+    encoded = ",".join(base64.b64encode(parameter_set).decode() for parameter_set in sets)
     lines = (
         "v=0",
-        f"o=- {session} 1 IN {kind} {host}",
+        f"o=- {session} 1 IN {address_type} {host}",
         f"s={name}",
-        f"c=IN {kind} {nothing}",
+        f"c=IN {address_type} {any_address}",
         "t=0 0",
         "a=control:*",
         "a=range:npt=now-",
         f"m=video 0 RTP/AVP {payload_type}",
         f"a=rtpmap:{payload_type} H264/90000",
         f"a=fmtp:{payload_type} packetization-mode=1;profile-level-id={sets[0][1:4].hex().upper()};"
-        f"sprop-parameter-sets={coded}",
+        f"sprop-parameter-sets={encoded}",
         f"a=framerate:{rate:g}",
         f"a=control:{TRACK}",
     )

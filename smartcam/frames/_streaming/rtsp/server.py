@@ -12,9 +12,9 @@ from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames._codecs.h264 import H264Encoder
-from smartcam.frames._codecs.threads import Codecs, StreamRuns
+from smartcam.frames._codecs.threads import Codecs, StreamRunner
 from smartcam.frames._source import FrameSource
-from smartcam.frames._streaming.rtsp.addresses import NAME
+from smartcam.frames._streaming.rtsp.addresses import STREAM_NAME
 from smartcam.frames._streaming.rtsp.authentication import Authentication
 from smartcam.frames._streaming.rtsp.serving import RtspServing
 from smartcam.frames._streaming.rtsp.streams import RtspStream
@@ -29,7 +29,7 @@ PORT: Final = 8554
 DEFAULT_FRAME_RATE: Final = 30.0
 """Frames per second of a source that reports none."""
 
-_ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
+_ALL_ADDRESSES: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
 
 class RtspServer(Server):
@@ -40,12 +40,11 @@ class RtspServer(Server):
         async with RtspServer({"left": source}) as server:
             print(server.url("left"))
 
-    A source is encoded once for all viewers, and streams while there are viewers, and for two
-    seconds after. A slow viewer gets only complete frames, skips others, and continues with a key
-    frame. A viewer that accepts no data for 10 s, or sends no report over UDP for 60 s, is
-    disconnected. Datagrams go only to the connection's address. When a source ends, its viewers'
-    connections are closed; a later request is answered 503 with the reason, and restarts the
-    source.
+    A source is encoded once for all viewers. It streams while it has viewers, and two seconds
+    longer. A slow viewer misses whole frames, and continues with a key frame. A viewer that accepts
+    no data for 10 s, or sends no report over UDP for 60 s, is disconnected. Datagrams go only to
+    the connection's address. When a source ends, its viewers' connections are closed; a later
+    request is answered 503 with the reason, and restarts the source.
 
     Without a password, every client that reaches the port may view. Pictures are not encrypted;
     with Digest the password itself is not sent.
@@ -57,8 +56,8 @@ class RtspServer(Server):
         port: port to listen on; 0: any.
         user: name of the user; None: no password is needed.
         password: password of the user.
-        basic: also accept the bare password, from clients that do not know Digest.
-        bitrate: bits per second of an encoder, instead of a quality.
+        basic: whether the bare password is accepted, from clients that do not know Digest.
+        bitrate: bits per second of each source's stream, instead of a quality.
         crf: quality, 0 (best) to 51.
         fps: frames per second, for the bit rate; None: each source's, else 30.
         keyint: number of frames within which every part of the picture is refreshed.
@@ -90,7 +89,7 @@ class RtspServer(Server):
         check_kind(sources, Mapping, "sources", "a mapping from name to source", caller)
         for name, source in sources.items():
             check_kind(source, FrameSource, "sources", "sources of frames", caller)
-            if not isinstance(name, str) or not NAME.fullmatch(name):
+            if not isinstance(name, str) or not STREAM_NAME.fullmatch(name):
                 raise ConfigurationError(
                     "RtspServer: a name: expected 1 to 64 letters, digits and . _ ~ -, the first a "
                     f"letter or digit, got {name!r}"
@@ -102,7 +101,7 @@ class RtspServer(Server):
                 check_text(value, word, caller, least=1, most=200)
         self.host: str = check_text(host, "host", caller, least=1, most=300)
         self._authentication = Authentication(
-            user, password, basic=check_flag(basic, "basic", caller)
+            user, password, allows_basic=check_flag(basic, "basic", caller)
         )
         self._sources = dict(sources)
         self._port = check_integer(port, "port", 0, 0xFFFF, caller)
@@ -135,7 +134,7 @@ class RtspServer(Server):
             raise ConfigurationError(
                 f"RtspServer: expected one of {', '.join(self._sources)}, got {name!r}"
             )
-        host = socket.gethostname() if self.host in _ANY else self.host
+        host = socket.gethostname() if self.host in _ALL_ADDRESSES else self.host
         return f"rtsp://{f'[{host}]' if ':' in host else host}:{self._port}/{name}"
 
     def statistics(self) -> dict[str, RtspStatistics]:
@@ -149,12 +148,12 @@ class RtspServer(Server):
             ConfigurationError: the server cannot listen on the port, or a number is out of range.
             MissingExtraError: the extra ``video`` is not installed.
 
-        Cancellation: leaves it stopped.
+        Cancellation: the server stays stopped.
         """
         if self._serving is not None:
             return
         codecs = Codecs(threads=min(4, len(self._sources)))
-        streams = self._made(codecs)
+        streams = self._new_streams(codecs)
         try:
             listener = await listening(self.host, self._port)
         except (OSError, ValueError, OverflowError) as exc:
@@ -178,15 +177,15 @@ class RtspServer(Server):
             return
         await finish(serving.close)
 
-    def _made(self, codecs: Codecs) -> dict[str, RtspStream]:
-        """Return the streams; a source with two names has one encoder."""
+    def _new_streams(self, codecs: Codecs) -> dict[str, RtspStream]:
+        """Return a stream for each name; a source with two names has one encoder."""
         shared: dict[int, tuple[SharedH264, float]] = {}
         for source in self._sources.values():
             if id(source) in shared:
                 continue
             rate = self._fps if self._fps is not None else _rate(source)
             options = {"keyint": self._keyint, "crf": self._crf, "bitrate": self._bitrate}
-            encoder = H264Encoder(StreamRuns(codecs), fps=rate, **options)  # type: ignore[arg-type]
+            encoder = H264Encoder(StreamRunner(codecs), fps=rate, **options)  # type: ignore[arg-type]
             shared[id(source)] = SharedH264(source, encoder), rate
         return {
             name: RtspStream(name, *shared[id(source)]) for name, source in self._sources.items()

@@ -44,10 +44,10 @@ class RtspServing:
         max_viewers: int,
     ) -> None:
         self.authentication = authentication
-        self.number: int = secrets.randbits(31)  # session number of descriptions
+        self.sdp_session: int = secrets.randbits(31)  # session number in SDP descriptions
         self._streams, self._codecs = streams, codecs
         self._max_viewers = max_viewers
-        self._viewers: list[str] = []  # addresses of the viewers
+        self._viewer_addresses: list[str] = []  # address of each viewer
         self._listener: socket.socket | None = None
         self.places: Places[RtspConnection] = Places(max_connections, within=IDLE_TIMEOUT)
         self._acceptor = Acceptor(
@@ -80,22 +80,22 @@ class RtspServing:
 
     # called by the connections
 
-    def enter(self, connection: RtspConnection, peer: object) -> str:
+    def register(self, connection: RtspConnection, peer: object) -> str:
         """Register a new connection; return the reason if there are too many, else ""."""
         if self._listener is None:
             return "the server is stopped"
         return self._acceptor.enter(connection, peer)
 
-    def leave(self, connection: RtspConnection) -> None:
+    def unregister(self, connection: RtspConnection) -> None:
         """Remove a closed connection."""
         self._acceptor.leave(connection)
 
-    def served(self, connection: RtspConnection) -> None:
-        """Mark a connection as the most recently served, which makes room last."""
+    def mark_served(self, connection: RtspConnection) -> None:
+        """Mark a connection as the most recently served: others are closed first to make room."""
         self._acceptor.move_back(connection)
 
-    def last_session_ended(self, connection: RtspConnection) -> None:
-        """Note that a connection has no session any more."""
+    def on_last_session_end(self, connection: RtspConnection) -> None:
+        """Start the time limit of a connection that has no session any more."""
         self._acceptor.move_back(connection)
         self._acceptor.expect(connection, IDLE_TIMEOUT, "no session")
 
@@ -109,21 +109,21 @@ class RtspServing:
             raise RtspError(404, f"expected one of {', '.join(self._streams)}, got {name[:80]!r}")
         return self._streams[name]
 
-    def admit(self, session: RtspSession, peer: str) -> None:
+    def add_viewer(self, session: RtspSession, peer: str) -> None:
         """Count a viewer from an address.
 
         Raises:
             RtspError: there are too many viewers, or too many from the address.
         """
-        if len(self._viewers) >= self._max_viewers:
+        if len(self._viewer_addresses) >= self._max_viewers:
             raise RtspError(453, f"there are {self._max_viewers} viewers already")
         share = share_of(self._max_viewers)
-        if not is_loopback(peer) and self._viewers.count(peer) >= share:
+        if not is_loopback(peer) and self._viewer_addresses.count(peer) >= share:
             raise RtspError(453, f"there are {share} viewers from {peer} already")
-        self._viewers.append(peer)
-        session.stream.viewers += 1
+        self._viewer_addresses.append(peer)
+        session.stream.viewer_count += 1
 
-    def dismiss(self, session: RtspSession, peer: str) -> None:
+    def remove_viewer(self, session: RtspSession, peer: str) -> None:
         """Remove a viewer from the count."""
-        self._viewers.remove(peer)
-        session.stream.viewers -= 1
+        self._viewer_addresses.remove(peer)
+        session.stream.viewer_count -= 1

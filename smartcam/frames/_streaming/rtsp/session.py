@@ -18,7 +18,7 @@ from smartcam.frames._streaming.rtp.packets import (
     parse_rtcp,
 )
 from smartcam.frames._streaming.rtp.reception import ntp_time
-from smartcam.frames._streaming.rtsp.packing import PacketNumbers
+from smartcam.frames._streaming.rtsp.packing import PacketHeaders
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,7 +37,8 @@ REPORT_INTERVAL: Final = 5.0
 CHECK_INTERVAL: Final = 1.0
 """Seconds between two checks of the client."""
 
-CLOCK: Final = 90_000
+CLOCK_RATE: Final = 90_000
+"""Ticks of RTP timestamps per second."""
 
 
 class RtspSession:
@@ -48,47 +49,47 @@ class RtspSession:
 
     Args:
         stream: stream to deliver.
-        ended: function that is called once when the session ends by itself, with the session and
-            the reason; "": the client takes nothing.
+        on_end: function that is called once when the session ends by itself, with the session and
+            the reason; "": the client accepts no data.
     """
 
-    def __init__(self, stream: RtspStream, ended: Callable[[RtspSession, str], None]) -> None:
+    def __init__(self, stream: RtspStream, on_end: Callable[[RtspSession, str], None]) -> None:
         self.id: str = secrets.token_hex(12)
         self.stream = stream
-        self.playing = False
+        self.is_playing = False
         self.delivery: PacketDelivery | None = None
-        self._ended = ended
+        self._on_end = on_end
         self._loop = asyncio.get_running_loop()
-        self._numbering = PacketNumbers()
-        self._offset = secrets.randbits(32)
-        self._last = -1  # last timestamp without the offset
-        self._wants_key, self._skips = True, False
+        self._headers = PacketHeaders()
+        self._timestamp_offset = secrets.randbits(32)
+        self._last_ticks = -1  # timestamp of the last frame, without the offset
+        self._awaits_key_frame, self._is_skipping = True, False
         self._reported_at = -REPORT_INTERVAL
-        self._heard_at = self._loop.time()
+        self._last_sign_of_life = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
 
     @property
     def ssrc(self) -> int:
         """SSRC of the session's packets."""
-        return self._numbering.ssrc
+        return self._headers.ssrc
 
     def start(self, delivery: PacketDelivery) -> None:
-        """Set the delivery to the client, which is closed with the session."""
+        """Set how packets reach the client; the delivery is closed with the session."""
         self.delivery = delivery
-        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check)
+        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check_client)
 
     def play(self) -> str:
-        """Start sending frames; return the RTP-Info of the first packet."""
-        if not self.playing:
-            self.playing, self._wants_key, self._skips = True, True, False
-            self.stream.shared.join(self)
+        """Start sending frames; return the first packet's numbers for the header RTP-Info."""
+        if not self.is_playing:
+            self.is_playing, self._awaits_key_frame, self._is_skipping = True, True, False
+            self.stream.shared.add_viewer(self)
         now = self._timestamp(self._ticks(time.monotonic()))
-        return f"seq={self._numbering.sequence};rtptime={now}"
+        return f"seq={self._headers.sequence};rtptime={now}"
 
     def pause(self) -> None:
         """Stop sending frames until :meth:`play`."""
-        self.playing = False
-        self.stream.shared.leave(self)
+        self.is_playing = False
+        self.stream.shared.remove_viewer(self)
 
     def close(self, why: str = "") -> None:
         """Release everything. Idempotent.
@@ -103,12 +104,12 @@ class RtspSession:
         delivery, self.delivery = self.delivery, None
         if delivery is not None:
             if why:
-                delivery.report(compound(*self._report(), Goodbye((self.ssrc,), why)))
+                delivery.send_rtcp(compound(*self._sender_report(), Goodbye((self.ssrc,), why)))
             delivery.close()
 
     def keep_alive(self) -> None:
-        """Note that the client is alive."""
-        self._heard_at = self._loop.time()
+        """Restart the time within which the client must send something."""
+        self._last_sign_of_life = self._loop.time()
 
     def take_rtcp(self, data: bytes) -> None:
         """Process a report of the client; invalid bytes are ignored."""
@@ -119,79 +120,79 @@ class RtspSession:
         if any(isinstance(report, ReceiverReport | SenderReport) for report in reports):
             self.keep_alive()
         if any(isinstance(report, PictureLost) and report.media == self.ssrc for report in reports):
-            self.stream.shared.key_frame()
+            self.stream.shared.request_key_frame()
 
     # called by the stream
 
-    def take(self, unit: Frame, key: bool) -> None:
+    def on_frame(self, unit: Frame, is_key_frame: bool) -> None:
         """Send an encoded frame, or skip it."""
         now, delivery = self._loop.time(), self.delivery
         if delivery is None:
             return
-        ready = delivery.ready(now)
-        if self._wants_key and not key:
-            self.stream.skipped += self._skips
-            if ready:
-                self.stream.shared.key_frame()
+        can_send = delivery.can_send(now)
+        if self._awaits_key_frame and not is_key_frame:
+            self.stream.skipped += self._is_skipping
+            if can_send:
+                self.stream.shared.request_key_frame()
             return
-        ticks = max(self._ticks(unit.captured), self._last + 1)
-        if not (ready and self._send(delivery, unit, ticks, key, now)):
+        ticks = max(self._ticks(unit.captured), self._last_ticks + 1)
+        if not (can_send and self._send(delivery, unit, ticks, is_key_frame, now)):
             self.stream.skipped += 1
-            self._wants_key = self._skips = True
+            self._awaits_key_frame = self._is_skipping = True
             return
-        self._last, self._wants_key, self._skips = ticks, False, False
+        self._last_ticks, self._awaits_key_frame, self._is_skipping = ticks, False, False
         self.stream.sent += 1
 
-    def ended(self, error: FrameSourceError) -> None:
+    def on_stream_end(self, error: FrameSourceError) -> None:
         """End the session, since the source has ended."""
-        self.playing = False
+        self.is_playing = False
         self._end(str(error))
 
     def _send(
-        self, delivery: PacketDelivery, unit: Frame, ticks: int, key: bool, now: float
+        self, delivery: PacketDelivery, unit: Frame, ticks: int, is_key_frame: bool, now: float
     ) -> bool:
-        pieces = self.stream.cutter.pieces(unit)
-        packets = self._numbering.numbered(pieces, self._timestamp(ticks))
+        payloads = self.stream.packetizer.payloads(unit)
+        packets = self._headers.packets_of(payloads, self._timestamp(ticks))
         if now - self._reported_at >= REPORT_INTERVAL:
             self._send_report(now)
-        return delivery.send(packets, key, now)
+        return delivery.send(packets, is_key_frame, now)
 
     def _ticks(self, moment: float) -> int:
-        return round(moment * CLOCK)
+        return round(moment * CLOCK_RATE)
 
     def _timestamp(self, ticks: int) -> int:
-        return ticks + self._offset & 0xFFFFFFFF
+        return ticks + self._timestamp_offset & 0xFFFFFFFF
 
-    def _report(self) -> tuple[SenderReport, SourceDescription]:
+    def _sender_report(self) -> tuple[SenderReport, SourceDescription]:
         ntp = ntp_time(time.time())
         stamp = self._timestamp(self._ticks(time.monotonic()))
-        made = self._numbering
-        report = SenderReport(self.ssrc, ntp, stamp, made.packets, made.octets)
+        headers = self._headers
+        report = SenderReport(self.ssrc, ntp, stamp, headers.packets, headers.octets)
         return report, SourceDescription(self.ssrc, "smartcam")
 
     def _send_report(self, now: float) -> None:
         self._reported_at = now
         if self.delivery is not None:
-            self.delivery.report(compound(*self._report()))
+            self.delivery.send_rtcp(compound(*self._sender_report()))
 
-    def _check(self) -> None:
+    def _check_client(self) -> None:
         """End the session if the client is lost."""
         if self.delivery is None:
             return
         now = self._loop.time()
-        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check)
-        alive = self.delivery.alive(now) if self.playing else None
-        if alive:
+        self._timer = self._loop.call_later(CHECK_INTERVAL, self._check_client)
+        is_alive = self.delivery.is_alive(now) if self.is_playing else None
+        if is_alive:
             self.keep_alive()
-        if alive is False:
+        if is_alive is False:
             self.stream.stalled += 1
             self._end("")
-        elif now - self._heard_at >= SESSION_TIMEOUT:
+        elif now - self._last_sign_of_life >= SESSION_TIMEOUT:
             self.stream.silent += 1
             self._end(f"no request or report came for {SESSION_TIMEOUT} s")
-        elif self.playing and now - self._reported_at >= REPORT_INTERVAL:
+        elif self.is_playing and now - self._reported_at >= REPORT_INTERVAL:
             self._send_report(now)
 
     def _end(self, why: str) -> None:
         self.close(why)
-        self._ended(self, why)
+        self._on_end(self, why)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from smartcam.frames._streaming.rtsp.packing import UnitCutter
+from smartcam.frames._streaming.rtsp.packing import FramePacketizer
 
 if TYPE_CHECKING:
     from smartcam.frames._streaming.shared_stream import SharedH264
@@ -43,8 +43,8 @@ class RtspStream:
     name: str
     shared: SharedH264
     rate: float
-    cutter: UnitCutter = field(default_factory=UnitCutter)
-    viewers: int = 0
+    packetizer: FramePacketizer = field(default_factory=FramePacketizer)
+    viewer_count: int = 0
     sent: int = 0
     skipped: int = 0
     stalled: int = 0
@@ -54,9 +54,9 @@ class RtspStream:
         """Return the counts of the stream."""
         counts = self.shared.counts
         return RtspStatistics(
-            viewers=self.viewers,
+            viewers=self.viewer_count,
             encoded=counts.encoded,
-            keys=counts.keys,
+            keys=counts.key_frames,
             failed=counts.failed,
             sent=self.sent,
             skipped=self.skipped,

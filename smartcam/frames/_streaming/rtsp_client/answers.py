@@ -25,20 +25,20 @@ MAX_HELD_BYTES: Final = 4 + 0xFFFF + MAX_HEAD_BYTES + MAX_BODY_BYTES
 
 _ANSWER: Final = re.compile(rb"RTSP/\d\.\d[ \t]+(\d{3})(?:[ \t]+([^\r\n]{0,200}))?")
 _REQUEST: Final = re.compile(rb"([A-Z_]{3,32})[ \t]+([^ \r\n]{1,2048})[ \t]+RTSP/\d\.\d[ \t]*")
-_HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
-_BEGINS: Final = re.compile(
+_HEADER_END: Final = re.compile(rb"\n\r{0,8}\n")
+_MESSAGE_START: Final = re.compile(
     rb"\$|RTSP/\d|(?:ANNOUNCE|GET_PARAMETER|OPTIONS|PAUSE|REDIRECT|SET_PARAMETER|TEARDOWN) "
 )
 
-MAX_BEGIN_BYTES: Final = 16
-"""Number of bytes that suffice to recognize a message."""
+MAX_START_BYTES: Final = 16
+"""Number of bytes that suffice to recognize the start of a message."""
 
 USUAL_CHANNELS: Final = range(4)
-"""Channels that are accepted directly after bytes outside of messages."""
+"""Channels whose packets are recognized directly after bytes outside of messages."""
 
 
 class ServerAnswer(NamedTuple):
-    """An answer; header names are in lower case, with all values of each."""
+    """An answer; ``headers`` has all values of each header, by its name in lower case."""
 
     status: int
     reason: str
@@ -74,69 +74,73 @@ Received: TypeAlias = ServerAnswer | ServerRequest | ChannelPacket
 
 
 class AnswerParser:
-    """Cut messages from a stream of bytes.
+    """Parse messages from a stream of bytes.
 
-    Bytes outside of messages are skipped. The parser keeps at most :data:`MAX_HELD_BYTES`, and
-    bytes fed since the last :meth:`next`.
+    Bytes outside of messages are skipped. The parser keeps at most :data:`MAX_HELD_BYTES`, and the
+    bytes that were fed since the last call of :meth:`next`.
     """
 
     def __init__(self) -> None:
         self._data = bytearray()
-        self._searched = 0  # number of searched bytes without the end of a header
-        self._strays = 0
+        self._searched_bytes = 0  # number of bytes that were searched and have no end of a header
+        self._stray_bytes = 0
         self._channels = set(USUAL_CHANNELS)
-        self._head: ServerAnswer | ServerRequest | None = None
-        self._body = 0  # size of the current body
+        self._message: ServerAnswer | ServerRequest | None = None
+        self._body_size = 0  # size of the current body
 
     def feed(self, data: bytes) -> None:
         """Add bytes."""
         self._data += data
 
     def next(self) -> Received | None:
-        """Return the next complete message; None if it is incomplete.
+        """Return the next message; None if no complete message is left.
 
         Raises:
             MessageError: too many bytes outside of messages, or a message is too large.
         """
-        while self._head is None:
+        while self._message is None:
             if not self._skip_strays():
                 return None
             if self._data[:1] == b"$":
                 return self._packet()
-            if not self._read_head():
+            if not self._read_header():
                 return None
-        if len(self._data) < self._body:
+        if len(self._data) < self._body_size:
             return None
-        head, self._head = self._head, None
-        body = bytes(self._data[: self._body])
-        del self._data[: self._body]
-        return head._replace(body=body) if isinstance(head, ServerAnswer) else head
+        message, self._message = self._message, None
+        body = bytes(self._data[: self._body_size])
+        del self._data[: self._body_size]
+        return message._replace(body=body) if isinstance(message, ServerAnswer) else message
 
     def _skip_strays(self) -> bool:
         """Skip bytes outside of messages; return True if a message begins."""
-        while (begins := self._begins()) is None:
-            if self._strays > MAX_STRAY_BYTES:
+        while (has_start := self._find_start()) is None:
+            if self._stray_bytes > MAX_STRAY_BYTES:
                 break
-        if self._strays > MAX_STRAY_BYTES:
-            raise MessageError(f"RTSP: {self._strays} bytes came that belong to no message")
-        return bool(begins)
+        if self._stray_bytes > MAX_STRAY_BYTES:
+            raise MessageError(f"RTSP: {self._stray_bytes} bytes came that belong to no message")
+        return bool(has_start)
 
-    def _begins(self) -> bool | None:
-        """Return True if a message begins; None: bytes that resembled a message were skipped."""
-        match = _BEGINS.search(self._data)
-        gone = match.start() if match else max(0, len(self._data) - MAX_BEGIN_BYTES)
-        if gone:
-            self._strays += len(self._data[:gone].strip(b"\r\n\0 "))
-            del self._data[:gone]
-            self._searched = 0
-        if match is None or not self._strays or self._data[:1] != b"$":
+    def _find_start(self) -> bool | None:
+        """Skip bytes up to a possible start of a message.
+
+        Returns:
+            True if a message starts; None if bytes that resembled a message were skipped.
+        """
+        match = _MESSAGE_START.search(self._data)
+        skipped = match.start() if match else max(0, len(self._data) - MAX_START_BYTES)
+        if skipped:
+            self._stray_bytes += len(self._data[:skipped].strip(b"\r\n\0 "))
+            del self._data[:skipped]
+            self._searched_bytes = 0
+        if match is None or not self._stray_bytes or self._data[:1] != b"$":
             return match is not None
         if len(self._data) <= 4:  # after skipped bytes, a dollar may be data
             return False
         if self._data[4] >> 6 == 2 and self._data[1] in self._channels:
             return True
         del self._data[:1]
-        self._strays += 1
+        self._stray_bytes += 1
         return None
 
     def _packet(self) -> ChannelPacket | None:
@@ -147,36 +151,36 @@ class AnswerParser:
             return None
         packet = ChannelPacket(self._data[1], bytes(self._data[4:end]))
         self._channels.add(packet.channel)
-        self._strays = 0
+        self._stray_bytes = 0
         del self._data[:end]
         return packet
 
-    def _read_head(self) -> bool:
+    def _read_header(self) -> bool:
         """Read the header of a message; return False if it is incomplete.
 
-        Lines may end by either character, or by both.
+        Lines may end with LF or CRLF.
         """
-        match = _HEAD_ENDS.search(self._data, max(0, self._searched - 10))
+        match = _HEADER_END.search(self._data, max(0, self._searched_bytes - 10))
         size = match.end() if match else len(self._data)
         if size > MAX_HEAD_BYTES:
             raise MessageError(f"RTSP: an answer: expected lines of {MAX_HEAD_BYTES} bytes at most")
         if match is None:
-            self._searched = size
+            self._searched_bytes = size
             return False
         lines = bytes(self._data[:size]).replace(b"\r", b"").split(b"\n")
         del self._data[:size]
-        self._searched = 0
-        self._head = _message(lines[0], _headers(lines[1:]))
-        if self._head is not None:
-            self._strays = 0
-            self._body = _length(self._head.headers)
+        self._searched_bytes = 0
+        self._message = _parse_first_line(lines[0], _headers(lines[1:]))
+        if self._message is not None:
+            self._stray_bytes = 0
+            self._body_size = _body_length(self._message.headers)
         return True
 
 
-def _message(
+def _parse_first_line(
     line: bytes, headers: Mapping[str, Sequence[str]]
 ) -> ServerAnswer | ServerRequest | None:
-    """Return the message for its first line; None: the line is no beginning of a message."""
+    """Return the message that starts with a line; None: no message starts with this line."""
     if (match := _ANSWER.match(line)) is not None:
         reason = (match[2] or b"").decode("latin-1").strip()
         return ServerAnswer(int(match[1]), reason, headers)
@@ -199,7 +203,7 @@ def _headers(lines: list[bytes]) -> dict[str, list[str]]:
     return headers
 
 
-def _length(headers: Mapping[str, Sequence[str]]) -> int:
+def _body_length(headers: Mapping[str, Sequence[str]]) -> int:
     given = next(iter(headers.get("content-length", ())), "0")
     if not re.fullmatch(r"[0-9]{1,20}", given):
         return 0

@@ -18,7 +18,9 @@ MAX_CHALLENGES: Final = 8
 _HASHES: Final = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
 """Hash functions by their names in challenges; the last one is preferred."""
 
-_PART: Final = re.compile(r'\s*([A-Za-z0-9_-]{1,32})\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s",]*))\s*,?')
+_PARAMETER: Final = re.compile(
+    r'\s*([A-Za-z0-9_-]{1,32})\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s",]*))\s*,?'
+)
 
 
 class Challenge(NamedTuple):
@@ -26,43 +28,47 @@ class Challenge(NamedTuple):
 
     Attributes:
         scheme: name in lower case.
-        parts: parameters by names in lower case.
+        parameters: parameters by names in lower case.
     """
 
     scheme: str
-    parts: dict[str, str]
+    parameters: dict[str, str]
 
     @property
     def algorithm(self) -> str:
         """Name of Digest's hash function, without ``-sess``."""
-        return self.parts.get("algorithm", "MD5").upper().removesuffix("-SESS")
+        return self.parameters.get("algorithm", "MD5").upper().removesuffix("-SESS")
 
     @property
     def rank(self) -> int:
         """Preference of the challenge; 0: not supported."""
         if self.scheme == "basic":
             return 1
-        qop = re.split(r"[\s,]+", self.parts.get("qop", "auth").lower())
-        known = self.scheme == "digest" and "nonce" in self.parts and "auth" in qop
-        return 2 + list(_HASHES).index(self.algorithm) if known and self.algorithm in _HASHES else 0
+        qop = re.split(r"[\s,]+", self.parameters.get("qop", "auth").lower())
+        is_supported = self.scheme == "digest" and "nonce" in self.parameters and "auth" in qop
+        return (
+            2 + list(_HASHES).index(self.algorithm)
+            if is_supported and self.algorithm in _HASHES
+            else 0
+        )
 
 
 def challenge_of(headers: Sequence[str]) -> Challenge | None:
     """Return the preferred supported challenge of an answer; None: there is none."""
-    read = [_read(header) for header in headers[:MAX_CHALLENGES]]
-    best = max(read, key=lambda challenge: challenge.rank, default=None)
+    challenges = [_parse_challenge(header) for header in headers[:MAX_CHALLENGES]]
+    best = max(challenges, key=lambda challenge: challenge.rank, default=None)
     return best if best is not None and best.rank else None
 
 
-def _read(header: str) -> Challenge:
-    scheme, _, given = header.strip().partition(" ")
-    parts: dict[str, str] = {}
-    place = 0
-    while (match := _PART.match(given, place)) is not None:
+def _parse_challenge(header: str) -> Challenge:
+    scheme, _, text = header.strip().partition(" ")
+    parameters: dict[str, str] = {}
+    offset = 0
+    while (match := _PARAMETER.match(text, offset)) is not None:
         value = match[3] if match[2] is None else re.sub(r"\\(.)", r"\1", match[2])
-        parts.setdefault(match[1].lower(), value)
-        place = match.end()
-    return Challenge(scheme.lower(), parts)
+        parameters.setdefault(match[1].lower(), value)
+        offset = match.end()
+    return Challenge(scheme.lower(), parameters)
 
 
 class Credentials:
@@ -76,22 +82,22 @@ class Credentials:
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
         self._challenge: Challenge | None = None
-        self._count = 0  # number of requests with the challenge's nonce
+        self._request_count = 0  # number of requests with the challenge's nonce
 
     @property
-    def known(self) -> bool:
+    def has_user(self) -> bool:
         """True if there is a user."""
         return bool(self._user)
 
-    def challenged(self, headers: Sequence[str]) -> bool:
-        """Store a refusal's challenge; return whether another request may succeed."""
+    def store_challenge(self, headers: Sequence[str]) -> bool:
+        """Store the challenge of a refusal; return False if another request would fail, too."""
         challenge = challenge_of(headers)
-        if not self.known or challenge is None:
+        if not self.has_user or challenge is None:
             return False
-        before, self._challenge = self._challenge, challenge
-        self._count = 0
-        stale = challenge.parts.get("stale", "").lower() == "true"
-        return before is None or stale or challenge.parts != before.parts
+        previous, self._challenge = self._challenge, challenge
+        self._request_count = 0
+        is_stale = challenge.parameters.get("stale", "").lower() == "true"
+        return previous is None or is_stale or challenge.parameters != previous.parameters
 
     def header(self, method: str, uri: str) -> str:
         """Return the value of ``Authorization``; "" without a challenge."""
@@ -99,40 +105,40 @@ class Credentials:
         if challenge is None:
             return ""
         if challenge.scheme == "basic":
-            both = f"{self._user}:{self._password}".encode()
-            return f"Basic {base64.b64encode(both).decode()}"
-        self._count += 1
+            user_and_password = f"{self._user}:{self._password}".encode()
+            return f"Basic {base64.b64encode(user_and_password).decode()}"
+        self._request_count += 1
         return self._digest(challenge, method, uri)
 
     def _digest(self, challenge: Challenge, method: str, uri: str) -> str:
-        given, hashed = challenge.parts, _hash(challenge.algorithm)
+        given, hash_text = challenge.parameters, _hash_function(challenge.algorithm)
         realm, nonce = given.get("realm", ""), given["nonce"]
-        secret = hashed(f"{self._user}:{realm}:{self._password}")
-        count, client_nonce = f"{self._count:08x}", secrets.token_hex(8)
-        session = given.get("algorithm", "").upper().endswith("-SESS")
-        if session:
-            secret = hashed(f"{secret}:{nonce}:{client_nonce}")
-        hash_of_request, quality = hashed(f"{method}:{uri}"), "qop" in given
-        middle = f"{nonce}:{count}:{client_nonce}:auth" if quality else nonce
-        parts = {"username": self._user, "realm": realm, "nonce": nonce, "uri": uri}
-        parts["response"] = hashed(f"{secret}:{middle}:{hash_of_request}")
-        shown = [f"{name}={_quoted(value)}" for name, value in parts.items()]
+        secret = hash_text(f"{self._user}:{realm}:{self._password}")
+        count, client_nonce = f"{self._request_count:08x}", secrets.token_hex(8)
+        is_session = given.get("algorithm", "").upper().endswith("-SESS")
+        if is_session:
+            secret = hash_text(f"{secret}:{nonce}:{client_nonce}")
+        hash_of_request, has_qop = hash_text(f"{method}:{uri}"), "qop" in given
+        middle = f"{nonce}:{count}:{client_nonce}:auth" if has_qop else nonce
+        parameters = {"username": self._user, "realm": realm, "nonce": nonce, "uri": uri}
+        parameters["response"] = hash_text(f"{secret}:{middle}:{hash_of_request}")
+        fields = [f"{name}={_quoted(value)}" for name, value in parameters.items()]
         if "algorithm" in given:
-            shown.append(f"algorithm={given['algorithm']}")
+            fields.append(f"algorithm={given['algorithm']}")
         if "opaque" in given:
-            shown.append(f"opaque={_quoted(given['opaque'])}")
-        if quality or session:
-            shown.append(f'cnonce="{client_nonce}"')
-        if quality:
-            shown += ("qop=auth", f"nc={count}")
-        return f"Digest {', '.join(shown)}"
+            fields.append(f"opaque={_quoted(given['opaque'])}")
+        if has_qop or is_session:
+            fields.append(f'cnonce="{client_nonce}"')
+        if has_qop:
+            fields += ("qop=auth", f"nc={count}")
+        return f"Digest {', '.join(fields)}"
 
 
-def _hash(algorithm: str) -> Callable[[str], str]:
-    def hashed(text: str) -> str:
+def _hash_function(algorithm: str) -> Callable[[str], str]:
+    def hash_text(text: str) -> str:
         return _HASHES[algorithm](text.encode(), usedforsecurity=False).hexdigest()
 
-    return hashed
+    return hash_text
 
 
 def _quoted(text: str) -> str:

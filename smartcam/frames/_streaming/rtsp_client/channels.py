@@ -13,15 +13,18 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtsp_client.link import RtspLink
 
 
-def options_of(transport: str) -> dict[str, str]:
-    """Return the options of a header's first transport, by names in lower case."""
+def transport_options(transport: str) -> dict[str, str]:
+    """Return the options of the first transport in a header ``Transport``.
+
+    The keys are names in lower case; the protocol is under ``""``.
+    """
     protocol, *rest = transport.partition(",")[0].split(";")
     parts = (option.strip().partition("=") for option in rest)
     options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
     return {"": protocol.strip().upper()} | options
 
 
-def pair_of(text: str, most: int) -> tuple[int, int] | None:
+def parse_pair(text: str, most: int) -> tuple[int, int] | None:
     """Parse a pair of channels or ports; a missing second number is the first plus one."""
     match = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
     if match is None:
@@ -44,40 +47,40 @@ class InterleavedChannels:
     """
 
     def __init__(self, link: RtspLink, channels: tuple[int, int], payload_type: int) -> None:
-        self._link, self._channels, self._type = link, channels, payload_type
-        self._sure = False
-        self._rtp: Callable[[bytes, tuple[Any, ...]], None] | None = None
-        self._rtcp: Callable[[bytes, tuple[Any, ...]], None] | None = None
-        self._from = link.peer
+        self._link, self._channels, self._payload_type = link, channels, payload_type
+        self._is_confirmed = False
+        self._on_rtp: Callable[[bytes, tuple[Any, ...]], None] | None = None
+        self._on_rtcp: Callable[[bytes, tuple[Any, ...]], None] | None = None
+        self._peer = link.peer
 
-    def read(
+    def start_reading(
         self,
-        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
-        rtcp: Callable[[bytes, tuple[Any, ...]], None],
-        read: Callable[[], None],
+        on_rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        on_rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        on_batch_read: Callable[[], None],
     ) -> None:
-        """Call ``rtp`` and ``rtcp`` for each packet and report, until :meth:`close`."""
-        self._rtp, self._rtcp = rtp, rtcp
-        self._link.on_packet, self._link.on_read = self._packet, read
+        """Call the functions for each packet, for each report, and after each batch."""
+        self._on_rtp, self._on_rtcp = on_rtp, on_rtcp
+        self._link.on_packet, self._link.on_batch_read = self._on_packet, on_batch_read
 
-    def _packet(self, channel: int, data: bytes) -> None:
-        report = is_rtcp(data)
-        if not self._sure and channel not in self._channels and not report:
-            if len(data) < 2 or data[1] & 0x7F != self._type:
+    def _on_packet(self, channel: int, data: bytes) -> None:
+        is_report = is_rtcp(data)
+        if not self._is_confirmed and channel not in self._channels and not is_report:
+            if len(data) < 2 or data[1] & 0x7F != self._payload_type:
                 return
             self._channels = (channel, channel ^ 1)
         if channel not in self._channels:
             return
-        self._sure |= not report and channel == self._channels[0]
-        take = self._rtcp if report else self._rtp
-        if take is not None:
-            take(data, self._from)
+        self._is_confirmed |= not is_report and channel == self._channels[0]
+        callback = self._on_rtcp if is_report else self._on_rtp
+        if callback is not None:
+            callback(data, self._peer)
 
-    def report(self, data: bytes, _: tuple[Any, ...]) -> None:
-        """Send a report; drop it if too much data waits, since reports are repeated."""
+    def send_rtcp(self, data: bytes, _: tuple[Any, ...]) -> None:
+        """Send a report; drop it if too much unsent data waits, since reports are repeated."""
         head = bytes((0x24, self._channels[1])) + len(data).to_bytes(2, "big")
         self._link.write(head + data)
 
     def close(self) -> None:
         """Stop calling the functions."""
-        self._rtp = self._rtcp = None
+        self._on_rtp = self._on_rtcp = None

@@ -21,7 +21,7 @@ MAX_LINES: Final = 1000
 CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
 """Supported codecs by their names."""
 
-STATIC: Final = {26: "JPEG", 28: "NV", 31: "H261", 32: "MPV", 33: "MP2T", 34: "H263"}
+STATIC_CODECS: Final = {26: "JPEG", 28: "NV", 31: "H261", 32: "MPV", 33: "MP2T", 34: "H263"}
 """Codecs by static payload types (RFC 3551)."""
 
 
@@ -34,7 +34,7 @@ class VideoTrack(NamedTuple):
         control: URL of the stream in the description, perhaps relative; "": the description's URL.
         parameters: parameters of the codec (fmtp), by names in lower case.
         size: size of the pictures; None: not in the description.
-        secure: whether the packets are encrypted (SRTP).
+        is_encrypted: whether the packets are encrypted (SRTP).
     """
 
     payload_type: int
@@ -42,7 +42,7 @@ class VideoTrack(NamedTuple):
     control: str = ""
     parameters: Mapping[str, str] = MappingProxyType({})
     size: tuple[int, int] | None = None
-    secure: bool = False
+    is_encrypted: bool = False
 
     @property
     def coding(self) -> Coding | None:
@@ -50,11 +50,11 @@ class VideoTrack(NamedTuple):
         return CODINGS.get(self.encoding)
 
     @property
-    def sets(self) -> bytes:
+    def parameter_sets(self) -> bytes:
         """Parameter sets for the decoder, as in a file; b"" if the description has none."""
         names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
         units = [value for name in names for value in self.parameters.get(name, "").split(",")]
-        return b"".join(START_CODE + unit for text in units if (unit := _decoded(text)))
+        return b"".join(START_CODE + unit for text in units if (unit := _decode_base64(text)))
 
 
 class StreamDescription(NamedTuple):
@@ -63,20 +63,20 @@ class StreamDescription(NamedTuple):
     Attributes:
         control: URL of all streams together, perhaps relative; "": not given.
         tracks: tracks of video.
-        others: kinds of the other streams, such as audio.
+        others: media types of the other streams, such as audio.
     """
 
     control: str
     tracks: tuple[VideoTrack, ...]
     others: tuple[str, ...]
 
-    def chosen(self) -> VideoTrack | None:
+    def first_supported_track(self) -> VideoTrack | None:
         """Return the first supported stream of video; None: there is none."""
-        ours = (track for track in self.tracks if track.coding is not None and not track.secure)
-        return next(ours, None)
+        tracks = self.tracks
+        return next((track for track in tracks if track.coding and not track.is_encrypted), None)
 
 
-def described(body: bytes) -> StreamDescription:
+def parse_description(body: bytes) -> StreamDescription:
     """Parse a description; unreadable lines are skipped."""
     lines = body.decode("utf-8", "replace").replace("\r", "\n").split("\n")[:MAX_LINES]
     sections: list[list[str]] = [[]]
@@ -85,45 +85,48 @@ def described(body: bytes) -> StreamDescription:
             sections.append([])
         sections[-1].append(line)
     session, *media = sections
-    kinds = [section[0][2:].split() for section in media]
+    media_lines = [section[0][2:].split() for section in media]
     tracks = [
-        _track(kind, section)
-        for kind, section in zip(kinds, media, strict=True)
-        if kind[:1] == ["video"]
+        _track(media_line, section)
+        for media_line, section in zip(media_lines, media, strict=True)
+        if media_line[:1] == ["video"]
     ]
-    others = tuple(kind[0] for kind in kinds if kind and kind[0] != "video")
+    others = tuple(line[0] for line in media_lines if line and line[0] != "video")
     return StreamDescription(_attribute(session, "control"), tuple(tracks), others)
 
 
-def _track(kind: list[str], lines: list[str]) -> VideoTrack:
-    numbers = [int(number) for number in kind[3:] if re.fullmatch(r"[0-9]{1,3}", number)] or [-1]
-    names = {number: _encoding(number, lines) for number in numbers}
-    number = next((number for number in numbers if names[number] in CODINGS), numbers[0])
-    secure = len(kind) > 2 and kind[2].upper().startswith("RTP/SAVP")
-    parameters = _parameters(_of_type(lines, "fmtp", number))
-    encoding = names[number]
+def _track(media_line: list[str], lines: list[str]) -> VideoTrack:
+    types = [int(text) for text in media_line[3:] if re.fullmatch(r"[0-9]{1,3}", text)] or [-1]
+    encodings = {payload_type: _encoding(payload_type, lines) for payload_type in types}
+    supported = (payload_type for payload_type in types if encodings[payload_type] in CODINGS)
+    payload_type = next(supported, types[0])
+    is_encrypted = len(media_line) > 2 and media_line[2].upper().startswith("RTP/SAVP")
+    parameters = _parameters(_typed_attribute(lines, "fmtp", payload_type))
+    encoding = encodings[payload_type]
     if not encoding and "sprop-parameter-sets" in parameters:
         encoding = "H264"
     return VideoTrack(
-        number, encoding, _attribute(lines, "control"), parameters, _size(lines), secure
+        payload_type, encoding, _attribute(lines, "control"), parameters, _size(lines), is_encrypted
     )
 
 
-def _encoding(number: int, lines: list[str]) -> str:
-    text = _of_type(lines, "rtpmap", number)
-    return text.partition(";")[0].partition("/")[0].strip().upper() or STATIC.get(number, "")
+def _encoding(payload_type: int, lines: list[str]) -> str:
+    text = _typed_attribute(lines, "rtpmap", payload_type)
+    name = text.partition(";")[0].partition("/")[0].strip().upper()
+    return name or STATIC_CODECS.get(payload_type, "")
 
 
 def _attribute(lines: list[str], name: str) -> str:
-    begins = f"a={name}:"
-    line = next((line for line in lines if line.lower().startswith(begins)), begins)
-    return line[len(begins) :].strip()
+    prefix = f"a={name}:"
+    line = next((line for line in lines if line.lower().startswith(prefix)), prefix)
+    return line[len(prefix) :].strip()
 
 
-def _of_type(lines: list[str], name: str, number: int) -> str:
-    """Return the texts of an attribute for a payload type, joined."""
+def _typed_attribute(lines: list[str], name: str, payload_type: int) -> str:
+    """Return all values of an attribute for a payload type, joined by semicolons."""
     matches = (re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line) for line in lines)
-    return ";".join(match[2] for match in matches if match is not None and int(match[1]) == number)
+    found = (match for match in matches if match is not None and int(match[1]) == payload_type)
+    return ";".join(match[2] for match in found)
 
 
 def _parameters(text: str) -> dict[str, str]:
@@ -133,14 +136,16 @@ def _parameters(text: str) -> dict[str, str]:
 
 def _size(lines: list[str]) -> tuple[int, int] | None:
     """Return the size of the pictures, which some senders of large JPEGs describe."""
-    for name, between in (("x-dimensions", ","), ("framesize", "-")):
-        match = re.search(rf"([0-9]{{1,5}})\s*{between}\s*([0-9]{{1,5}})", _attribute(lines, name))
+    for name, separator in (("x-dimensions", ","), ("framesize", "-")):
+        match = re.search(
+            rf"([0-9]{{1,5}})\s*{separator}\s*([0-9]{{1,5}})", _attribute(lines, name)
+        )
         if match is not None and int(match[1]) and int(match[2]):
             return int(match[1]), int(match[2])
     return None
 
 
-def _decoded(text: str) -> bytes:
+def _decode_base64(text: str) -> bytes:
     text = "".join(text.split())
     try:
         return base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
@@ -149,16 +154,20 @@ def _decoded(text: str) -> bytes:
 
 
 def url_of(control: str, base: str) -> str:
-    """Return the absolute URL of a stream, relative to the URL of all streams.
+    """Return the absolute URL of a stream.
+
+    Args:
+        control: URL of the stream in the description, perhaps relative.
+        base: URL of all streams together.
 
     The URL is only used in requests to the same server.
     """
     if not control or control == "*":
         return base
     try:
-        absolute = urlsplit(control).scheme.lower() in ("rtsp", "rtsps")
+        is_absolute = urlsplit(control).scheme.lower() in ("rtsp", "rtsps")
     except ValueError:
-        absolute = False
-    if absolute:
+        is_absolute = False
+    if is_absolute:
         return control
     return f"{base}{control}" if base.endswith("/") else f"{base}/{control.removeprefix('/')}"

@@ -10,7 +10,7 @@ from smartcam.exceptions import UnsupportedError
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
 from smartcam.frames._streaming.rtp.driver import FirstPicture
-from smartcam.frames._streaming.rtp.jpeg import JpegUnits
+from smartcam.frames._streaming.rtp.jpeg import JpegPayloadFormat
 from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
 from smartcam.frames._streaming.rtsp_client.conversation import (
     ConversationPlan,
@@ -18,19 +18,19 @@ from smartcam.frames._streaming.rtsp_client.conversation import (
     RtspConversation,
 )
 from smartcam.frames._streaming.rtsp_client.parameters import RtspParameters
-from smartcam.frames._video.driver import VideoDriver, one_of, tls_of, wanted_format
+from smartcam.frames._video.driver import VideoDriver, one_of, tls_context, wanted_format
 from smartcam.frames._video.frames import CONVERTIBLE
 
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._features import DeviceFeatures
-    from smartcam.frames._streaming.rtp.assembling import UnitKind
+    from smartcam.frames._streaming.rtp.assembling import PayloadFormat
     from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
     from smartcam.frames._streaming.rtsp_client.description import VideoTrack
 
 
-KNOWN: Final = ("delay", "elsewhere", "format", "name", "timeout", "transport")
+PARAMETERS: Final = ("delay", "elsewhere", "format", "name", "timeout", "transport")
 
 
 class RtspDriver(FrameDriver):
@@ -68,27 +68,27 @@ class RtspDriver(FrameDriver):
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
         secure = address.scheme == "rtsps"
-        given = address.parameters(
-            sorted((*KNOWN, "ca", "verify")) if secure else KNOWN, address.fragment
+        parameters = address.parameters(
+            sorted((*PARAMETERS, "ca", "verify")) if secure else PARAMETERS, address.fragment
         )
         number = address.number
-        self._name = given.get("name") or address.shown.partition("#")[0].partition("?")[0]
-        self._delay = number("delay", given.get("delay", "1"), 0, 600)
-        wanted = wanted_format(address, given.get("format"))
+        self._name = parameters.get("name") or address.shown.partition("#")[0].partition("?")[0]
+        self._delay = number("delay", parameters.get("delay", "1"), 0, 600)
+        wanted = wanted_format(address, parameters.get("format"))
         self._format = "" if wanted is None else wanted.name
-        transport = one_of(address, "transport", given, ("tcp", "udp"))
-        transports = (transport,) if "transport" in given else ("tcp", "udp")
-        elsewhere = one_of(address, "elsewhere", given, ("no", "yes")) == "yes"
-        timeout = number("timeout", given.get("timeout", "5"), 0.1, 600)
+        transport = one_of(address, "transport", parameters, ("tcp", "udp"))
+        transports = (transport,) if "transport" in parameters else ("tcp", "udp")
+        follows_elsewhere = one_of(address, "elsewhere", parameters, ("no", "yes")) == "yes"
+        timeout = number("timeout", parameters.get("timeout", "5"), 0.1, 600)
         url = address.url.partition("#")[0]
-        tls = tls_of(address, given)
+        tls = tls_context(address, parameters)
         if not address.host:
             raise address.wrong("address", "rtsp://HOST/PATH", address.shown)
-        self._plan = ConversationPlan(self._name, url, timeout, transports, elsewhere, tls)
+        self._plan = ConversationPlan(self._name, url, timeout, transports, follows_elsewhere, tls)
         self._size: tuple[int, int] | None = None
-        self._proofs = 0
-        self._playing: _Playing | None = None
-        self._other: VideoDriver | None = None
+        self._right_markers = 0
+        self._playing: _PlayingSession | None = None
+        self._ffmpeg_driver: VideoDriver | None = None
 
     @property
     def name(self) -> str:
@@ -102,13 +102,13 @@ class RtspDriver(FrameDriver):
 
     async def _ask(self, method: str, body: bytes) -> ServerAnswer:
         """Send a request on the playing connection, or on a new connection."""
-        if self._other is not None:
+        if self._ffmpeg_driver is not None:
             raise UnsupportedError(f"{self._name}: FFmpeg reads this stream, without parameters")
         if self._playing is not None:
-            return await self._playing.conversation.parameter(method, body)
+            return await self._playing.conversation.send_parameter(method, body)
         conversation = RtspConversation(self._plan)
         try:
-            return await conversation.parameter(method, body)
+            return await conversation.send_parameter(method, body)
         finally:
             await conversation.close()
 
@@ -131,8 +131,8 @@ class RtspDriver(FrameDriver):
             async with asyncio.timeout(self._plan.timeout):
                 frame = await first.outcome
         except OtherEncodingError:
-            self._other = VideoDriver(self.address)
-            return await self._other.open()
+            self._ffmpeg_driver = VideoDriver(self.address)
+            return await self._ffmpeg_driver.open()
         except TimeoutError:
             raise self._plan.source_error(
                 f"expected a whole picture, got none within {self._plan.timeout:g} s: "
@@ -149,8 +149,8 @@ class RtspDriver(FrameDriver):
         Raises:
             FrameSourceError: the camera is gone, refuses, or does not answer.
         """
-        if self._other is not None:
-            await self._other.start(sink)
+        if self._ffmpeg_driver is not None:
+            await self._ffmpeg_driver.start(sink)
         else:
             await self._start(sink)
 
@@ -159,10 +159,12 @@ class RtspDriver(FrameDriver):
         conversation = RtspConversation(self._plan)
         try:
             await conversation.set_up()
-            plan = self._decoding(conversation.track)
-            watched = self._size is not None
-            self._playing = _Playing(self._plan, plan, conversation, sink, watched, self._proofs)
-            await self._playing.begin()
+            plan = self._decoding_plan(conversation.track)
+            has_size = self._size is not None
+            self._playing = _PlayingSession(
+                self._plan, plan, conversation, sink, has_size, self._right_markers
+            )
+            await self._playing.start()
         except BaseException:
             try:
                 await self.stop()
@@ -170,37 +172,45 @@ class RtspDriver(FrameDriver):
                 await conversation.close()
             raise
 
-    def _decoding(self, track: VideoTrack) -> DecodingPlan:
+    def _decoding_plan(self, track: VideoTrack) -> DecodingPlan:
         coding = track.coding
         assert coding is not None  # noqa: S101 - others are not chosen
-        passed_on = self._format in ("H264", "MJPEG")
-        comes = coding.format if coding.name != "H265" else coding.name
-        if passed_on and comes != self._format:
-            raise self._plan.source_error(f"expected {self._format}, got {comes}")
-        to = "" if passed_on or not self._format else CONVERTIBLE[self._format]
-        name, sets = self._name, track.sets
-        return DecodingPlan(name, coding, self._delay, self._size, sets, to, passed_on)
+        passes_encoded = self._format in ("H264", "MJPEG")
+        actual = coding.format if coding.name != "H265" else coding.name
+        if passes_encoded and actual != self._format:
+            raise self._plan.source_error(f"expected {self._format}, got {actual}")
+        converts = bool(self._format) and not passes_encoded
+        return DecodingPlan(
+            self._name,
+            coding,
+            self._delay,
+            self._size,
+            track.parameter_sets,
+            CONVERTIBLE[self._format] if converts else "",
+            passes_encoded,
+        )
 
     async def stop(self) -> None:
         """End the session."""
-        if self._other is not None:
-            await self._other.stop()
+        if self._ffmpeg_driver is not None:
+            await self._ffmpeg_driver.stop()
         playing, self._playing = self._playing, None
         if playing is not None:
-            self._proofs = playing.proofs
-            await playing.end()
+            self._right_markers = playing.right_markers
+            await playing.stop()
 
     async def close(self) -> None:
         """Release everything. Idempotent."""
         await self.stop()
 
 
-class _Playing:
+class _PlayingSession:
     """The tasks and the connection of a driver while a camera plays.
 
     Args:
-        watched: whether silence is an error; ``open`` has its own timeout with a fuller error.
-        proofs: number of earlier frames of the camera with a right marker.
+        detects_silence: whether a pause without packets is an error; :meth:`RtspDriver.open` waits
+            for a picture with a timeout of its own instead.
+        right_markers: number of earlier frames of the camera with a right marker.
     """
 
     def __init__(
@@ -209,70 +219,71 @@ class _Playing:
         decoding: DecodingPlan,
         conversation: RtspConversation,
         sink: FrameSink,
-        watched: bool,
-        proofs: int,
+        detects_silence: bool,
+        right_markers: int,
     ) -> None:
-        self._plan, self.conversation, self._watched = plan, conversation, watched
+        self._plan, self.conversation, self._detects_silence = plan, conversation, detects_silence
         track = conversation.track
-        kind: UnitKind = decoding.coding.kind()
-        if isinstance(kind, JpegUnits):
-            kind.size = track.size
+        payload_format: PayloadFormat = decoding.coding.payload_format()
+        if isinstance(payload_format, JpegPayloadFormat):
+            payload_format.size = track.size
         self._decoding = UnitDecoding(decoding, sink)
-        self._watching: asyncio.Task[None] | None = None
+        self._silence_task: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
             *(
                 conversation.channels,
                 track.payload_type,
                 0.0,
-                self._decoding.take,
-                self._said_goodbye,
+                self._decoding.queue_units,
+                self._on_goodbye,
             ),
-            only=conversation.senders,
-            kind=kind,
-            agreed=True,
-            proofs=proofs,
+            only_hosts=conversation.senders,
+            payload_format=payload_format,
+            is_negotiated=True,
+            right_markers=right_markers,
         )
-        conversation.link.on_end = self._over
+        conversation.link.on_end = self._report_end
 
-    async def begin(self) -> None:
+    async def start(self) -> None:
         """Start playing, and decode the camera's packets."""
-        await self._decoding.begin(self._receiver)
+        await self._decoding.start(self._receiver)
         await self.conversation.play()
-        if self._watched:
-            watching = self._watch()
-            self._watching = asyncio.create_task(watching, name=f"silence of {self._plan.name}")
+        if self._detects_silence:
+            name = f"silence of {self._plan.name}"
+            self._silence_task = asyncio.create_task(self._watch_silence(), name=name)
 
-    async def end(self) -> None:
+    async def stop(self) -> None:
         """Stop; the sink is not called any more."""
-        watching, self._watching = self._watching, None
-        if watching is not None:
-            watching.cancel()
+        silence_task, self._silence_task = self._silence_task, None
+        if silence_task is not None:
+            silence_task.cancel()
         try:
-            if watching is not None:
-                await asyncio.wait([watching])
+            if silence_task is not None:
+                await asyncio.wait([silence_task])
             self._receiver.close()
             await self.conversation.close()
         finally:
             self._receiver.close()
-            await self._decoding.end()
+            await self._decoding.stop()
 
     @property
-    def proofs(self) -> int:
+    def right_markers(self) -> int:
         """Number of the camera's frames with a right marker."""
-        return self._receiver.proofs
+        return self._receiver.right_markers
 
     def statistics(self) -> RtpStatistics:
         """Return the counts of packets received."""
         return self._receiver.statistics(self._decoding.overflows)
 
-    def _said_goodbye(self, reason: str) -> None:
-        self._over(f"the server ended the stream{f' ({reason})' if reason else ''}")
+    def _on_goodbye(self, reason: str) -> None:
+        self._report_end(f"the server ended the stream{f' ({reason})' if reason else ''}")
 
-    def _over(self, why: str) -> None:
-        self._decoding.over(self._plan.source_error(why))
+    def _report_end(self, why: str) -> None:
+        self._decoding.report_end(self._plan.source_error(why))
 
-    async def _watch(self) -> None:
-        loop, longest = asyncio.get_running_loop(), self._plan.timeout
-        while (left := self._receiver.last_packet_at + longest - loop.time()) > 0:  # noqa: ASYNC110
-            await asyncio.sleep(left)
-        self._over(f"no packet came for {longest:g} s")
+    async def _watch_silence(self) -> None:
+        loop, timeout = asyncio.get_running_loop(), self._plan.timeout
+        receiver = self._receiver
+        while (remaining := receiver.last_packet_at + timeout - loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(remaining)
+        self._report_end(f"no packet came for {timeout:g} s")

@@ -32,12 +32,12 @@ MAX_REFUSALS: Final = 3
 MAX_UNANSWERED: Final = 32
 """Largest number of unanswered requests that are kept, since answers may be late."""
 
-_ALLOWED: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
-_ENDING: Final = ("REDIRECT", "TEARDOWN")
+_ANSWERED_METHODS: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
+_ENDING_METHODS: Final = ("REDIRECT", "TEARDOWN")
 
 
 class RtspLink(asyncio.Protocol):
-    """A connection to a server; one task sends requests, and packets are passed on.
+    """A connection to a server: it sends one request at a time, and passes packets on.
 
     Args:
         name: name of the source, for errors.
@@ -45,26 +45,30 @@ class RtspLink(asyncio.Protocol):
 
     Attributes:
         on_packet: function that is called with a channel and a packet.
-        on_read: function that is called after each batch of packets.
+        on_batch_read: function that is called after each batch of packets.
         on_end: function that is called once with the reason of the end.
     """
 
     def __init__(self, name: str, credentials: Credentials) -> None:
         self.name, self._credentials = name, credentials
         self.on_packet: Callable[[int, bytes], None] = _ignore
-        self.on_read: Callable[[], None] = _ignore
+        self.on_batch_read: Callable[[], None] = _ignore
         self.on_end: Callable[[str], None] = _ignore
-        self.ended = ""  # reason of the end
+        self.end_reason = ""  # why the link ended; "": it has not ended
         self._parser = AnswerParser()
         self._transport: asyncio.Transport | None = None
         self._cseq = 0
-        self._waiting: tuple[int, asyncio.Future[ServerAnswer]] | None = None
+        self._pending_answer: tuple[int, asyncio.Future[ServerAnswer]] | None = None
         self._unanswered: list[int] = []
-        self._turn = asyncio.Lock()
+        self._request_lock = asyncio.Lock()
 
     @classmethod
     async def connect(
-        cls, name: str, where: tuple[str, int], credentials: Credentials, tls: ssl.SSLContext | None
+        cls,
+        name: str,
+        host_and_port: tuple[str, int],
+        credentials: Credentials,
+        tls: ssl.SSLContext | None,
     ) -> RtspLink:
         """Return a connection to a host and port.
 
@@ -74,21 +78,21 @@ class RtspLink(asyncio.Protocol):
         loop = asyncio.get_running_loop()
         _, link = await loop.create_connection(
             lambda: cls(name, credentials),
-            *where,
+            *host_and_port,
             ssl=tls,
-            server_hostname=where[0] if tls else None,
+            server_hostname=host_and_port[0] if tls else None,
         )
         return link
 
     @property
     def peer(self) -> tuple[Any, ...]:
         """The server's address."""
-        return tuple(self._of_socket("peername"))
+        return tuple(self._socket_info("peername"))
 
     @property
     def address(self) -> tuple[Any, ...]:
         """The local address."""
-        return tuple(self._of_socket("sockname"))
+        return tuple(self._socket_info("sockname"))
 
     @property
     def family(self) -> socket.AddressFamily:
@@ -99,58 +103,61 @@ class RtspLink(asyncio.Protocol):
         """End the link with a reason for :attr:`on_end`."""
         self._end(why)
 
-    def _of_socket(self, name: str) -> Any:
+    def _socket_info(self, name: str) -> Any:
         value = None if self._transport is None else self._transport.get_extra_info(name)
         if not value:
-            raise self._error(self.ended or "the connection is lost")
+            raise self._error(self.end_reason or "the connection is lost")
         return value
 
     async def ask(
         self, method: str, url: str, headers: dict[str, str] | None = None, body: bytes = b""
     ) -> ServerAnswer:
-        """Send a request, and return its answer; answer challenges for a password.
+        """Send a request, and return its answer; send the password if the server asks for it.
 
         Raises:
             FrameSourceError: the connection ended, or the password is wrong or missing.
         """
-        async with self._turn:
+        async with self._request_lock:
             for refusals in range(1, MAX_REFUSALS + 1):
                 answer = await self._ask_once(method, url, headers or {}, body)
                 if answer.status != 401:
                     return answer
                 challenges = answer.headers.get("www-authenticate", ())
-                if refusals == MAX_REFUSALS or not self._credentials.challenged(challenges):
+                if refusals == MAX_REFUSALS or not self._credentials.store_challenge(challenges):
                     raise self._refused_error(method, answer)
             raise AssertionError("MAX_REFUSALS is at least 1")
 
     def _refused_error(self, method: str, answer: ServerAnswer) -> FrameSourceError:
         challenges = answer.headers.get("www-authenticate", ())
         shown = ", ".join(challenges)[:200] or "no challenge"
-        cure = f"expected Basic, or Digest with MD5 or SHA-256, got {shown!r}"
-        if not self._credentials.known:
-            cure = "put USER:PASSWORD@ before the host"
+        hint = f"expected Basic, or Digest with MD5 or SHA-256, got {shown!r}"
+        if not self._credentials.has_user:
+            hint = "put USER:PASSWORD@ before the host"
         elif challenge_of(challenges) is not None:
-            cure = "wrong user or password"
-        return self._error(f"{method}: 401 Unauthorized: {cure}")
+            hint = "wrong user or password"
+        return self._error(f"{method}: 401 Unauthorized: {hint}")
 
     async def _ask_once(
         self, method: str, url: str, headers: dict[str, str], body: bytes
     ) -> ServerAnswer:
         self._cseq += 1
         lines = [f"{method} {url} RTSP/1.0", f"CSeq: {self._cseq}", "User-Agent: smartcam"]
-        shown = self._credentials.header(method, url)
-        lines += [f"Authorization: {shown}"] if shown else []
+        authorization = self._credentials.header(method, url)
+        lines += [f"Authorization: {authorization}"] if authorization else []
         lines += (f"{name}: {value}" for name, value in headers.items())
-        answered: asyncio.Future[ServerAnswer] = asyncio.get_running_loop().create_future()
-        self._waiting = (self._cseq, answered)
+        future: asyncio.Future[ServerAnswer] = asyncio.get_running_loop().create_future()
+        self._pending_answer = (self._cseq, future)
         try:
             if not self.write("\r\n".join((*lines, "", "")).encode() + body):
-                raise self._error(self.ended or "the server accepts no more data")
-            return await answered
+                raise self._error(self.end_reason or "the server accepts no more data")
+            return await future
         finally:
-            if self._waiting is not None and not answered.done():
-                self._unanswered = [*self._unanswered[1 - MAX_UNANSWERED :], self._waiting[0]]
-            self._waiting = None
+            if self._pending_answer is not None and not future.done():
+                self._unanswered = [
+                    *self._unanswered[1 - MAX_UNANSWERED :],
+                    self._pending_answer[0],
+                ]
+            self._pending_answer = None
 
     def write(self, data: bytes) -> bool:
         """Send bytes; return False if too many wait, or the link has ended."""
@@ -164,7 +171,7 @@ class RtspLink(asyncio.Protocol):
 
     def close(self) -> None:
         """End the link after the written bytes are sent; stop passing on packets. Idempotent."""
-        self.on_packet, self.on_read, self.on_end = _ignore, _ignore, _ignore
+        self.on_packet, self.on_batch_read, self.on_end = _ignore, _ignore, _ignore
         self._end("it was closed")
 
     def abort(self) -> None:
@@ -182,15 +189,15 @@ class RtspLink(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse bytes, and process complete messages."""
-        if self.ended:
+        if self.end_reason:
             return
         self._parser.feed(data)
         try:
-            while not self.ended and (item := self._parser.next()) is not None:
-                self._take(item)
+            while not self.end_reason and (item := self._parser.next()) is not None:
+                self._on_message(item)
         except MessageError as error:
             self._end(str(error))
-        self.on_read()
+        self.on_batch_read()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Fail all calls that wait for an answer."""
@@ -199,38 +206,42 @@ class RtspLink(asyncio.Protocol):
 
     # received messages
 
-    def _take(self, item: ServerAnswer | ServerRequest | ChannelPacket) -> None:
+    def _on_message(self, item: ServerAnswer | ServerRequest | ChannelPacket) -> None:
         if isinstance(item, ChannelPacket):
             self.on_packet(item.channel, item.data)
         elif isinstance(item, ServerAnswer):
-            self._answered(item)
+            self._on_answer(item)
         else:
-            self._requested(item)
+            self._on_request(item)
 
-    def _answered(self, answer: ServerAnswer) -> None:
-        """Pass an answer on; some servers send a wrong CSeq, or none."""
+    def _on_answer(self, answer: ServerAnswer) -> None:
+        """Pass an answer to its caller, also if a server sends a wrong CSeq or none."""
         cseq = answer.cseq
         if cseq in self._unanswered:
             self._unanswered.remove(cseq)
-        elif self._waiting is not None and not self._waiting[1].done() and answer.status >= 200:
-            self._waiting[1].set_result(answer)
+        elif (
+            self._pending_answer is not None
+            and not self._pending_answer[1].done()
+            and answer.status >= 200
+        ):
+            self._pending_answer[1].set_result(answer)
 
-    def _requested(self, request: ServerRequest) -> None:
-        """Answer a server's request, such as a check of the client."""
-        known = request.method in (*_ALLOWED, *_ENDING)
+    def _on_request(self, request: ServerRequest) -> None:
+        """Answer a server's request, such as a check whether the client is alive."""
+        is_supported = request.method in (*_ANSWERED_METHODS, *_ENDING_METHODS)
         cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
-        status = "200 OK" if known else "501 Not Implemented"
+        status = "200 OK" if is_supported else "501 Not Implemented"
         self.write(f"RTSP/1.0 {status}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
-        if request.method in _ENDING:
+        if request.method in _ENDING_METHODS:
             self._end(f"the server ended the session ({request.method})")
 
     def _end(self, why: str) -> None:
-        if self.ended:
+        if self.end_reason:
             return
-        self.ended = why
-        if self._waiting is not None and not self._waiting[1].done():
-            self._waiting[1].set_exception(self._error(why))
-            self._waiting[1].exception()  # mark the error as retrieved
+        self.end_reason = why
+        if self._pending_answer is not None and not self._pending_answer[1].done():
+            self._pending_answer[1].set_exception(self._error(why))
+            self._pending_answer[1].exception()  # mark the error as retrieved
         on_end, self.on_end = self.on_end, _ignore
         on_end(why)
         if self._transport is not None:

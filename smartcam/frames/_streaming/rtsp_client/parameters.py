@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
     from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
 
-READ: Final = "GET_PARAMETER"
-SET: Final = "SET_PARAMETER"
+GET_METHOD: Final = "GET_PARAMETER"
+SET_METHOD: Final = "SET_PARAMETER"
 
 NOT_UNDERSTOOD: Final = 451
 READ_ONLY: Final = 458
-INVALID: Final = 457
+INVALID_VALUE: Final = 457
 
-WITHOUT_METHOD: Final = (405, 501, 551)
+UNSUPPORTED_METHOD: Final = (405, 501, 551)
 """Status codes of a camera that does not support parameters."""
 
 MAX_SHOWN_CHARACTERS: Final = 80
@@ -46,7 +46,9 @@ class RtspParameters(DeviceFeatures):
 
     async def names(self) -> list[str]:
         """Raise: RTSP has no list of parameters."""
-        self._cannot("list its parameters: read one by its name in the maker's documents")
+        self._raise_unsupported(
+            "list its parameters: read one by its name in the maker's documents"
+        )
 
     async def describe(self, name: str) -> Feature:
         """Return a parameter with its value as text, without a range."""
@@ -54,7 +56,7 @@ class RtspParameters(DeviceFeatures):
 
     async def get(self, name: str) -> FeatureValue:
         """Return the value of a parameter, as text."""
-        answer = await self._answered(READ, name, f"{name}\r\n")
+        answer = await self._request(GET_METHOD, name, f"{name}\r\n")
         body = answer.body.decode(errors="replace")
         for line in body.splitlines():
             key, colon, value = line.partition(":")
@@ -63,9 +65,9 @@ class RtspParameters(DeviceFeatures):
         actual = (
             f"got {body[:MAX_SHOWN_CHARACTERS]!r}"
             if body.strip()
-            else ("got none: the camera only takes the request for a sign of life")
+            else ("got none: the camera uses the request only to keep the session alive")
         )
-        raise self._feature_error(name, f"expected its value from {READ}, {actual}")
+        raise self._feature_error(name, f"expected its value from {GET_METHOD}, {actual}")
 
     async def set(self, name: str, value: FeatureValue) -> FeatureValue:
         """Set a parameter; return the camera's new value, or the given value if it reports none.
@@ -76,7 +78,7 @@ class RtspParameters(DeviceFeatures):
         if re.search(r"[\r\n\0]", text):
             shown = repr(text[:MAX_SHOWN_CHARACTERS])
             raise self._feature_error(name, f"expected a value of one line, got {shown}")
-        await self._answered(SET, name, f"{name}: {text}\r\n")
+        await self._request(SET_METHOD, name, f"{name}: {text}\r\n")
         try:
             return await self.get(name)
         except (FrameFeatureError, UnsupportedError):  # the parameter can be set, but not read
@@ -84,9 +86,9 @@ class RtspParameters(DeviceFeatures):
 
     async def execute(self, name: str) -> None:
         """Raise: RTSP has no commands."""
-        self._cannot(f"execute a command such as {name[:MAX_SHOWN_CHARACTERS]}")
+        self._raise_unsupported(f"execute a command such as {name[:MAX_SHOWN_CHARACTERS]}")
 
-    async def _answered(self, method: str, name: str, body: str) -> ServerAnswer:
+    async def _request(self, method: str, name: str, body: str) -> ServerAnswer:
         if not re.fullmatch(r"[!-9;-~]+", name):
             text = "expected a name of printable ASCII without blanks and colons"
             raise self._feature_error(name, text)
@@ -94,16 +96,16 @@ class RtspParameters(DeviceFeatures):
         if answer.status == 200:
             return answer
         status = f"{method}: {answer.status} {answer.reason}".rstrip()
-        if answer.status in WITHOUT_METHOD:
+        if answer.status in UNSUPPORTED_METHOD:
             raise UnsupportedError(f"{self._name}: it has no such request: {status}")
         why = {
             NOT_UNDERSTOOD: "there is no such parameter",
             READ_ONLY: "it can only be read",
-            INVALID: "the camera does not accept the value",
+            INVALID_VALUE: "the camera does not accept the value",
         }.get(answer.status, "it refuses that")
         raise self._feature_error(name, f"{why}: {status}")
 
-    def _cannot(self, action: str) -> NoReturn:
+    def _raise_unsupported(self, action: str) -> NoReturn:
         raise UnsupportedError(f"{self._name}: a camera of RTSP cannot {action}")
 
     def _feature_error(self, name: str, text: str) -> FrameFeatureError:
