@@ -54,7 +54,7 @@ from smartcam.calibration._hand_eye.validation import (
     poor_fit_error,
     seen_poses,
 )
-from smartcam.calibration._jackknife import jackknife, weighed_jackknife
+from smartcam.calibration._jackknife import jackknife, weighted_jackknife
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import CAMERA, TARGET, half_turn, half_turned, locate
@@ -643,7 +643,7 @@ def _covariance(chosen: Candidate) -> Array:
     left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
     spreads = np.array([inverse_scaled(information_left) for information_left in left])
     full = inverse_scaled(information)
-    scatter = weighed_jackknife(steps, spreads, full, WEIGHT_POWER)[:12, :12]
+    scatter = weighted_jackknife(steps, spreads, full, WEIGHT_POWER)[:12, :12]
     for rival in chosen.rivals:
         both = solution.camera.before(rival.camera), solution.target.before(rival.target)
         scatter += np.outer(step := np.concatenate(both), step)

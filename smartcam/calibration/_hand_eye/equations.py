@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias, get_args
 
 import numpy as np
 
-from smartcam.calibration._least_squares import Normal, minimize, solve_scaled
+from smartcam.calibration._least_squares import NormalEquations, minimize, solve_scaled
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._lens.projection import linearize, pose_changes
 from smartcam.geometry._inside import Rigid, check_choice, cross_matrix, right_jacobian
@@ -397,11 +397,11 @@ def _by_view(robot: RobotPoses, seen: Observations, at: Solution) -> tuple[float
     return cost + float((weights * at.corrections**2).sum()), matrix, right
 
 
-def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> Normal:
+def _normal(robot: RobotPoses, seen: Observations, at: Solution) -> NormalEquations:
     """Return the equations of a step; ``X``, ``Z`` and the other parameters are shared."""
     cost, matrix, right = _by_view(robot, seen, at)
     correction, shared = slice(0, 6 if at.noise else 0), slice(6, None)
-    return Normal(
+    return NormalEquations(
         cost,
         matrix[:, shared, shared].sum(axis=0),
         right[:, shared].sum(axis=0),
@@ -433,14 +433,14 @@ def adjust(
         Solution(start.camera, start.target, change, none, noise=noise),
         lambda at: _normal(robot, spread, at),
         _stepped,
-        gain=gain,
-        noise=ROUNDING_COST,
+        min_gain=gain,
+        rounding_cost=ROUNDING_COST,
         damping=FIRST_DAMPING,
     )
     if not math.isfinite(normal.cost):
         return at
     try:
-        information = normal.reduced()[0]
+        information = normal.eliminate_poses()[0]
     except np.linalg.LinAlgError:  # poses and views so wrong that a target is in the camera
         return dataclasses.replace(at, cost=math.inf)
     return dataclasses.replace(at, cost=normal.cost, information=information)
@@ -494,7 +494,7 @@ def pull(robot: RobotPoses, seen: Observations, at: Solution, numbers: tuple[int
     spread = freed if at.noise is None else freed.spread(at.noise.shared)
     corrections = at.corrections if at.corrections.size else none
     begin = dataclasses.replace(at, change=change, corrections=corrections)
-    matrix, fitted = _normal(robot, spread, begin).reduced()[0], 12 + seen.extra_count
+    matrix, fitted = _normal(robot, spread, begin).eliminate_poses()[0], 12 + seen.extra_count
     slopes: Array = -solve_scaled(matrix[:fitted, :fitted], matrix[:fitted, fitted:])[:12]
     return slopes
 
@@ -505,4 +505,4 @@ def information(robot: RobotPoses, seen: Observations, truth: Solution) -> Array
     ``robot`` and ``seen`` are without noise; ``truth`` has the noise of the robot.
     """
     none = np.zeros((robot.poses.size, 6))
-    return _normal(robot, seen, dataclasses.replace(truth, corrections=none)).reduced()[0]
+    return _normal(robot, seen, dataclasses.replace(truth, corrections=none)).eliminate_poses()[0]

@@ -182,7 +182,7 @@ class HandEyeCalibration(storage.SavedCalibration):
             worst=1 + self.worst,
             allowed=self.allowed,
             cures=VIEW_CURES,
-            more="take more views",
+            advice="take more views",
             where=f" without view{several} {', '.join(left_out)}" if left_out else "",
         )
         if judgement.verdict.level != "good":

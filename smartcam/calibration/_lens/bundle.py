@@ -15,8 +15,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._jackknife import weighed_jackknife
-from smartcam.calibration._least_squares import Normal, inverse_scaled, minimize, solve_scaled
+from smartcam.calibration._jackknife import weighted_jackknife
+from smartcam.calibration._least_squares import (
+    NormalEquations,
+    inverse_scaled,
+    minimize,
+    solve_scaled,
+)
 from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
 from smartcam.geometry._inside import IDENTITY, Rigid
 
@@ -174,7 +179,7 @@ class AdjustedBundle:
     residuals: list[Array]  # residuals of each sight (N, 2), seen minus projected, pixels
     weighted: float  # sum of the weighted squares; infinite if points lie behind a camera
     more: float  # variance that was added to that of each coordinate, pixels^2
-    normal: Normal  # normal equations at the solution
+    normal: NormalEquations  # normal equations at the solution
     freedom: int  # number of coordinates minus number of unknowns
 
     @property
@@ -187,8 +192,9 @@ class AdjustedBundle:
         count = self.bundle.of_cameras
         if not math.isfinite(self.weighted):
             return np.full((count, count), np.nan)
-        # the inverse's upper left block is that of Schur's complement: see Normal.covariance
-        matrix = self.normal.reduced()[0]
+        # the inverse's upper left block is that of Schur's complement: see
+        # NormalEquations.covariance
+        matrix = self.normal.eliminate_poses()[0]
         between, points = matrix[:count, count:], matrix[count:, count:]
         return inverse_scaled(matrix[:count, :count] - between @ np.linalg.solve(points, between.T))
 
@@ -232,7 +238,7 @@ def adjust(
     than the part ``gain``.
     """
     normal_at = BundleEquations(bundle, sights, more).normal
-    bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=gain)
+    bundle, normal = minimize(bundle, normal_at, Bundle.moved, min_gain=gain)
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
     return AdjustedBundle(
@@ -263,7 +269,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
     # without the pose. The rest is of second order in the pull of the pose on the others.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
-    matrix, right, _, _ = adjusted.normal.reduced()
+    matrix, right, _, _ = adjusted.normal.eliminate_poses()
     count, left_out = adjusted.bundle.of_cameras, []
     poses = sorted({sight.pose for sight in sights})
     for pose in poses:
@@ -271,12 +277,12 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
         bundle = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.subset([pose]))
         equations = BundleEquations(bundle, sights_of_pose, adjusted.more, prior=False)
         at = equations.normal(bundle)
-        part = at.reduced()
+        part = at.eliminate_poses()
         wanted = np.column_stack([right - part[1], np.eye(len(right), count)])
         step, by_noise = np.split(solve_scaled(matrix - part[0], wanted), [1], axis=1)
         shared = step[:, 0]
         without = bundle.moved(shared, part[3] - part[2] @ shared)
-        squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
+        squares = at.cost - float((at.pose_right * part[3]).sum()) - 2.0 * part[1] @ shared
         squares += float(shared @ part[0] @ shared)
         if (
             len(poses) <= MAX_FEW_POSES
@@ -307,7 +313,7 @@ def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> 
     """
     changes = [adjusted.bundle.camera_changes(left.bundle) for left in left_out]
     spreads = np.array([left.by_noise for left in left_out])
-    return weighed_jackknife(np.array(changes), spreads, adjusted.by_noise, WEIGHT_POWER)
+    return weighted_jackknife(np.array(changes), spreads, adjusted.by_noise, WEIGHT_POWER)
 
 
 def free_points(sights: Sequence[Sight]) -> int:
@@ -364,10 +370,12 @@ class BundleEquations:
         self._meant = sights[0].view.target.points
         self._prior = _prior(self._meant) if prior and bundle.free else None
 
-    def normal(self, bundle: Bundle) -> Normal:
+    def normal(self, bundle: Bundle) -> NormalEquations:
         """Return the normal equations."""
-        normal, cost = Normal.nothing(bundle.shared, bundle.poses.size, 6), 0.0
-        normal.own[self._unseen] = np.eye(6)  # poses without an observation stay as they are
+        normal, cost = NormalEquations.zeros(bundle.shared, bundle.poses.size, 6), 0.0
+        normal.pose_blocks[self._unseen] = np.eye(
+            6
+        )  # poses without an observation stay as they are
         matrix, right = normal.shared, normal.shared_right
         for group in self._groups:
             columns, jacobian, by_points = self._columns(bundle, group)
@@ -376,9 +384,9 @@ class BundleEquations:
                 flat = rows.reshape(-1, rows.shape[2])
                 # derivatives by the pose, by the shared unknowns, and the residuals
                 product = flat.T @ flat
-                normal.own[pose] += product[:6, :6]
-                normal.own_right[pose] += product[:6, -1]
-                normal.mixed[pose][:, columns] += product[:6, 6:-1]
+                normal.pose_blocks[pose] += product[:6, :6]
+                normal.pose_right[pose] += product[:6, -1]
+                normal.coupling[pose][:, columns] += product[:6, 6:-1]
                 matrix[np.ix_(columns, columns)] += product[6:-1, 6:-1]
                 right[columns] += product[6:-1, -1]
                 cost += float(product[-1, -1])
@@ -391,7 +399,7 @@ class BundleEquations:
                 matrix[np.ix_(places.ravel(), columns)] += between[:, 6:-1]
                 matrix[np.ix_(columns, places.ravel())] += between[:, 6:-1].T
                 right[places.ravel()] += between[:, -1]
-                normal.mixed[pose][:, places.ravel()] += between[:, :6].T
+                normal.coupling[pose][:, places.ravel()] += between[:, :6].T
         if bundle.points is not None and self._prior is not None:
             # minimise also |p - nominal|^2 / loose^2, and the same of the whole sheet: see _prior
             sheet, shift = slice(bundle.of_cameras, bundle.shared), bundle.points - self._meant

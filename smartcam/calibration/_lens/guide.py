@@ -175,7 +175,7 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     bundle = Bundle.single(calibration.camera, poses, basis, points)
     sights = [Sight(0, number, fit.view) for number, fit in enumerate(used)]
     equations = BundleEquations(bundle, sights, calibration.sigma**2)
-    information = equations.normal(bundle).reduced()[0]
+    information = equations.normal(bundle).eliminate_poses()[0]
     back = np.linalg.pinv(basis)
     scattered, count = back @ calibration.covariance @ back.T, len(information)
     times = float(np.trace(information @ scattered)) / max(count, 1)

@@ -32,7 +32,7 @@ from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._one_blas_thread import one_blas_thread
-from smartcam.calibration._views import TargetView, as_list, as_views, label
+from smartcam.calibration._views import TargetView, as_list, as_views, view_name
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Array, Code, Remark, Rigid, check_choice
 
@@ -162,7 +162,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(fit.view, number) for number, fit in enumerate(self.views) if not fit.used
+            view_name(fit.view, number) for number, fit in enumerate(self.views) if not fit.used
         )
 
     def uncertainty(
@@ -357,7 +357,7 @@ def _numbered_alike(
         numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
     lens = fit_lens([numbered[i] for i in used], model, held)
     better = _summary(numbered, used, lens, bad, sheet)
-    names = [label(view, i) for i, view in enumerate(views) if turned[i]]
+    names = [view_name(view, i) for i, view in enumerate(views) if turned[i]]
     return (calibration, []) if better.sheet is None else (better, names)
 
 
@@ -377,7 +377,7 @@ def check_views(
         if view.target != views[0].target:
             raise Code.DIFFERENT_TARGETS.refusal(
                 f"{called}: expected views of one target, {views[0].target}, got {view.target} in "
-                f"{label(view, number)}",
+                f"{view_name(view, number)}",
                 views[0].target,
                 view.target,
             )
@@ -533,12 +533,12 @@ def _remarks(
 ) -> Iterator[Remark]:
     for number, fit in enumerate(calibration.views):
         for code, text in fit.view.warnings:
-            yield Remark(code, f"{label(fit.view, number)}: {text}")
+            yield Remark(code, f"{view_name(fit.view, number)}: {text}")
     for number in bad:
         fit = calibration.views[number]
         done = "was not used" if not fit.used else "is used all the same"
         yield Code.BAD_VIEW.remark(
-            f"{label(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
+            f"{view_name(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
             f"{calibration.rms:.3g} in all: it {done}"
         )
     if calibration.rms > POOR_FIT_RMS_PX:

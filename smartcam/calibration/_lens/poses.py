@@ -13,7 +13,7 @@ from smartcam._extras import load
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
 from smartcam.calibration._lens.projection import excess
-from smartcam.calibration._views import TargetView, checked
+from smartcam.calibration._views import TargetView, check_type
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Code, Rigid, exp_rotation
 
@@ -98,7 +98,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
             picture was flipped; ``POOR_FIT``: the points have wrong numbers, or no pose puts them
             in front of the camera; ``SHAPE``: the arguments are no view and no camera.
     """
-    checked(camera, CameraModel, "pose of the target: camera")
+    check_type(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
     sights = [Sight(0, 0, view)]
     adjusted = [
@@ -147,7 +147,7 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
 
     Raises the errors of :func:`locate`.
     """
-    called = f"pose of the target{_of(checked(view, TargetView, 'pose of the target'))}"
+    called = f"pose of the target{_of(check_type(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
     if count < MIN_POINTS:
         raise Code.TOO_FEW.unexpected(

@@ -24,7 +24,7 @@ from smartcam.calibration._lens.misfit import (
     misfit_remarks,
 )
 from smartcam.calibration._lens.projection import excess
-from smartcam.calibration._views import label
+from smartcam.calibration._views import view_name
 from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ def without_strays(
         for view, pose in zip(views, poses, strict=True)
     ]
     outliers = strays(fitted, more, [True] * len(fitted), lens=False)
-    names = [label(view, number) for number, view in enumerate(views)]
+    names = [view_name(view, number) for number, view in enumerate(views)]
     left = without(views, outliers)
     cleaned = [fit._replace(view=view) for fit, view in zip(fitted, left, strict=True)]
     remarks = stray_remarks(outliers, names, "was not used"), view_remarks(views, names)
@@ -253,7 +253,7 @@ def examined(
         Fitted(fit.view, calibration.camera, fit.transform.rigid, points)
         for fit in calibration.views
     ]
-    names = [label(view, number) for number, view in enumerate(views)]
+    names = [view_name(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", calibration.rms, views)
     of_fit = [*view_remarks(views, names), *_remarks_on_middle(calibration)]
     free = np.zeros(COUNT, dtype=np.bool_)

@@ -38,7 +38,7 @@ from smartcam.calibration._stereo.start import (
     start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView, as_covariances, as_list, label
+from smartcam.calibration._views import TargetView, as_covariances, as_list, view_name
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Array, Code, Remark, as_points, check_choice
 
@@ -138,7 +138,7 @@ class StereoCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(view, number)
+            view_name(view, number)
             for number, pair in enumerate(self.pairs)
             for view, used in zip((pair.left, pair.right), pair.used, strict=True)
             if view is not None and not used
@@ -501,7 +501,7 @@ def _remarks(
                 f"is {distance} where the left view and the other pairs have it: the two are of "
                 "different moments, or swapped"
             )
-        name = f"{label(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
+        name = f"{view_name(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
         yield Code.BAD_VIEW.remark(f"{name}: {reason}; it {done}")
     if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(

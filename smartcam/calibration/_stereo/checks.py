@@ -27,7 +27,7 @@ from smartcam.calibration._lens.suspicions import (
     without,
 )
 from smartcam.calibration._stereo.start import SIDES
-from smartcam.calibration._views import checked, label
+from smartcam.calibration._views import check_type, view_name
 from smartcam.geometry import CameraModel
 from smartcam.geometry._inside import Code, Remark
 
@@ -69,7 +69,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     Raises ``COINCIDENT`` if an image is given for both sides, and ``SWAPPED_LENSES``.
     """
     for side, lens in zip(SIDES, known, strict=True):
-        checked(lens, (CameraModel, type(None)), f"stereo: {side}")
+        check_type(lens, (CameraModel, type(None)), f"stereo: {side}")
     pairs = [
         (number, left, right)
         for number, (left, right) in enumerate(moments)
@@ -79,7 +79,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
             raise Code.COINCIDENT.refusal(
                 "stereo: expected images of two cameras, got the same image on both sides in "
-                f"{label(left, number)}",
+                f"{view_name(left, number)}",
                 "two cameras",
                 number,
             )
@@ -144,7 +144,7 @@ def examined(
     sides = [[pair.left for pair in calibration.pairs], [pair.right for pair in calibration.pairs]]
     seen = list(_views_of(calibration))
     fitted, used = [sight.fitted for sight in seen], [sight.used for sight in seen]
-    names = [f"{label(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in seen]
+    names = [f"{view_name(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in seen]
     of_fit = list(view_remarks([fit.view for fit in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
@@ -166,7 +166,7 @@ def examined(
         ],
         calibration.sigma**2,
         free,
-        [label(left.fitted.view, left.pair) for left, _ in both],
+        [view_name(left.fitted.view, left.pair) for left, _ in both],
     )
     outliers = strays(fitted, calibration.sigma**2, used)
     if outliers and drop:
@@ -212,7 +212,9 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     most = most_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
-    named = ", ".join(f"{label(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad)
+    named = ", ".join(
+        f"{view_name(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad
+    )
     raise Code.POOR_FIT.refusal(
         "stereo: expected cameras that show the pairs as they are, got residuals of "
         f"{rms:.3g} pixels rms, {most:.3g} at most expected: were the views of each pair taken at "
