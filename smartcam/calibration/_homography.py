@@ -24,8 +24,8 @@ def fit_homography(flat: Array, pixels: Array) -> Array | None:
     """
     # Each pair gives two linear equations of the nine elements, u (h3 x) = h1 x and
     # v (h3 x) = h2 x. The singular vector of the least singular value, for normalised points, is
-    # the start of a refinement of the squares in pixels. Source: Hartley and Zisserman, Multiple
-    # View Geometry, 2nd edition, sections 4.1 and 4.4.4.
+    # the start of a refinement of the squares in pixels.
+    # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.4.4.
     cv2 = load("cv2")
     matrix = cv2.findHomography(flat, pixels)[0]
     return None if matrix is None else np.array(matrix, dtype=np.float64)

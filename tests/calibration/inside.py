@@ -65,7 +65,12 @@ from smartcam.calibration._lens.bundle import adjust as bundle_adjust
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.intrinsics import ViewFit
 from smartcam.calibration._lens.poses import half_turned
-from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._lens.projection import (
+    excess_variance,
+    linearize,
+    pose_changes,
+    whitening,
+)
 from smartcam.calibration._lens.sheet_shape import adjust_shape, choose_shape, moved_to_nominal
 from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration._plane.fitting import (

@@ -58,9 +58,9 @@ from smartcam.calibration._jackknife import jackknife, weighted_jackknife
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import CAMERA, TARGET, half_turn, half_turned, locate
-from smartcam.calibration._lens.projection import excess, whitening
-from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, Sheet
-from smartcam.calibration._lens.suspicions import without_strays
+from smartcam.calibration._lens.projection import excess_variance, whitening
+from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, SheetOption
+from smartcam.calibration._lens.suspicions import remove_strays
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.validation import check_positive
 from smartcam.calibration._statistics import common_move
@@ -208,7 +208,7 @@ def calibrate_hand_eye(
         # A sheet bent by a tenth of a millimetre, which views cannot show, makes cameras 1.7 mm off
         # where 0.7 mm are expected, if the views alone tell the lens (measured in simulation).
         few = len(ordered[0].target.points) <= MAX_FREE_POINTS
-        alone: Sheet = "free" if few else "exact"
+        alone: SheetOption = "free" if few else "exact"
         lens_calibration = calibrate_intrinsics(
             ordered, sheet="auto" if adjust == "auto" else alone
         )
@@ -221,7 +221,7 @@ def calibrate_hand_eye(
         ordered = _numbered_alike(ordered, robot, located)
         located = [locate(view, lens) for view in ordered]
         views = [ordered[i] for i in np.argsort(order)]
-    ordered, strays = without_strays(ordered, located, lens, given=camera is not None)
+    ordered, strays = remove_strays(ordered, located, lens, is_lens_given=camera is not None)
     located = [locate(view, lens) for view in ordered] if strays else located
     poses = Rigid.stacked(view.transform.rigid for view in located)
     seen = _observations(ordered, located, lens)
@@ -395,7 +395,7 @@ def _observations(
     """Return the views' points, with noise as large as the views themselves show."""
     residuals = np.concatenate([view.residuals for view in located])
     noise = np.concatenate([view.covariance for view in views])
-    more = excess(residuals, noise, residuals.size - 6 * len(views))
+    more = excess_variance(residuals, noise, residuals.size - 6 * len(views))
     given = _given_points(views)
     points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
     white = np.zeros((*given.shape, 2, 2))

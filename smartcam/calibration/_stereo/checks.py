@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._lens.misfit import (
-    COUNT,
     LENS,
     RIG,
     RIGHT_LENS,
-    Fitted,
+    UNKNOWN_COUNT,
+    FittedView,
     lens_remarks,
     misfit_remarks,
 )
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._lens.suspicions import (
-    most_rms,
+    find_strays,
+    max_plausible_rms,
+    remove_points,
     stray_remarks,
-    strays,
     view_remarks,
-    without,
 )
 from smartcam.calibration._stereo.start import SIDES
 from smartcam.calibration._views import check_type, view_name
@@ -128,7 +128,7 @@ def check_apart(transform: Transform, covariance: Array) -> None:
         )
 
 
-def examined(
+def examine_pairs(
     calibration: StereoCalibration,
     again: Callable[..., StereoCalibration],
     *,
@@ -156,7 +156,7 @@ def examined(
         for sights_of_pair in pairs
         if len(sights_of_pair) == 2 and all(sight.used for sight in sights_of_pair)
     ]
-    free = np.zeros(COUNT, dtype=np.bool_)
+    free = np.zeros(UNKNOWN_COUNT, dtype=np.bool_)
     free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
     free[RIG] = True
     of_fit += misfit_remarks(
@@ -168,9 +168,11 @@ def examined(
         free,
         [view_name(left.fitted.view, left.pair) for left, _ in both],
     )
-    outliers = strays(fitted, calibration.sigma**2, used)
+    outliers = find_strays(fitted, calibration.sigma**2, used)
     if outliers and drop:
-        for sight, view in zip(seen, without([fit.view for fit in fitted], outliers), strict=True):
+        for sight, view in zip(
+            seen, remove_points([fit.view for fit in fitted], outliers), strict=True
+        ):
             sides[sight.side][sight.pair] = view
         calibration, of_fit = again(*sides), []  # remarked on by check_fit
     done = "was not used" if drop else "is used all the same"
@@ -184,7 +186,7 @@ class _SeenFrom(NamedTuple):
     side: int
     pair: int
     used: bool
-    fitted: Fitted
+    fitted: FittedView
 
 
 def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
@@ -199,7 +201,10 @@ def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
                 )
                 camera = (calibration.left, calibration.right)[side]
                 yield _SeenFrom(
-                    side, number, pair.used[side], Fitted(view, camera, poses[side].rigid, points)
+                    side,
+                    number,
+                    pair.used[side],
+                    FittedView(view, camera, poses[side].rigid, points),
                 )
 
 
@@ -209,7 +214,7 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
     views that fit worst.
     """
-    most = most_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
+    most = max_plausible_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
     named = ", ".join(

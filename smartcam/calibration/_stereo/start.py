@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, known_lens
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, empty_basis
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
@@ -54,7 +54,7 @@ class Lenses(NamedTuple):
     def basis(self, side: int) -> Array:
         """Return the unknowns of a side's lens (4 + K, F)."""
         known = self.known[side]
-        return lens_basis(self.model, self.fixed) if known is None else known_lens(known)
+        return lens_basis(self.model, self.fixed) if known is None else empty_basis(known)
 
 
 Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]

@@ -418,7 +418,7 @@ def test_start_is_near_the_truth() -> None:
     assert [one[0] for one in moments] == left
     np.testing.assert_allclose(bundle.rig.rotation[0], RIG.rotation, atol=0.01)
     np.testing.assert_allclose(bundle.rig.translation[0], RIG.translation, atol=2e-3)
-    assert bundle.shared == 6
+    assert bundle.shared_count == 6
     assert apart == {}
 
 
