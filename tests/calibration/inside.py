@@ -94,7 +94,7 @@ from smartcam.calibration._printing.page import (
 from smartcam.calibration._printing.page_layout import BORDER_MM, RULER_MM
 from smartcam.calibration._printing.sheets import Rays, Sheet, page_size
 from smartcam.calibration._solvers import CameraPosition2D, Poses, RealWorldPosition, Solver
-from smartcam.calibration._stereo.checks import check_apart, check_fit, remark_sides
+from smartcam.calibration._stereo.checks import check_cameras_apart, check_fit, side_remarks
 from smartcam.calibration.formats._cameras import (
     FORMS,
     CameraForm,

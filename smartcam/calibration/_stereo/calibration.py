@@ -1,4 +1,4 @@
-"""Calibrate two cameras that look at the same place: the pose of one in the other's frame."""
+"""Calibrate two cameras that look at the same place, and the pose of one in the other's frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from smartcam.calibration._lens.poses import TARGET, check_view, half_turned
 from smartcam.calibration._lens.sheet_shape import SheetOption, choose_shape
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._stereo import triangulation
-from smartcam.calibration._stereo.checks import check_fit, check_pairs, examine_pairs, remark_sides
+from smartcam.calibration._stereo.checks import check_fit, check_pairs, examine_pairs, side_remarks
 from smartcam.calibration._stereo.errors import PairErrors, pair_errors
 from smartcam.calibration._stereo.rectification import Rectification, rectify
 from smartcam.calibration._stereo.start import (
@@ -35,7 +35,7 @@ from smartcam.calibration._stereo.start import (
     Lenses,
     Moment,
     as_moments,
-    start,
+    guess_start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
 from smartcam.calibration._views import TargetView, as_covariances, as_list, view_name
@@ -73,8 +73,8 @@ class PairFit(storage.Stored):
         held_out: RMS error of the distances between neighbouring points, as triangulated by cameras
             that were fitted without this pair, metres; NaN if a view is missing or bad, or if there
             are too few pairs.
-        epipolar: RMS distance from the epipolar lines of the same cameras, pixels; NaN as for
-            ``held_out``.
+        epipolar: RMS distance of the points from their epipolar lines, pixels, for the same cameras
+            as ``held_out``; NaN if ``held_out`` is.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -108,8 +108,8 @@ class StereoCalibration(storage.SavedCalibration):
         held_out: held-out error: RMS error, metres, of the distances between neighbouring points of
             the target, as triangulated by cameras that were fitted without the pair, over all
             pairs. NaN if there were too few pairs.
-        held_out_epipolar: RMS distance from the epipolar lines of cameras fitted without the pair,
-            pixels.
+        held_out_epipolar: RMS distance from the epipolar lines, pixels, of cameras that were
+            fitted without the pair.
         sheet: (T, 3), offsets of the target's points from their nominal places, metres; None
             if they are taken as exact.
         warnings: remarks to read before using the calibration.
@@ -169,9 +169,9 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        pixels = self._check_pixels(left_pixels, right_pixels)
+        pixels = self._as_pixels(left_pixels, right_pixels)
         covariance = tuple(
-            _check_covariances(given, len(pixels[0]), side)
+            _pixel_covariances(given, len(pixels[0]), side)
             for given, side in zip((left_covariance, right_covariance), SIDES, strict=True)
         )
         both = covariance[0], covariance[1]
@@ -219,7 +219,7 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        pixels = self._check_pixels(left_pixels, right_pixels)
+        pixels = self._as_pixels(left_pixels, right_pixels)
         return triangulation.epipolar_distances(self._cameras, pixels)
 
     def point_errors(
@@ -277,7 +277,7 @@ class StereoCalibration(storage.SavedCalibration):
     def _cameras(self) -> CameraPair:
         return CameraPair(self.left, self.right, self.transform)
 
-    def _check_pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
+    def _as_pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
         first, second = as_points(left, 2, "left pixels"), as_points(right, 2, "right pixels")
         if len(first) != len(second):
             raise Code.SHAPE.refusal(
@@ -361,7 +361,7 @@ def calibrate_stereo(
             len(complete),
         )
     lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
-    moments, bundle, mismatched = start(moments, lenses)
+    moments, bundle, mismatched = guess_start(moments, lenses)
     sights = [
         Sight(side, number, view)
         for number, moment in enumerate(moments)
@@ -404,7 +404,7 @@ def calibrate_stereo(
     calibration = _build_calibration(
         _Solution(moments, sights, bad, adjusted, min_pairs, mismatched), sheet
     )
-    return examine_pairs(calibration, recalibrate, known=(left, right), drop=drop_bad)
+    return examine_pairs(calibration, recalibrate, known=(left, right), drop_strays=drop_bad)
 
 
 def _complete_pairs(sights: Sequence[Sight]) -> list[int]:
@@ -414,14 +414,15 @@ def _complete_pairs(sights: Sequence[Sight]) -> list[int]:
 
 
 class _Solution(NamedTuple):
-    """Results that the summary is made from."""
+    """The fit from which a calibration is built."""
 
     moments: list[Moment]  # all views, the right ones numbered as the left ones
     sights: list[Sight]  # used views
     bad: list[Sight]  # views that fit badly, whether used or not
     adjusted: AdjustedBundle  # fitted cameras
     min_pairs: int  # number of pairs that are needed
-    mismatched: Mapping[int, float]  # as in :class:`~smartcam.calibration._stereo.start.FirstGuess`
+    # moments whose views do not belong together, as in :class:`FirstGuess`
+    mismatched: Mapping[int, float]
 
     def pair(self, number: int) -> tuple[TargetView, TargetView]:
         """Return the views of a moment that both cameras see."""
@@ -432,7 +433,7 @@ class _Solution(NamedTuple):
 
 
 def _held_out_errors(solution: _Solution, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
-    """Return the errors of each pair with cameras that were fitted without it."""
+    """Return the errors of each pair, with cameras that were fitted without this pair."""
     pairs = _complete_pairs(solution.sights)
     if len(pairs) <= solution.min_pairs:
         return {}
@@ -527,16 +528,16 @@ def _remarks(
             "a lens is not of its model, the sheet is not flat, or the pairs were not taken at the "
             "same moments"
         )
-    yield from remark_sides(calibration.transform)
+    yield from side_remarks(calibration.transform)
     yield from sheet_remarks
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(_complete_pairs(solution.sights))} pairs are no more than the cameras have need of: none "
-            "can be left out to see how good they are"
+            f"{len(_complete_pairs(solution.sights))} pairs are no more than the cameras have need "
+            "of: none can be left out to see how good they are"
         )
 
 
-def _check_covariances(covariance: ArrayLike | None, count: int, side: str) -> Array:
+def _pixel_covariances(covariance: ArrayLike | None, count: int, side: str) -> Array:
     if covariance is None:
         return np.tile(np.eye(2), (count, 1, 1))
     return as_covariances(covariance, count, f"{side} covariance")
