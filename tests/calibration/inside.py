@@ -33,8 +33,8 @@ from smartcam.calibration._files.store import (
 from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
     check_motion,
-    second_turn,
-    second_turns,
+    left_out_second_axis_turns,
+    second_axis_turn,
     solve_linear,
 )
 from smartcam.calibration._hand_eye.equations import (
@@ -46,10 +46,10 @@ from smartcam.calibration._hand_eye.equations import (
     Setup,
     Solution,
     adjust,
-    bends,
+    bend_heights,
+    leave_each_out,
     predicted_views,
-    sums,
-    without_each,
+    view_products,
 )
 from smartcam.calibration._homography import apply_homography, element_derivatives, fit_homography
 from smartcam.calibration._lens.bundle import (
