@@ -7,18 +7,18 @@ from smartcam.calibration._detection.charucos import charuco_board
 from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_corners
 from smartcam.calibration._detection.grid_growing import (
     MAX_SEEDS_TRIED,
-    _Grown,
-    alike_areas,
-    lattices,
+    _GridGrower,
+    area_test,
+    grow_grids,
 )
-from smartcam.calibration._detection.image import grey_image, scaled
+from smartcam.calibration._detection.image import grey_image, resize_image
 from smartcam.calibration._detection.markers import (
     MAX_OUTLINES,
     MAX_OUTLINES_OF_ALL_WINDOWS,
     WINDOWS_PX,
     Markers,
     _outlines,
-    agreeing,
+    compare_with_board,
     marker_finder,
 )
 from smartcam.calibration._files import store
