@@ -18,7 +18,7 @@ from smartcam.calibration._lens.comparison import LensComparison
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.calibration._views import label
+from smartcam.calibration._views import view_name
 from smartcam.geometry._inside import IDENTITY, Code
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def _lens_chart(calibration: IntrinsicCalibration) -> list[Chart]:
                     "held out", [fit.held_out for fit in calibration.views], calibration.held_out
                 ),
             ],
-            [label(fit.view, number) for number, fit in enumerate(calibration.views)],
+            [view_name(fit.view, number) for number, fit in enumerate(calibration.views)],
             [not fit.used for fit in calibration.views],
         )
     ]
@@ -187,12 +187,12 @@ def _robot_chart(calibration: HandEyeCalibration) -> list[Chart]:
 
 def _pair_names(calibration: StereoCalibration) -> list[str]:
     views = [fit.left or fit.right for fit in calibration.pairs]
-    return [label(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
+    return [view_name(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
 
 
 def _robot_names(calibration: HandEyeCalibration) -> list[str]:
     if calibration.views:
-        return [label(view, number) for number, view in enumerate(calibration.views)]
+        return [view_name(view, number) for number, view in enumerate(calibration.views)]
     return [f"pose {number}" for number in range(len(calibration.robot_poses))]
 
 
@@ -218,7 +218,9 @@ def _boards(
 
 
 def _lens_scene(calibration: IntrinsicCalibration) -> DrawnScene:
-    names = short_names([label(fit.view, number) for number, fit in enumerate(calibration.views)])
+    names = short_names(
+        [view_name(fit.view, number) for number, fit in enumerate(calibration.views)]
+    )
     poses, left_out = (
         [fit.transform for fit in calibration.views],
         [not fit.used for fit in calibration.views],

@@ -32,7 +32,7 @@ from smartcam.calibration._plane.fitting import (
     fit,
     scaled_axes,
 )
-from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, sum_of_squares, touch_noise
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
@@ -98,10 +98,10 @@ class _Agreement(NamedTuple):
     @property
     def least(self) -> int:
         """Fewest touches that must agree: more than half, and one more than the model needs."""
-        return max(len(self.mask) // 2, MODELS[self.fitted.model].least) + 1
+        return max(len(self.mask) // 2, MODELS[self.fitted.model].min_points) + 1
 
 
-def agreeing(
+def find_agreeing(
     camera: Array, robot: Array, weights: Array, touch_sigma: float | None
 ) -> NDArray[np.bool_]:
     """Return the mask (N,) of points that agree with one another, more than half of them.
@@ -155,7 +155,7 @@ def _best(pairs: Pairs, sigma: float | None) -> _Agreement | None:
     noise = min(_noise(agreement, pairs, sigma) for agreement in (simple, general))
     price = LEFT_OUT_COST_RATIO * noise.variance * _limit(len(pairs.camera), None)
     before, after = (
-        squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
+        sum_of_squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
         + price * float((~agreement.mask).sum())
         for agreement in (simple, general)
     )
@@ -172,7 +172,7 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
         return None
     squared = _squared(matrices, pairs)
     if sigma is None:
-        sigma_of_search = _scale(squared, MODELS[name].least)
+        sigma_of_search = _scale(squared, MODELS[name].min_points)
     else:
         sigma_of_search = max(sigma, ROUNDING_RATIO)
     threshold = sigma_of_search**2 * _limit(len(pairs.camera), None)
@@ -192,7 +192,7 @@ def _settle(
     """Fit and judge in turn, until exactly the fitted points agree."""
     fitted = None
     for _ in range(MAX_ROUNDS):
-        if int(mask.sum()) < MODELS[name].least:
+        if int(mask.sum()) < MODELS[name].min_points:
             return None
         try:
             fitted = fit(name, Pairs(pairs.camera[mask], pairs.robot[mask], pairs.weights[mask]))
@@ -204,7 +204,7 @@ def _settle(
         mask = judged
     else:
         return None
-    cost = squares(fitted.residuals, pairs.weights[mask]) + threshold * float((~mask).sum())
+    cost = sum_of_squares(fitted.residuals, pairs.weights[mask]) + threshold * float((~mask).sum())
     return _Agreement(fitted, mask, cost)
 
 
@@ -226,7 +226,7 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     # An outlier would enlarge the sum of squares, so the point's own share is subtracted: the sum
     # falls by r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    total, freedom = squares(fitted.residuals, pairs.weights[mask]), fitted.freedom
+    total, freedom = sum_of_squares(fitted.residuals, pairs.weights[mask]), fitted.freedom
     limits = np.full(len(mask), math.inf)
     for chosen, left in ((mask, freedom - 3), (~mask, freedom)):
         if left > 0:
@@ -237,7 +237,7 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
 
 def _noise(agreement: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
     """Return the touches' noise as given, or estimated from the points that agree."""
-    squared = squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
+    squared = sum_of_squares(agreement.fitted.residuals, pairs.weights[agreement.mask])
     return touch_noise(sigma, squared, agreement.fitted.freedom) or Noise(ROUNDING_RATIO**2)
 
 
@@ -279,7 +279,7 @@ def _subsets(count: int, least: int) -> NDArray[np.intp]:
 
 def _proposals(name: ModelName, pairs: Pairs) -> Array:
     """Return the maps (S, 4, 3) that subsets of the points determine."""
-    subsets = _subsets(len(pairs.camera), MODELS[name].least)
+    subsets = _subsets(len(pairs.camera), MODELS[name].min_points)
     subsets = subsets[_shapely(pairs.camera[subsets]) & _shapely(pairs.robot[subsets])]
     return PROPOSALS[name](pairs.camera[subsets], pairs.robot[subsets])
 

@@ -19,8 +19,8 @@ from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
 from smartcam.calibration._plane.diagnostics import (
     TYPICAL_SIGMA_M,
     check_side,
-    remark_side,
-    sigma_of,
+    estimate_sigma,
+    side_remarks,
 )
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
@@ -127,7 +127,7 @@ def fit_touches(
     axis = None if tool_z is None else mean_axis(tool_z, len(touched))
     side = None if axis is None else check_side(sheet.frame[:, 2], axis)
     freedom = 3 * len(groups[0]) + 2 * len(groups[1]) + 2 * len(groups[2]) - 6
-    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
+    sigma = estimate_sigma(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))
@@ -148,7 +148,7 @@ def fit_touches(
         camera_points=centre + rotate_ccw(places, theta),
         robot_points=touched,
         weights=np.ones(len(touched)),
-        matrix=place.outward(local),
+        matrix=place.to_original(local),
         place=place,
         unit_covariance=covariance,
         residuals=sheet.residuals,
@@ -242,4 +242,4 @@ def _remarks(
             "and the residuals do not tell"
         )
     )
-    return (*remarks, *remark_side(side))
+    return (*remarks, *side_remarks(side))

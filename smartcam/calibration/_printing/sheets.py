@@ -46,7 +46,7 @@ from smartcam.calibration._targets import (
     resized,
     target_from_data,
 )
-from smartcam.calibration._views import checked
+from smartcam.calibration._views import check_type
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -342,7 +342,7 @@ def _mm(metres: float) -> str:
 
 
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    checked(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
+    check_type(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
         return quartered(MM_PER_METRE * target.diameter / 2)
     return ink(target)

@@ -21,7 +21,7 @@ from smartcam.calibration._homography import (
 )
 from smartcam.calibration._least_squares import inverse_scaled, unit_diagonal
 from smartcam.calibration._lens.poses import check_view, locate
-from smartcam.calibration._lens.projection import excess, whitening
+from smartcam.calibration._lens.projection import excess_variance, whitening
 from smartcam.calibration._solvers import Poses
 from smartcam.geometry._inside import (
     Code,
@@ -222,7 +222,7 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     if camera is None:
         return _by_homography(view, start)
     pose = locate(view, camera)
-    more = excess(pose.residuals, view.covariance, 2 * len(flat) - 6)
+    more = excess_variance(pose.residuals, view.covariance, 2 * len(flat) - 6)
     rotation, shift = pose.transform.rotation, pose.transform.translation
     first, second = rotation[:, 0], rotation[:, 1]
     # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn w by
@@ -252,7 +252,7 @@ def _by_homography(view: TargetView, start: Array) -> PlaneView:
     first = start @ np.linalg.inv(to_flat)
     matrix, covariance = _fitted(first / first[2, 2], source, pixels, view.covariance)
     residuals = pixels - apply_homography(matrix, source)
-    more = excess(residuals, view.covariance, freedom)
+    more = excess_variance(residuals, view.covariance, freedom)
     if more:
         noise = view.covariance + more * np.eye(2)
         matrix, covariance = _fitted(matrix, source, pixels, noise)

@@ -13,9 +13,9 @@ import pytest
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection.ordering import (
     Arrangement,
+    choose_marked,
     choose_rightward,
     find_arrangements,
-    marked,
     places_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
@@ -373,9 +373,9 @@ def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int |
 
     if origin is None:
         with refused(Code.AMBIGUOUS_ORIGIN, "by 30 grey levels of 255, got 9"):
-            marked(ways, level, "board")
+            choose_marked(ways, level, "board")
     else:
-        way, margin = marked(ways, level, "board")
+        way, margin = choose_marked(ways, level, "board")
         assert (way.order[0, 0], margin) == (0, 140)
 
 
