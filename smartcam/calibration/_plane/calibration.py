@@ -446,19 +446,20 @@ class PlaneCalibration(storage.SavedCalibration):
         robot_array = as_points(np.atleast_2d(robot_points), 3, "robot points")
         if len(camera_array) != len(robot_array) or not len(camera_array):
             raise Code.SHAPE.unexpected(
-                f"expected as many robot points as camera points ({len(camera_array)}), one at least",
+                f"expected as many robot points as camera points ({len(camera_array)}), "
+                "one at least",
                 len(camera_array),
                 len(robot_array),
             )
         offsets = robot_array - self.transform(camera_array)
         derivatives = self._parameter_derivatives(camera_array).reshape(-1, 12)
         variance = self._touch_variance
-        unit_covariances = derivatives @ self.unit_covariance @ derivatives.T + np.eye(
+        offset_covariance = derivatives @ self.unit_covariance @ derivatives.T + np.eye(
             len(derivatives)
         )
-        all_squares = float(offsets.ravel() @ np.linalg.solve(unit_covariances, offsets.ravel()))
+        all_squares = float(offsets.ravel() @ np.linalg.solve(offset_covariance, offsets.ravel()))
         shift_basis = np.tile(np.eye(3), (len(camera_array), 1))
-        weighted = np.linalg.solve(unit_covariances, shift_basis)
+        weighted = np.linalg.solve(offset_covariance, shift_basis)
         weighted_sum = weighted.T @ offsets.ravel()
         shift_squares = float(
             weighted_sum @ np.linalg.solve(shift_basis.T @ weighted, weighted_sum)
@@ -470,7 +471,7 @@ class PlaneCalibration(storage.SavedCalibration):
         chance = noise.chance(all_squares, len(derivatives))
         if len(camera_array) > 1:
             chance = min(1.0, 2.0 * min(chance, noise.chance(shift_squares, 3)))
-        expected = math.sqrt(variance * float(np.trace(unit_covariances)) / len(camera_array))
+        expected = math.sqrt(variance * float(np.trace(offset_covariance)) / len(camera_array))
         return Drift(offsets, expected, chance, normal_deviations(chance), chance < level)
 
     def at_height(self, height: float, camera_position: ArrayLike) -> PlaneCalibration:
@@ -601,8 +602,7 @@ def fit_plane(
         inliers = np.flatnonzero(find_agreeing(marks, touches, merged.weights, touch_sigma))
     check_samples(marks[inliers], touches[inliers], min_points, touch_sigma)
     max_sigma = MAX_SIGMA.of(extent(touches[inliers])) if touch_sigma is None else touch_sigma
-    # of all points, not only the inliers: points in a wrong order may agree with one another as
-    # well
+    # all points are used, since points in a wrong order may also agree with one another
     reordered = better_order(marks, touches, max_sigma)
     if reordered is not None and set(reordered.moved).isdisjoint(inliers):
         reordered = None
@@ -711,7 +711,7 @@ def _move_remarks(offsets: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]
 
 
 def _left_out_remark(calibration: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Return the remark on a point that was left out: its distance, and that which noise explains."""
+    """Return the remark on a point that was left out, with the distance that noise explains."""
     distance = float(np.linalg.norm(calibration.residuals[index]))
     variance = 3.0 / weight * (calibration.touch_sigma or 0.0) ** 2
     variance += (

@@ -233,7 +233,7 @@ def _test_wrong_touches(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _residual_chance(evidence: Evidence, squared: float, total: float) -> float:
-    """Return the p-value of a residual's square; the other residuals, if enough, tell the noise."""
+    """Return a residual's p-value; the noise is estimated from the others if these suffice."""
     freedom = evidence.fitted.freedom - 3
     sigma = evidence.sigma if freedom < MIN_DEGREES_OF_FREEDOM else None
     noise = touch_noise(sigma, max(total - squared, 0.0), freedom)

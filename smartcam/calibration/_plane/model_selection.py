@@ -89,7 +89,7 @@ class Candidates:
         return self.get(name) or fit(name, self._pairs, self._scale)
 
     def simplest_model(self) -> ModelName:
-        """Return the simplest model that can be compared; ``rigid`` only if it has a held-out error."""
+        """Return the simplest model that has a held-out error, or else ``similarity``."""
         first = self.names[0]
         return "similarity" if math.isnan(self.error(first)) else first
 

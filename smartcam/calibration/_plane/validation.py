@@ -137,10 +137,10 @@ def check_samples(
 ) -> None:
     """Raise if points do not determine a plane and a map onto it.
 
-    ``camera`` (N, 2); ``robot`` (N, 3), metres; the model needs ``min_count`` points; ``touch_sigma``:
-    standard deviation of one coordinate, metres; None: not known. Raises TOO_FEW, UNIT_UNKNOWN,
-    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``allow_strays``: some touches may be far off,
-    so a large field does not mean other units.
+    ``camera`` (N, 2); ``robot`` (N, 3), metres. ``min_count``: number of points that the model
+    needs. ``touch_sigma``: standard deviation of one coordinate, metres; None: not known. Raises
+    TOO_FEW, UNIT_UNKNOWN, COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``allow_strays``: some
+    touches may be far off, so a large field does not mean other units.
     """
     if len(camera) < min_count:
         raise Code.TOO_FEW.unexpected(
