@@ -164,8 +164,8 @@ def _test_planarity(evidence: Evidence) -> Iterator[Remark]:
     if noise is not None and noise.chance(squares_of_heights, count) < SIGNIFICANCE_LEVEL:
         worst, mm = int(np.argmax(weights * heights**2)), 1e3 * evidence.place.robot_size
         yield Code.NOT_PLANAR.remark(
-            f"the touched points lie {mm * math.sqrt(squares_of_heights / count):.3g} mm rms out of "
-            f"a plane, where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
+            f"the touched points lie {mm * math.sqrt(squares_of_heights / count):.3g} mm rms "
+            f"out of a plane, where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
             f"point {evidence.point_numbers[worst]} is the furthest, "
             f"{mm * abs(float(heights[worst])):.3g} mm"
         )

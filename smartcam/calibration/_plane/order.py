@@ -76,7 +76,8 @@ class Reordered(NamedTuple):
         note = "" if self.sure else "; more than one order does as well: touch them again"
         return Code.WRONG_ORDER.remark(
             f"the touches of points {points_text} look {problem}: as given they speak of a touch "
-            f"with a sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{note}"
+            f"with a sigma of {1e3 * self.before:.3g} mm, put right of "
+            f"{1e3 * self.after:.3g} mm{note}"
         )
 
 

@@ -235,7 +235,8 @@ def _remarks(
         remarks.append(
             Code.POOR_FIT.remark(
                 f"the touches lie {1e3 * math.sqrt(squares / len(sheet.positions)):.3g} mm rms "
-                f"beside rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was given"
+                f"beside rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was "
+                "given"
             )
         )
     remarks.append(

@@ -15,9 +15,9 @@ from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
 from smartcam.calibration._plane.robust import (
+    MAP_SOLVERS,
     MAX_FITTED_PROPOSALS,
     MAX_SUBSETS_TRIED,
-    PROPOSALS,
     find_agreeing,
 )
 from smartcam.geometry._inside import Array, Code
@@ -293,14 +293,14 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
     touches = with_wrong(marks, [*range(0, 180, 2)])
     proposed: list[int] = []
     fitted: list[Fit] = []
-    for name, propose in PROPOSALS.items():
+    for name, propose in MAP_SOLVERS.items():
 
         def counted(camera: Array, touched: Array, propose: Any = propose) -> Array:
             proposed.append(len(camera))
             maps: Array = propose(camera, touched)
             return maps
 
-        monkeypatch.setitem(PROPOSALS, name, counted)
+        monkeypatch.setitem(MAP_SOLVERS, name, counted)
 
     def kept(*given: Any) -> Fit:
         fitted.append(fit(*given))
