@@ -161,14 +161,14 @@ def as_covariances(values: Any, count: int, label: str) -> Array:
     Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
     """
     try:
-        given = np.asarray(values, dtype=np.float64)
+        matrices = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.unexpected(f"{label}: expected numbers", (count, 2, 2), exc) from exc
-    if given.shape != (count, 2, 2):
+    if matrices.shape != (count, 2, 2):
         raise Code.SHAPE.unexpected(
-            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
+            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), matrices.shape
         )
-    covariances = as_points(given.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
+    covariances = as_points(matrices.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
     trace = np.trace(covariances, axis1=1, axis2=2)
     uneven = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(

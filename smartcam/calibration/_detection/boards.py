@@ -81,30 +81,32 @@ class Board(NamedTuple):
     """The found corners of a board, with their columns and rows."""
 
     points: Array  # (N, 2), pixels
-    places: NDArray[np.intp]  # (N, 2), column and row; their origin and directions are arbitrary
+    grid_positions: NDArray[np.intp]  # (N, 2), column and row; origin and directions are arbitrary
     # whether the image has another board with as many columns, rows and corners
     has_twin: bool = False
 
     @property
     def counts(self) -> tuple[int, int]:
         """Columns and rows."""
-        if not len(self.places):
+        if not len(self.grid_positions):
             return 0, 0
-        columns, rows = (np.ptp(self.places, axis=0) + 1).tolist()
+        columns, rows = (np.ptp(self.grid_positions, axis=0) + 1).tolist()
         return columns, rows
 
     @property
     def is_full(self) -> bool:
         """True if no corner is missing."""
         columns, rows = self.counts
-        return len(self.places) == columns * rows
+        return len(self.grid_positions) == columns * rows
 
     def points_by_rows(self, columns: int, rows: int) -> Array | None:
         """Return all points (columns * rows, 2) row by row; None if any is missing."""
         if not self.is_full or sorted(self.counts) != sorted((columns, rows)):
             return None
         row, column = (1, 0) if self.counts == (columns, rows) else (0, 1)
-        return self.points[np.lexsort((self.places[:, column], self.places[:, row]))]
+        return self.points[
+            np.lexsort((self.grid_positions[:, column], self.grid_positions[:, row]))
+        ]
 
     def shows_same_board(self, other: Board) -> bool:
         """Return whether this board has most of the corners of another one."""
@@ -113,28 +115,32 @@ class Board(NamedTuple):
 
     def fill_missing(self) -> Board:
         """Return the board with each missing corner at the place that the others predict."""
-        low, high = self.places.min(axis=0), self.places.max(axis=0)
-        missing = _missing_places(self, low, high)
-        points = GridMap(self.places.astype(np.float64), self.points)(missing.astype(np.float64))
-        return Board(np.concatenate([self.points, points]), np.concatenate([self.places, missing]))
+        low, high = self.grid_positions.min(axis=0), self.grid_positions.max(axis=0)
+        missing = _missing_positions(self, low, high)
+        points = GridMap(self.grid_positions.astype(np.float64), self.points)(
+            missing.astype(np.float64)
+        )
+        return Board(
+            np.concatenate([self.points, points]), np.concatenate([self.grid_positions, missing])
+        )
 
     def trim_rim(self) -> Board:
         """Return the board without outermost rows and columns that have few corners."""
-        places = self.places
+        grid_positions = self.grid_positions
         for axis, end in itertools.product((0, 1), (np.min, np.max)):
-            if not len(places):
+            if not len(grid_positions):
                 break
-            is_outermost = places[:, axis] == end(places[:, axis])
+            is_outermost = grid_positions[:, axis] == end(grid_positions[:, axis])
             if is_outermost.sum() < MIN_FILLED_SHARE * self.counts[1 - axis]:
                 return self._replace(
-                    points=self.points[~is_outermost], places=places[~is_outermost]
+                    points=self.points[~is_outermost], grid_positions=grid_positions[~is_outermost]
                 ).trim_rim()
         return self
 
 
-def colour_signs(places: NDArray[np.intp]) -> Array:
-    """Return 1 and -1, which alternate over places like the colours of a board."""
-    return np.where(places.sum(axis=1) % 2 == 0, 1.0, -1.0)
+def colour_signs(grid_positions: NDArray[np.intp]) -> Array:
+    """Return 1 and -1, which alternate over the grid like the colours of a board."""
+    return np.where(grid_positions.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
 def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Iterator[Board]:
@@ -170,50 +176,56 @@ def _grid_size(grid: Lattice) -> list[int]:
 
 def complete_board(image: GreyImage, board: Board) -> Board | None:
     """Return the board with missing corners added; None if the fits show that it is no board."""
-    sampled_places = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
-    _, signs = _fit_corners(image, board, sampled_places)
-    board_sign = float(colour_signs(sampled_places) @ signs)
-    if abs(board_sign) < MIN_FITTED_SHARE * len(sampled_places):
+    sampled_positions = board.grid_positions[
+        :: math.ceil(len(board.grid_positions) / MAX_CORNERS_JUDGED)
+    ]
+    _, signs = _fit_corners(image, board, sampled_positions)
+    board_sign = float(colour_signs(sampled_positions) @ signs)
+    if abs(board_sign) < MIN_FITTED_SHARE * len(sampled_positions):
         return None
-    new_places = board.places
+    new_positions = board.grid_positions
     for _ in range(MAX_ITERATIONS):
-        missing = _missing_places(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
-        # new corners may predict the empty places next to them better
+        missing = _missing_positions(
+            board, board.grid_positions.min(axis=0) - 1, board.grid_positions.max(axis=0) + 1
+        )
+        # new corners may predict the empty positions next to them better
         is_beside_new = (
-            np.abs(missing[:, None] - new_places).max(axis=2).min(axis=1, initial=2) <= 1
+            np.abs(missing[:, None] - new_positions).max(axis=2).min(axis=1, initial=2) <= 1
         )
         missing = missing[is_beside_new]
         points, signs = _fit_corners(image, board, missing)
         is_corner = colour_signs(missing) * signs * board_sign > 0
         if not is_corner.any():
             break
-        new_places = missing[is_corner]
+        new_positions = missing[is_corner]
         board = Board(
             np.concatenate([board.points, points[is_corner]]),
-            np.concatenate([board.places, new_places]),
+            np.concatenate([board.grid_positions, new_positions]),
         ).trim_rim()
     return board
 
 
-def _missing_places(
+def _missing_positions(
     board: Board, low: NDArray[np.intp], high: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """Return the places (N, 2) from ``low`` to ``high`` where no corner has been found yet."""
-    all_places = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
-    found_places = set(map(tuple, board.places.tolist()))
-    missing = [place for place in all_places if place not in found_places]
+    """Return the grid positions (N, 2) from ``low`` to ``high`` without a corner so far."""
+    all_positions = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
+    found_positions = set(map(tuple, board.grid_positions.tolist()))
+    missing = [position for position in all_positions if position not in found_positions]
     return np.array(missing, dtype=np.intp).reshape(-1, 2)
 
 
-def _fit_corners(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return corners (N, 2) at a board's places, and the signs of their gains.
+def _fit_corners(
+    image: GreyImage, board: Board, grid_positions: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """Return corners (N, 2) at a board's grid positions, and the signs of their gains.
 
-    The sign is 0 where the image shows no corner, and for places outside of the image.
+    The sign is 0 where the image shows no corner, and for positions outside of the image.
     """
-    grid_map = GridMap(board.places.astype(np.float64), board.points)
-    coordinates = places.astype(np.float64)
+    grid_map = GridMap(board.grid_positions.astype(np.float64), board.points)
+    coordinates = grid_positions.astype(np.float64)
     points, steps = grid_map(coordinates), local_steps(grid_map, coordinates, 1.0)
-    signs = np.zeros(len(places))
+    signs = np.zeros(len(grid_positions))
     is_candidate = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
     is_candidate &= np.abs(np.linalg.det(steps)) > MIN_SQUARE_PIXELS
     is_candidate[is_candidate] = looks_like_corners(
@@ -234,7 +246,7 @@ def _fit_corners(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tu
 def looks_like_corners(image: GreyImage, points: Array, steps: Array) -> NDArray[np.bool_]:
     """Return a mask of the points (N, 2) at which two opposite squares are darker than the others.
 
-    The test rejects most places that are no corners, and is much faster than a fit. ``steps``
+    The test rejects most positions that are no corners, and is much faster than a fit. ``steps``
     (N, 2, 2) lead to the next corners, pixels.
     """
     if not len(points):

@@ -23,7 +23,7 @@ from smartcam.calibration._detection.ordering import (
     choose_marked,
     choose_rightward,
     find_arrangements,
-    places_row_by_row,
+    positions_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import apply_homography, fit_homography
@@ -83,7 +83,7 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
             continue
         corners = _refit_strays(image, corners, candidate.is_seen, part)
         numberings = find_arrangements(
-            corners.points, places_row_by_row(part.columns, part.rows), part
+            corners.points, positions_row_by_row(part.columns, part.rows), part
         )
         if part == target:
             arrangement, margin = _number_board(image, target, corners, numberings)
@@ -147,7 +147,7 @@ def _find_candidates(
         grid = board.points_by_rows(target.columns, target.rows)
         if grid is not None:
             yield _BoardCorners(grid, np.ones(count, dtype=np.bool_), target, board.has_twin)
-        is_too_small = min(board.counts) < 3 or len(board.places) < min(
+        is_too_small = min(board.counts) < 3 or len(board.grid_positions) < min(
             MIN_CORNERS_CONNECTED, MIN_FITTED_SHARE * count
         )
         if is_too_small or any(
@@ -165,10 +165,15 @@ def _find_candidates(
         filled = completed_board.fill_missing()
         for part in _possible_parts(target, completed_board.counts):
             grid = filled.points_by_rows(part.columns, part.rows)
-            if grid is not None and len(completed_board.places) >= MIN_FITTED_SHARE * len(grid):
+            if grid is not None and len(completed_board.grid_positions) >= MIN_FITTED_SHARE * len(
+                grid
+            ):
                 is_seen = np.asarray(np.isin(grid, completed_board.points).all(axis=1))
                 yield _BoardCorners(grid, is_seen, part)
-        if completed_board.is_full and len(completed_board.places) >= MIN_FITTED_SHARE * count:
+        if (
+            completed_board.is_full
+            and len(completed_board.grid_positions) >= MIN_FITTED_SHARE * count
+        ):
             return
 
 
@@ -217,15 +222,15 @@ def _refit_strays(
     A stray is a corner that was not fitted, or is far from its predicted place. If it is a stray
     again, its distance from the predicted place is added to its covariance.
     """
-    places = places_row_by_row(target.columns, target.rows).astype(np.float64)
+    grid_positions = positions_row_by_row(target.columns, target.rows).astype(np.float64)
     is_good = corners.fitted
-    expected = GridMap(places[is_good], corners.points[is_good])(places)
+    expected = GridMap(grid_positions[is_good], corners.points[is_good])(grid_positions)
     distances = np.linalg.norm(corners.points - expected, axis=1)
     max_distance = MAX_STRAY_PX + 4 * float(np.median(distances[is_good]))
     is_stray = ~is_good | (distances > max_distance)
     if not is_stray.any():
         return corners
-    expected = GridMap(places[~is_stray], corners.points[~is_stray])(places)
+    expected = GridMap(grid_positions[~is_stray], corners.points[~is_stray])(grid_positions)
     refitted = _refine(
         image,
         _BoardCorners(expected[is_stray], is_seen[is_stray], target),
@@ -242,7 +247,7 @@ def _refit_strays(
 
 def _has_board_colours(corners: Corners, target: Checkerboard) -> bool:
     signs = (
-        colour_signs(places_row_by_row(target.columns, target.rows))
+        colour_signs(positions_row_by_row(target.columns, target.rows))
         * np.sign(corners.gains)
         * corners.fitted
     )
@@ -348,8 +353,8 @@ def _paper_levels(image: GreyImage, grid: Array) -> Iterator[float]:
         [(index + 0.5, low) for index in range(columns - 1)],
         [(low, index + 0.5) for index in range(rows - 1)],
     )
-    places = places_row_by_row(columns, rows).astype(np.float64)
-    pixels = GridMap(places, grid.reshape(-1, 2))(np.concatenate([dot_ring, *edge_places]))
+    grid_positions = positions_row_by_row(columns, rows).astype(np.float64)
+    pixels = GridMap(grid_positions, grid.reshape(-1, 2))(np.concatenate([dot_ring, *edge_places]))
     last_pixel = np.array(image.size) - 1
     for pixel in pixels:
         is_inside = bool(((pixel >= 0) & (pixel <= last_pixel)).all())
@@ -389,19 +394,21 @@ def _black_origin_score(target: Checkerboard, corners: Corners, arrangement: Arr
     # target's
     direction = float(np.sign(order[0, 1] - order[0, 0]) * np.sign(order[1, 0] - order[0, 0]))
     signs = np.sign(corners.gains[order.ravel()])
-    return direction * float(colour_signs(places_row_by_row(target.columns, target.rows)) @ signs)
+    return direction * float(
+        colour_signs(positions_row_by_row(target.columns, target.rows)) @ signs
+    )
 
 
-def _map_near_origin(grid: Array, places: Array) -> Array:
+def _map_near_origin(grid: Array, grid_positions: Array) -> Array:
     """Map places (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
 
     Places are relative to this corner, in sides of a square.
     """
-    first_places = places_row_by_row(3, 3).astype(np.float64)
+    first_places = positions_row_by_row(3, 3).astype(np.float64)
     first_corners = grid[:3, :3].reshape(-1, 2)
     matrix = fit_homography(first_places, first_corners)
     return (
-        np.full_like(places, first_corners[0])
+        np.full_like(grid_positions, first_corners[0])
         if matrix is None
-        else apply_homography(matrix, places)
+        else apply_homography(matrix, grid_positions)
     )

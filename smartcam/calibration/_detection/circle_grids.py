@@ -104,9 +104,9 @@ def _find_grids(
     The image is the one in which the dots are dark: the given one or its negative.
     """
     for is_negative, scale, spots in _search_image(image.bytes, target):
-        for points, places in _find_layouts(spots, target, counts):
+        for points, grid_positions in _find_layouts(spots, target, counts):
             centres = (points + 0.5) / scale - 0.5
-            numberings = find_arrangements(centres, places, target)
+            numberings = find_arrangements(centres, grid_positions, target)
             if numberings and _fits_flat_grid(target, centres[numberings[0].order.ravel()]):
                 dark_image = (
                     GreyImage(255 - image.levels, 255 - image.bytes) if is_negative else image
@@ -179,7 +179,7 @@ def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
 def _find_layouts(
     spots: Spots, target: CircleGrid, counts: _SearchCounts
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-    """Yield grids of the target's number of dots: the dots (N, 2), and their places (N, 2)."""
+    """Yield grids of the target's number of dots: dots (N, 2) and their grid positions (N, 2)."""
     count = target.columns * target.rows
     if counts.spot_count is None:
         counts.spot_count = len(spots.areas)
@@ -216,11 +216,11 @@ def _is_complete(image: GreyImage, target: CircleGrid, points: Array) -> bool:
     """
     flat_points = target.points[:, :2]
     grid_map = GridMap(flat_points, points)
-    places = _places_beyond(target)
+    positions = _positions_beyond(target)
     threshold = sum(_dot_and_gap_levels(image, target, grid_map)) / 2
-    inner_levels = _ring_levels(image, grid_map, places, target.diameter / 4)
+    inner_levels = _ring_levels(image, grid_map, positions, target.diameter / 4)
     outer_levels = _ring_levels(
-        image, grid_map, places, (_min_distance(target) + target.diameter) / 4
+        image, grid_map, positions, (_min_distance(target) + target.diameter) / 4
     )
     is_in_image = np.isfinite(inner_levels).any(axis=1)
     darkest = np.where(np.isfinite(inner_levels), inner_levels, -np.inf).max(axis=1)
@@ -247,8 +247,8 @@ def _dot_and_gap_levels(
     return inner_level, outer_level
 
 
-def _places_beyond(target: CircleGrid) -> Array:
-    """Return the places (N, 2) where the grid's rows and columns would continue, metres."""
+def _positions_beyond(target: CircleGrid) -> Array:
+    """Return the positions (N, 2) where the grid's rows and columns would continue, metres."""
     half_spacing = target.spacing / 2
     half_steps = np.rint(target.points[:, :2] / half_spacing).astype(np.intp)
     steps = [(1, 1), (1, -1)] if target.asymmetric else [(2, 0), (0, 2)]
@@ -257,16 +257,16 @@ def _places_beyond(target: CircleGrid) -> Array:
     return half_spacing * np.array(sorted(neighbours - {(x, y) for x, y in half_steps.tolist()}))
 
 
-def _ring_levels(image: GreyImage, grid_map: GridMap, places: Array, radius: float) -> Array:
-    """Return grey levels (N, 16) on circles around N places; NaN outside of the image."""
-    u, v = grid_map((places[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
+def _ring_levels(image: GreyImage, grid_map: GridMap, positions: Array, radius: float) -> Array:
+    """Return grey levels (N, 16) on circles around N positions; NaN outside of the image."""
+    u, v = grid_map((positions[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
     width, height = image.size
     is_inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     column, row = (
         np.rint(np.where(is_inside, coordinates, 0)).astype(np.intp) for coordinates in (u, v)
     )
     levels = np.where(is_inside, image.levels[row, column], np.nan)
-    return levels.reshape(len(places), len(RING_DIRECTIONS))
+    return levels.reshape(len(positions), len(RING_DIRECTIONS))
 
 
 def _make_view(

@@ -2,7 +2,7 @@ r"""Refine the corners of a checkerboard.
 
 Two edges cross at a corner. Behind a lens that blurs by a Gaussian of width ``s`` the grey levels
 around it are ``offset + gain * erf(d1 / s') * erf(d2 / s')``, where ``d`` is the distance from an
-edge and ``s' = sqrt(2) * s``. Seven values, the place and the angle of each edge, blur, gain and
+edge and ``s' = sqrt(2) * s``. Seven values, the distance and the angle of each edge, blur, gain and
 offset, are fitted to all pixels around a corner. The corner is where the edges cross.
 """
 
@@ -49,7 +49,7 @@ ROUNDED_RADIUS_PX = 2.0
 """Pixels within this radius of a single square's corner are not fitted: the blur rounds the corner,
 and unless its angle is a right angle, the levels there are no product of two edges."""
 
-PLACES, ANGLES = slice(0, 4, 2), slice(1, 4, 2)
+EDGE_DISTANCES, ANGLES = slice(0, 4, 2), slice(1, 4, 2)
 
 
 class Corners(NamedTuple):
@@ -94,7 +94,7 @@ def refine_corners(
     if is_single_square:
         windows = windows.without_discs(start, ROUNDED_RADIUS_PX)
     start_values = _start_values(start - windows.centre, edge_steps)
-    evaluate = partial(_evaluate, alone=1.0 if is_single_square else 0.0)
+    evaluate = partial(_evaluate, single_square=1.0 if is_single_square else 0.0)
     fits, is_good = fit_windows(
         evaluate, windows, start_values, pixel_values=(0, 2), max_residual_ratio=MAX_RESIDUAL_RATIO
     )
@@ -124,15 +124,15 @@ def _start_values(points: Array, edge_steps: Array) -> Array:
     """Return the start values (N, 7) of a fit: those of edges along the given steps."""
     values = np.zeros((len(points), 7))
     # an edge along (x, y) has the normal (-y, x), and its points fulfil cos(angle) u + sin(angle) v
-    # = place
+    # = distance
     angles = np.arctan2(edge_steps[:, :, 0], -edge_steps[:, :, 1])
     values[:, ANGLES] = angles
-    values[:, PLACES] = np.cos(angles) * points[:, :1] + np.sin(angles) * points[:, 1:]
+    values[:, EDGE_DISTANCES] = np.cos(angles) * points[:, :1] + np.sin(angles) * points[:, 1:]
     return values
 
 
-def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
-    """Return the fits of four squares, or with ``alone`` = 1 of a single one.
+def _evaluate(windows: Windows, values: Array, single_square: float = 0.0) -> Fits:
+    """Return the fits of four squares, or with ``single_square`` = 1 of a single one.
 
     The levels of a single square are ``offset + gain * ((1 + E1) * (1 + E2) / 2 - 1)``, those of
     four ``offset + gain * E1 * E2``.
@@ -141,25 +141,29 @@ def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
     values32 = values.astype(np.float32)
     blur, gain, offset = (values32[:, [column]] for column in (BLUR, GAIN, OFFSET))
     cosines, sines = np.cos(values32[:, ANGLES]), np.sin(values32[:, ANGLES])
-    places = values32[:, PLACES]
+    edge_distances = values32[:, EDGE_DISTANCES]
     scale = 1 / (np.sqrt(np.float32(2)) * blur)
     signed_distances, positions, shapes, slopes = [], [], [], []
-    # d = cos(a) x + sin(a) y - place moves with place by -1, and with a by cos(a) y - sin(a) x, the
-    # way along the edge. The level gain E(d1 / s) E(d2 / s) + offset, E = erf, moves with d1 by
-    # gain E'(d1 / s) E(d2 / s) / s, and with the blur, to which s is in proportion, by
-    # -gain (E'_1 d1 / s E_2 + E'_2 d2 / s E_1) / blur.
+    # d = cos(a) x + sin(a) y - distance changes by -1 with the edge's distance, and with a by
+    # cos(a) y - sin(a) x, the position along the edge. The level gain E(d1 / s) E(d2 / s) + offset,
+    # E = erf, moves with d1 by gain E'(d1 / s) E(d2 / s) / s, and with the blur, to which s is in
+    # proportion, by -gain (E'_1 d1 / s E_2 + E'_2 d2 / s E_1) / blur.
     for side in (0, 1):
-        cosine, sine, place = (part[:, [side]] for part in (cosines, sines, places))
-        signed_distances.append((cosine * x + sine * y - place) * scale)
+        cosine, sine, edge_distance = (part[:, [side]] for part in (cosines, sines, edge_distances))
+        signed_distances.append((cosine * x + sine * y - edge_distance) * scale)
         positions.append(cosine * y - sine * x)
         shape, slope = edge_profile(signed_distances[side])
         shapes.append(shape)
         slopes.append(slope)
-    half = np.float32(1 - alone / 2)
-    one_side, other_side = (half * (np.float32(alone) + shape) * weights for shape in shapes)
+    half = np.float32(1 - single_square / 2)
+    one_side, other_side = (
+        half * (np.float32(single_square) + shape) * weights for shape in shapes
+    )
     first_slope = slopes[0] * other_side
     second_slope = slopes[1] * one_side
-    product = (np.float32(alone) + shapes[0]) * other_side - np.float32(alone) * weights
+    product = (np.float32(single_square) + shapes[0]) * other_side - np.float32(
+        single_square
+    ) * weights
     columns = (
         first_slope,
         first_slope * positions[0],
@@ -178,15 +182,15 @@ def _crossings(fits: Fits, windows: Windows) -> tuple[Array, Array, NDArray[np.b
     """Return the crossings of the edges, their covariances, and a mask of those that cross."""
     # N p = q with the normals as rows of N: p = N^-1 q, and dp = N^-1 (dq - dN p); a normal turned
     # by da moves by da along its edge, so dN p is da times the way along it.
-    places, angles = fits.values[:, PLACES], fits.values[:, ANGLES]
+    edge_distances, angles = fits.values[:, EDGE_DISTANCES], fits.values[:, ANGLES]
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=2)
     is_crossing = np.abs(np.linalg.det(normals)) > MIN_SINE
     normals[~is_crossing] = np.eye(2)
     inverse = np.linalg.inv(normals)
-    corners: Array = (inverse @ places[:, :, None])[:, :, 0]
+    corners: Array = (inverse @ edge_distances[:, :, None])[:, :, 0]
     positions = normals[:, :, 0] * corners[:, 1:] - normals[:, :, 1] * corners[:, :1]
     derivatives = np.zeros((len(corners), 2, fits.values.shape[1]))
-    derivatives[:, :, PLACES] = inverse
+    derivatives[:, :, EDGE_DISTANCES] = inverse
     derivatives[:, :, ANGLES] = -inverse * positions[:, None]
     covariance: Array = (
         derivatives @ covariances(fits, windows.counts) @ derivatives.transpose(0, 2, 1)

@@ -162,32 +162,32 @@ class _GridGrower:
 
     def grow(self, start: int, steps: Array, max_count: int) -> Lattice:
         """Return the dots reached step by step from a dot; stop soon after ``max_count``."""
-        places: Lattice = {(0, 0): start}
+        grid: Lattice = {(0, 0): start}
         used = {start}
         # place, dot, steps to its neighbours, and the dot with which the neighbours' area is
         # compared
         front = [((0, 0), start, steps, start)]
         wave_count = 0
-        while front and len(places) <= max_count:
-            if wave_count == 2 and len(places) < MIN_DOTS_REACHED:
+        while front and len(grid) <= max_count:
+            if wave_count == 2 and len(grid) < MIN_DOTS_REACHED:
                 break
             wave_count += 1
             candidates = self._next_candidates(
                 front, MAX_FIRST_STEP_OFFSET if wave_count < 2 else MAX_STEP_OFFSET
             )
             last_front, front = front, []
-            for (place, dot, steps, size_reference), candidates_by_side in zip(
+            for (position, dot, steps, size_reference), candidates_by_side in zip(
                 last_front, candidates, strict=True
             ):
                 for side, side_candidates in enumerate(candidates_by_side):
                     column, row = _SIDES[side]
-                    neighbour = (place[0] + column, place[1] + row)
+                    neighbour = (position[0] + column, position[1] + row)
                     free_dot = next(
                         (candidate for candidate in side_candidates if candidate not in used), None
                     )
-                    if free_dot is None or neighbour in places:
+                    if free_dot is None or neighbour in grid:
                         continue
-                    places[neighbour] = free_dot
+                    grid[neighbour] = free_dot
                     used.add(free_dot)
                     step = steps.copy()
                     step[side % 2] = (column + row) * (self._points[free_dot] - self._points[dot])
@@ -197,23 +197,23 @@ class _GridGrower:
                     front.append(
                         (neighbour, free_dot, step, free_dot if is_alike else size_reference)
                     )
-        return places
+        return grid
 
-    def complete(self, places: Lattice, max_count: int) -> None:
+    def complete(self, grid: Lattice, max_count: int) -> None:
         """Add the dots next to a grid that lie where all of its dots together predict them.
 
         Far from the start and near the horizon, the last step alone predicts a dot less well.
         """
         has_added = True
-        while has_added and len(places) <= max_count:
+        while has_added and len(grid) <= max_count:
             has_added = False
-            grid_map = GridMap(np.array(list(places), float), self._points[list(places.values())])
-            used = set(places.values())
+            grid_map = GridMap(np.array(list(grid), float), self._points[list(grid.values())])
+            used = set(grid.values())
             neighbour_of_place = {
                 (x + column, y + row): dot
-                for (x, y), dot in places.items()
+                for (x, y), dot in grid.items()
                 for column, row in _SIDES
-                if (x + column, y + row) not in places
+                if (x + column, y + row) not in grid
             }
             empty_places = np.array(list(neighbour_of_place), dtype=np.float64)
             max_distances = MAX_STEP_OFFSET * np.linalg.norm(
@@ -223,11 +223,11 @@ class _GridGrower:
             fit_mask = (distances < max_distances) & self._may_follow(
                 nearest, np.array(list(neighbour_of_place.values()))
             )
-            for place, dot, is_fit in zip(
+            for position, dot, is_fit in zip(
                 neighbour_of_place, nearest.tolist(), fit_mask.tolist(), strict=True
             ):
                 if is_fit and dot not in used:
-                    places[place] = dot
+                    grid[position] = dot
                     used.add(dot)
                     has_added = True
 
@@ -277,9 +277,9 @@ def _second_deviation(vectors: Array, deviations: Array) -> Array:
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
     """Return whether the grid could be that of a flat sheet, and not a chance arrangement."""
-    places = np.array(list(grid), dtype=np.float64)
+    grid_positions = np.array(list(grid), dtype=np.float64)
     pixels = points[list(grid.values())]
-    grid_map = GridMap(places, pixels)
-    distances = np.linalg.norm(grid_map(places) - pixels, axis=1)
-    steps = np.linalg.norm(local_steps(grid_map, places, 1.0), axis=2).min(axis=1)
+    grid_map = GridMap(grid_positions, pixels)
+    distances = np.linalg.norm(grid_map(grid_positions) - pixels, axis=1)
+    steps = np.linalg.norm(local_steps(grid_map, grid_positions, 1.0), axis=2).min(axis=1)
     return bool(np.median(distances / steps) < MAX_MEDIAN_OFFSET)

@@ -45,33 +45,35 @@ class Arrangement(NamedTuple):
 
 
 def find_arrangements(
-    points: Array, places: NDArray[np.intp], target: Checkerboard | CircleGrid
+    points: Array, grid_positions: NDArray[np.intp], target: Checkerboard | CircleGrid
 ) -> list[Arrangement]:
     """Return all ways in which a grid can be numbered.
 
-    ``points`` (N, 2): all points of the target in any order, pixels. ``places`` (N, 2): the column
-    and the row of each point, with arbitrary origin and directions. In a grid with shifted rows,
-    places count the steps along the two diagonals, to the nearest points.
+    ``points`` (N, 2): all points of the target in any order, pixels. ``grid_positions`` (N, 2): the
+    column and the row of each point, with arbitrary origin and directions. In a grid with shifted
+    rows, positions count the steps along the two diagonals, to the nearest points.
     """
-    target_places = _target_places(target)
+    target_positions = _target_positions(target)
     numberings: list[Arrangement] = []
-    if len(points) != len(target_places):
+    if len(points) != len(target_positions):
         return numberings
     for step_change in _STEP_CHANGES:
-        turned_places = places @ step_change
-        index_at = {place: index for index, place in enumerate(_shift_to_zero(turned_places))}
-        order = [index_at.get(place) for place in target_places]
+        turned_positions = grid_positions @ step_change
+        index_at = {
+            position: index for index, position in enumerate(_shift_to_zero(turned_positions))
+        }
+        order = [index_at.get(position) for position in target_positions]
         if None not in order:
             order_by_rows = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
             numberings.append(_arrangement(points, order_by_rows))
     return numberings
 
 
-def _shift_to_zero(places: NDArray[np.intp]) -> list[tuple[int, int]]:
-    return [(x, y) for x, y in (places - places.min(axis=0)).tolist()]
+def _shift_to_zero(grid_positions: NDArray[np.intp]) -> list[tuple[int, int]]:
+    return [(x, y) for x, y in (grid_positions - grid_positions.min(axis=0)).tolist()]
 
 
-def _target_places(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
+def _target_positions(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
     """Return the columns and rows of a target's points, as :func:`find_arrangements` takes them."""
     row, column = np.divmod(np.arange(target.columns * target.rows), target.columns)
     if isinstance(target, CircleGrid) and target.asymmetric:
@@ -80,8 +82,8 @@ def _target_places(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
     return _shift_to_zero(np.stack([column, row], axis=1))
 
 
-def places_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
-    """Return the places (N, 2), column and row, of points in the order of rows."""
+def positions_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
+    """Return the grid positions (N, 2), column and row, of points in the order of rows."""
     row, column = np.divmod(np.arange(columns * rows), columns)
     return np.stack([column, row], axis=1)
 

@@ -738,10 +738,10 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
         )
 
 
-def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Remark]:
-    if adjusted is None or np.array_equal(given.matrix, adjusted.matrix):
+def _lens_remarks(given_camera: CameraModel, adjusted_camera: CameraModel | None) -> list[Remark]:
+    if adjusted_camera is None or np.array_equal(given_camera.matrix, adjusted_camera.matrix):
         return []
-    given_focal, adjusted_focal = given.matrix[0, 0], adjusted.matrix[0, 0]
+    given_focal, adjusted_focal = given_camera.matrix[0, 0], adjusted_camera.matrix[0, 0]
     return [
         Code.WRONG_LENS.remark(
             f"expected the lens as it was given, got one that fits far better: fx "

@@ -150,7 +150,7 @@ class SharedEquations(NamedTuple):
     squares: Array  # (V,), weighted squares before any change
 
     @classmethod
-    def of(cls, equations: Sequence[Equations]) -> SharedEquations:
+    def from_views(cls, equations: Sequence[Equations]) -> SharedEquations:
         """Return the equations of views after eliminating the pose of each."""
         products = []
         for equation in equations:
@@ -199,7 +199,7 @@ class _FlippedLens(NamedTuple):
     shift: Array  # (L,), in the unit of each value
 
     @classmethod
-    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
+    def from_camera(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
         """Return the lens that pictures flipped along some axes show."""
         values = np.zeros(UNKNOWN_COUNT)
         values[: 4 + len(camera.distortion)] = lens_values(camera)
@@ -244,7 +244,7 @@ class _Misfit:
 
     def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
         """``free`` (UNKNOWN_COUNT,): mask of the values that were fitted."""
-        self.reduced = SharedEquations.of(equations)
+        self.reduced = SharedEquations.from_views(equations)
         self._residual_count, view_count = (
             sum(equation.residuals.size for equation in equations),
             len(equations),
@@ -385,7 +385,10 @@ def misfit_remarks(
 
 def _flip_remarks(misfit: _Misfit, camera: CameraModel, names: Sequence[str]) -> Iterator[Remark]:
     fits = [
-        (*_FlippedLens.of(camera, axes).find_flips(misfit.reduced, misfit.free, guess), direction)
+        (
+            *_FlippedLens.from_camera(camera, axes).find_flips(misfit.reduced, misfit.free, guess),
+            direction,
+        )
         for direction, axes in FLIPS.items()
         for guess in _guess_flips(misfit.reduced, [2 + axis for axis in axes])
     ]
@@ -420,7 +423,7 @@ def lens_remarks(
     if len(fitted) < MIN_VIEWS_FOR_LENS:
         return
     equations = [view.equations(extra_variance) for view in fitted]
-    reduced = SharedEquations.of(equations)
+    reduced = SharedEquations.from_views(equations)
     before, after = float(reduced.squares.sum()), reduced.solve(LENS_MASK)[1]
     if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(

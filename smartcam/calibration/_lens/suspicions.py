@@ -111,15 +111,15 @@ def find_strays(
     return outliers
 
 
-def _refit_lens(equations: Sequence[Equations], kept: Sequence[Mask]) -> list[Equations]:
+def _refit_lens(equations: Sequence[Equations], kept_masks: Sequence[Mask]) -> list[Equations]:
     """Return the equations after fitting the lens to the kept points."""
     masked = [
         Equations(*(part[mask] for part in equation))
-        for equation, mask in zip(equations, kept, strict=True)
+        for equation, mask in zip(equations, kept_masks, strict=True)
     ]
-    change = SharedEquations.of(masked).solve(LENS_MASK)[0]
+    change = SharedEquations.from_views(masked).solve(LENS_MASK)[0]
     refitted = []
-    for equation, mask in zip(equations, kept, strict=True):
+    for equation, mask in zip(equations, kept_masks, strict=True):
         residuals = equation.residuals - equation.by_shared @ change
         by_pose, right = equation.by_pose[mask].reshape(-1, 6), residuals[mask].ravel()
         step = solve_scaled(by_pose.T @ by_pose, by_pose.T @ right)

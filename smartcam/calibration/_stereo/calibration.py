@@ -171,8 +171,8 @@ class StereoCalibration(storage.SavedCalibration):
         """
         pixels = self._as_pixels(left_pixels, right_pixels)
         covariance = tuple(
-            _pixel_covariances(given, len(pixels[0]), side)
-            for given, side in zip((left_covariance, right_covariance), SIDES, strict=True)
+            _pixel_covariances(covariance, len(pixels[0]), side)
+            for covariance, side in zip((left_covariance, right_covariance), SIDES, strict=True)
         )
         both = covariance[0], covariance[1]
         return triangulation.triangulate(self._cameras, pixels, both).points

@@ -190,7 +190,7 @@ def _parallel_cameras(
             *arguments, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output_size
         )
     first, second, first_projection, second_projection, depth = (
-        np.array(each, dtype=np.float64) for each in rectified[:5]
+        np.array(values, dtype=np.float64) for values in rectified[:5]
     )
     return (first, second), (first_projection, second_projection), depth
 

@@ -16,7 +16,7 @@ from smartcam.calibration._detection.ordering import (
     choose_marked,
     choose_rightward,
     find_arrangements,
-    places_row_by_row,
+    positions_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._inside import Target
@@ -339,14 +339,14 @@ def test_arrangements_of_other_counts_are_none() -> None:
 
 def test_arrangements_of_a_grid_with_a_point_too_many_are_none() -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
-    pixels, places = drawn(board).pixels, places_row_by_row(5, 4)
+    pixels, places = drawn(board).pixels, positions_row_by_row(5, 4)
     more = np.vstack([pixels, pixels[:1] - 30]), np.vstack([places, [[-1, 0]]])
     assert find_arrangements(pixels, places, board) != []
     assert find_arrangements(*more, board) == []
 
 
 def test_rows_of_counts_columns_first() -> None:
-    assert places_row_by_row(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
+    assert positions_row_by_row(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
 
 
 def test_leftmost_is_proper_and_points_right() -> None:
@@ -365,7 +365,7 @@ def test_leftmost_is_proper_and_points_right() -> None:
 def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int | None) -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
     pixels = drawn(board).pixels
-    ways = find_arrangements(pixels, places_row_by_row(5, 4), board)
+    ways = find_arrangements(pixels, positions_row_by_row(5, 4), board)
     corners = [0, 4, 19, 15]
 
     def level(order: np.ndarray) -> float:
