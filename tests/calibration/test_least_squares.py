@@ -186,7 +186,7 @@ def test_a_copy_in_a_fork_begins_anew() -> None:
         one.forked()
         with one:
             assert set(threads()) == {1}
-    assert not one._inside  # a thread that was inside before the fork has no effect in the child
+    assert not one._depths  # a thread that was inside before the fork has no effect in the child
 
 
 @pytest.mark.usefixtures("two_threads")

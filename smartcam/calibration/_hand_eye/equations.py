@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias, get_args
 import numpy as np
 
 from smartcam.calibration._least_squares import NormalEquations, minimize, solve_scaled
-from smartcam.calibration._lens_end.bundle import lens_values, with_lens
-from smartcam.calibration._lens_end.projection import linearize, pose_changes
+from smartcam.calibration._lens.bundle import lens_values, with_lens
+from smartcam.calibration._lens.projection import linearize, pose_changes
 from smartcam.geometry._inside import Rigid, check_choice, cross_matrix, right_jacobian
 
 if TYPE_CHECKING:

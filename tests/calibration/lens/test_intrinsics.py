@@ -431,7 +431,7 @@ def test_exact_sheet_stays_exact_even_before_a_lens_that_is_not_of_its_model(
         views = seen(LEFT, poses(8, seed=seed), seed=seed)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
         found = choose_shape(fit_lens(views, "plumb_bob", fixed), sights, "auto")
-        assert found.off is None
+        assert found.offsets is None
         assert found.remarks == []
 
 
