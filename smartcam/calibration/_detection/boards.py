@@ -109,7 +109,7 @@ class Board(NamedTuple):
         ]
 
     def shows_same_board(self, other: Board) -> bool:
-        """Return whether this board has most of the corners of another one."""
+        """Return True if this board has most of the corners of another one."""
         tree = load("scipy.spatial").cKDTree(self.points)
         return bool(np.median(tree.query(other.points)[0]) < MAX_SAME_BOARD_OFF_PX)
 

@@ -201,7 +201,7 @@ def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
 
 
 def _has_all_corners(sighting: _Sighting, target: Charuco, image: GreyImage) -> bool:
-    """Return whether all corners were found that should be in the image."""
+    """Return True if all corners were found that should be in the image."""
     if len(sighting.ids) < MIN_CORNERS:
         return False
     matrix = fit_homography(target.points[sighting.ids, :2], sighting.points)

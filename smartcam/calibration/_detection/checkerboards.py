@@ -388,7 +388,7 @@ def _origin_levels(
 
 
 def _black_origin_score(target: Checkerboard, corners: Corners, arrangement: Arrangement) -> float:
-    """Return how many more corners fit a black square at the origin than fit a white one."""
+    """Return the number of corners that fit a black square at the origin, minus the others."""
     order = arrangement.order
     # gains refer to the found grid's columns and rows, whose directions may differ from the
     # target's
@@ -400,9 +400,9 @@ def _black_origin_score(target: Checkerboard, corners: Corners, arrangement: Arr
 
 
 def _map_near_origin(grid: Array, grid_positions: Array) -> Array:
-    """Map places (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
+    """Map grid positions (N, 2) near the first corner of a grid (rows, columns, 2) to pixels.
 
-    Places are relative to this corner, in sides of a square.
+    Positions are relative to this corner, in sides of a square.
     """
     first_places = positions_row_by_row(3, 3).astype(np.float64)
     first_corners = grid[:3, :3].reshape(-1, 2)

@@ -162,7 +162,7 @@ def _find_pieces(
 
 
 def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
-    """Return whether a good part of the grid is among dots of a few pixels."""
+    """Return True if a good part of the grid is among dots of a few pixels."""
     min_count = max(4, round(MIN_DOT_SHARE * len(target.points)))
     may_be_neighbours = area_test(specks.areas)
     return any(
@@ -200,7 +200,7 @@ def _find_layouts(
 
 
 def _fits_flat_grid(target: CircleGrid, points: Array) -> bool:
-    """Return whether the dots lie where a flat grid would show them."""
+    """Return True if the dots lie where a flat grid would show them."""
     flat_points = target.points[:, :2]
     grid_map = GridMap(flat_points, points)
     steps = np.linalg.norm(local_steps(grid_map, flat_points, target.spacing), axis=2).min(axis=1)
@@ -209,7 +209,7 @@ def _fits_flat_grid(target: CircleGrid, points: Array) -> bool:
 
 
 def _is_complete(image: GreyImage, target: CircleGrid, points: Array) -> bool:
-    """Return whether there are no further dots where the grid's rows and columns would continue.
+    """Return True if there are no further dots where the grid's rows and columns would continue.
 
     A further dot would be dark with light paper all around. Places outside of the image are not
     counted.

@@ -276,7 +276,7 @@ def _second_deviation(vectors: Array, deviations: Array) -> Array:
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
-    """Return whether the grid could be that of a flat sheet, and not a chance arrangement."""
+    """Return True if the grid could be that of a flat sheet, and not a chance arrangement."""
     grid_positions = np.array(list(grid), dtype=np.float64)
     pixels = points[list(grid.values())]
     grid_map = GridMap(grid_positions, pixels)

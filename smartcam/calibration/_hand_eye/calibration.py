@@ -245,7 +245,9 @@ def calibrate_hand_eye(
         # The robot's motions determine a lens better than views of a bent sheet: if the sheet bends
         # anew by 0.5 mm, cameras are 0.9 mm off instead of 1.8 mm (simulated).
         del parameter_choices[NOTHING], parameter_choices["scale"]
-    options = _Options(_choices_of(parameter_choices, adjust), method, drop_bad, order, most_scale)
+    options = _HandEyeOptions(
+        _choices_of(parameter_choices, adjust), method, drop_bad, order, most_scale
+    )
     result = _calibrate_without_bad(problem, options, names, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
@@ -319,7 +321,7 @@ def calibrate_hand_eye_from_poses(
     )
     names = [f"pose {i}" for i in order]
     parameter_choices = _choices_of({NOTHING: (), "scale": (0,)}, adjust)
-    options = _Options(parameter_choices, method, drop_bad, order, most_scale)
+    options = _HandEyeOptions(parameter_choices, method, drop_bad, order, most_scale)
     return dataclasses.replace(
         _calibrate_without_bad(problem, options, names, transforms, ordered),
         target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
@@ -420,7 +422,7 @@ def _choices_of(
     return dict(parameter_choices) if adjust == "auto" else {adjust: parameter_choices[adjust]}
 
 
-class _Options(NamedTuple):
+class _HandEyeOptions(NamedTuple):
     """The options that the user gave."""
 
     # values that may be adjusted, such as ``scale``, with the numbers of their parameters
@@ -433,7 +435,7 @@ class _Options(NamedTuple):
 
 def _calibrate_without_bad(
     problem: Problem,
-    options: _Options,
+    options: _HandEyeOptions,
     names: Sequence[str],
     transforms: Sequence[Transform],
     views: Sequence[TargetView | Transform],
@@ -516,7 +518,7 @@ def _move_remarks(
 
 
 def _start_poses(
-    problem: Problem, options: _Options, names: Sequence[str]
+    problem: Problem, options: _HandEyeOptions, names: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
     """Return the indices of the poses to start with, and remarks on poses of other views.
 
@@ -566,7 +568,7 @@ def _bad_pose_remark(result: HandEyeCalibration, index: int, name: str, outcome:
     )
 
 
-def _solve(problem: Problem, options: _Options, pose: Transform) -> HandEyeCalibration:
+def _solve(problem: Problem, options: _HandEyeOptions, pose: Transform) -> HandEyeCalibration:
     check_choice(options.method, ["auto", *METHODS], "method")
     best, all_candidates = fit_candidates(problem, options.parameter_choices, options.method)
     if best is None:
@@ -684,7 +686,7 @@ def _covariance(candidate: Candidate) -> Array:
     return covariance
 
 
-def _size_remarks(problem: Problem, options: _Options) -> Iterator[Remark]:
+def _size_remarks(problem: Problem, options: _HandEyeOptions) -> Iterator[Remark]:
     """Yield a remark if the target has another size, but the size was not to be adjusted."""
     if options.method not in LINEAR and any(
         0 in numbers for numbers in options.parameter_choices.values()

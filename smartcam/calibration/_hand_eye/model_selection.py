@@ -503,8 +503,8 @@ def _closed_form_candidate(problem: Problem, name: str, solution: Solution) -> C
             for i, previous in enumerate(solutions)
         ]
     candidate.left_out_solutions = Solution(
-        Rigid.stacked(one.camera for one in solutions),
-        Rigid.stacked(one.target for one in solutions),
+        Rigid.stacked(solution.camera for solution in solutions),
+        Rigid.stacked(solution.target for solution in solutions),
     )
     candidate.held_out_vectors = problem.error_vectors(candidate.left_out_solutions)
     return candidate

@@ -120,7 +120,7 @@ class Candidates:
 
 
 def fits_better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bool:
-    """Return whether noise alone would hardly make ``general`` fit that much better."""
+    """Return True if noise alone would hardly make ``general`` fit that much better."""
     simple_squares, general_squares = (
         sum_of_squares(simple.residuals, weights),
         sum_of_squares(general.residuals, weights),

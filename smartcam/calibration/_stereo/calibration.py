@@ -402,7 +402,7 @@ def calibrate_stereo(
         drop_bad=drop_bad,
     )
     calibration = _build_calibration(
-        _Solution(moments, sights, bad, adjusted, min_pairs, mismatched), sheet
+        _StereoSolution(moments, sights, bad, adjusted, min_pairs, mismatched), sheet
     )
     return examine_pairs(calibration, recalibrate, known=(left, right), drop_strays=drop_bad)
 
@@ -413,7 +413,7 @@ def _complete_pairs(sights: Sequence[Sight]) -> list[int]:
     return sorted(sides[0] & sides[1])
 
 
-class _Solution(NamedTuple):
+class _StereoSolution(NamedTuple):
     """The fit from which a calibration is built."""
 
     moments: list[Moment]  # all views, the right ones numbered as the left ones
@@ -432,7 +432,9 @@ class _Solution(NamedTuple):
         return left, right
 
 
-def _held_out_errors(solution: _Solution, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
+def _held_out_errors(
+    solution: _StereoSolution, left_out: Sequence[LeftOut]
+) -> dict[int, PairErrors]:
     """Return the errors of each pair, with cameras that were fitted without this pair."""
     pairs = _complete_pairs(solution.sights)
     if len(pairs) <= solution.min_pairs:
@@ -449,7 +451,7 @@ def _camera_pair(bundle: Bundle) -> CameraPair:
     return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.subset(0)))
 
 
-def _build_calibration(solution: _Solution, sheet: SheetOption) -> StereoCalibration:
+def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoCalibration:
     check_fit(solution.adjusted.rms, solution.sights, solution.bad)
     sheet_fit = choose_shape(solution.adjusted, solution.sights, sheet)
     adjusted = sheet_fit.adjusted
@@ -485,7 +487,7 @@ def _rms(arrays: Sequence[Array]) -> float:
 
 
 def _pair_fit(
-    solution: _Solution, number: int, held_out_errors: Mapping[int, PairErrors]
+    solution: _StereoSolution, number: int, held_out_errors: Mapping[int, PairErrors]
 ) -> PairFit:
     rms = {
         sight.camera: _rms([residuals])
@@ -507,7 +509,7 @@ def _pair_fit(
 
 
 def _remarks(
-    calibration: StereoCalibration, solution: _Solution, sheet_remarks: list[Remark]
+    calibration: StereoCalibration, solution: _StereoSolution, sheet_remarks: list[Remark]
 ) -> Iterator[Remark]:
     for bad_sight in solution.bad:
         is_used = any(bad_sight is sight for sight in solution.sights)

@@ -51,10 +51,10 @@ MAX_INPUT_BYTES = 256
 """Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
-"""This library's codes for answers of a single character."""
+"""Codes, of this library alone, for answers of a single character."""
 
 TRIGGER_REFUSED = 4
-"""This library's code for a trigger that was answered with ``!``."""
+"""Code, of this library alone, for a trigger that was answered with ``!``."""
 
 _CODE_MEANINGS: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
