@@ -250,7 +250,7 @@ def _closed_forms(
     seen = Rigid.stacked(locate(view, CAMERA).transform.rigid for view in views)
     result = {}
     for name in LINEAR:
-        found = solve_linear(name, robot, seen, exactly=True)
+        found = solve_linear(name, robot, seen, use_all_views=True)
         result[name] = (math.inf, math.inf)
         if found is not None:
             pose = Transform(scene.camera_pose.target, "camera", *found[0])

@@ -76,7 +76,7 @@ def judged(
     robot = RobotPoses(Rigid.stacked(one.rigid for one in some), setup == "eye-in-hand")
     placed = Rigid.stacked(one.rigid for one in ours.target_poses)
     for name in LINEAR:
-        pair = solve_linear(name, robot, placed, exactly=True)
+        pair = solve_linear(name, robot, placed, use_all_views=True)
         found[name] = np.full(1, math.inf)
         if pair is not None:
             found[name] = _squares(_replaced(ours, Solution(*pair)), other, shown)

@@ -119,20 +119,29 @@ class Rig:
         views = self.seen(points, poses, None)
         motions = Rigid.stacked(one.rigid for one in poses)
         columns = np.eye(4 + len(self.left.distortion))
-        one = Bundle((self.left,), Rigid.stacked([]), motions, (columns,), points=points, free=True)
+        one = Bundle(
+            (self.left,),
+            Rigid.stacked([]),
+            motions,
+            (columns,),
+            points=points,
+            has_free_points=True,
+        )
         sights = [Sight(0, number, view) for number, view in enumerate(views[0])]
         by_lens = linearize(self.rays, self.left).by_lens
-        lens = np.einsum("nij,jk,nik->n", by_lens, adjust(one, sights, 0.0).by_noise, by_lens)
+        lens = np.einsum(
+            "nij,jk,nik->n", by_lens, adjust(one, sights, 0.0).noise_covariance, by_lens
+        )
         both = Bundle(
             (self.left, self.right),
             Rigid.stacked([self.rig.rigid]),
             motions,
             (columns, columns),
             points=points,
-            free=True,
+            has_free_points=True,
         )
         sights += [Sight(1, number, view) for number, view in enumerate(views[1])]
-        covariance = adjust(both, sights, 0.0).by_noise
+        covariance = adjust(both, sights, 0.0).noise_covariance
         by_unknown = self._derivatives(both, np.sqrt(np.diag(covariance)))
         space = np.einsum("nij,jk,nik->n", by_unknown, covariance, by_unknown)
         return math.sqrt(float(lens.mean())), 1e3 * math.sqrt(float(space.mean()))
@@ -141,8 +150,8 @@ class Rig:
         """Return by how much the points in space move with the cameras' unknowns (N, 3, S)."""
 
         def found(change: Array) -> Array:
-            unknowns = np.concatenate([change, np.zeros(bundle.shared - len(change))])
-            moved = bundle.moved(unknowns, np.zeros((bundle.poses.size, 6)))
+            unknowns = np.concatenate([change, np.zeros(bundle.shared_count - len(change))])
+            moved = bundle.with_steps(unknowns, np.zeros((bundle.poses.size, 6)))
             transform = Transform("right", "left", *moved.rig.subset(0))
             each = np.tile(np.eye(2), (len(self.space), 1, 1))
             left, right = moved.cameras

@@ -270,7 +270,7 @@ LIMITS = (
     "calibration.wizards._verification.MAX_TOUCHES",
     "calibration.wizards._marks.MAX_MARKS",
     "calibration.wizards._touch_previews.HEAT_MAP_CELLS",
-    "calibration._plane.robust.MAX_ROUNDS",
+    "calibration._plane.robust.MAX_ITERATIONS",
     "calibration._plane.robust.MAX_SUBSETS_TRIED",
     "calibration.wizards._points.MAX_POINTS",
     "recording._recorder.INTERVAL",

@@ -23,8 +23,8 @@ def fit_homography(flat: Array, pixels: Array) -> Array | None:
     Four points or more are needed: ``flat`` (N, 2), metres, and ``pixels`` (N, 2).
     """
     # Each pair gives two linear equations of the nine elements, u (h3 x) = h1 x and
-    # v (h3 x) = h2 x; their least singular vector, of normalised points, begins a refinement of
-    # the pixels' squares.
+    # v (h3 x) = h2 x. The singular vector of the least singular value, for normalised points, is
+    # the start of a refinement of the squares in pixels.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 4.1 and 4.4.4.
     cv2 = load("cv2")
     matrix = cv2.findHomography(flat, pixels)[0]
@@ -35,8 +35,8 @@ def apply_homography(matrix: Array, points: Array) -> Array:
     """Map points (N, 2) to (N, 2) or (N, 3); infinite or NaN for one on the horizon."""
     mapped = points @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places: Array = mapped[:, :-1] / mapped[:, -1:]
-    return places
+        projected: Array = mapped[:, :-1] / mapped[:, -1:]
+    return projected
 
 
 def derivatives(matrix: Array, points: Array) -> Array:
@@ -44,9 +44,11 @@ def derivatives(matrix: Array, points: Array) -> Array:
 
     With ``p = q / w`` it is ``dp = (dq - p dw) / w``.
     """
-    places = apply_homography(matrix, points)
+    projected = apply_homography(matrix, points)
     depth = points @ matrix[-1, :2] + matrix[-1, 2]
-    slopes: Array = (matrix[:-1, :2] - places[:, :, None] * matrix[-1, :2]) / depth[:, None, None]
+    slopes: Array = (matrix[:-1, :2] - projected[:, :, None] * matrix[-1, :2]) / depth[
+        :, None, None
+    ]
     return slopes
 
 
@@ -66,23 +68,23 @@ def element_derivatives(matrix: Array, points: Array) -> Array:
     return result.reshape(len(points), size, 3 * (size + 1))
 
 
-def tangent_frames(slopes: Array, ahead: Array) -> Array:
+def tangent_frames(slopes: Array, directions: Array) -> Array:
     """Return rotations (N, 3, 3) with a plane's normal as z and a direction of the camera as x.
 
-    ``slopes`` (N, 3, 2): the derivatives at each place, or multiples of them. ``ahead`` (N, 2): the
-    directions in the camera's coordinates.
+    ``slopes`` (N, 3, 2): the derivatives at each place, or multiples of them. ``directions`` (N,
+    2): in the camera's coordinates.
     """
-    first = np.einsum("nij,nj->ni", slopes, ahead)
+    first = np.einsum("nij,nj->ni", slopes, directions)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     normals = np.cross(slopes[:, :, 0], slopes[:, :, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first), normals], axis=-1)
 
 
-def local_steps(seen: Callable[[Array], Array], points: Array, step: float) -> Array:
+def local_steps(project: Callable[[Array], Array], points: Array, step: float) -> Array:
     """Return the image vectors of ``step`` along x and along y, (N, 2, 2), pixels.
 
-    ``seen`` maps points (N, 2) of the plane to pixels; ``step`` is in the plane's unit.
+    ``project`` maps points (N, 2) of the plane to pixels; ``step`` is in the plane's unit.
     """
-    ways = [(seen(points + shift) - seen(points - shift)) / 2 for shift in step * np.eye(2)]
-    return np.stack(ways, axis=1)
+    steps = [(project(points + shift) - project(points - shift)) / 2 for shift in step * np.eye(2)]
+    return np.stack(steps, axis=1)

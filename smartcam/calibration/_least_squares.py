@@ -31,49 +31,51 @@ MAX_STEPS = 100
 """A fit takes at most this many steps; from a linear solution it takes about ten."""
 
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
-"""Least and largest part of the diagonal that is added to it; with the largest no step is long
-enough to gain anything."""
+"""Least and largest part of the diagonal that is added to the diagonal; with the largest, no step
+is long enough to gain anything."""
 
-RANK = 1e-14
+RANK_TOLERANCE = 1e-14
 """In a matrix with a unit diagonal, singular values below this part of the largest are rounding
 errors."""
 
-RANK_OF_COVARIANCE = 1e-12
+COVARIANCE_RANK_TOLERANCE = 1e-12
 """In a covariance with a unit diagonal, eigenvalues below this part of the largest are rounding
 errors."""
 
 MAX_UNKNOWNS_BY_SVD = 60
-"""With more unknowns than this, computing singular values first would take too much time."""
+"""Equations of more unknowns than this are solved without singular values, which would take too
+much time."""
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations ``J^T J x = J^T r`` of residuals r = measured - modelled."""
 
     cost: float  # sum of the squared residuals; infinite where there is no model
     shared: Array  # (S, S), J^T J of the shared unknowns
     shared_right: Array  # (S,), J^T r of the shared unknowns
-    own: Array  # (P, K, K), J^T J of each pose's K unknowns; 0 for a pose that has no observation
-    own_right: Array  # (P, K), J^T r of each pose's unknowns
-    mixed: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
+    # (P, K, K), J^T J of each pose's K unknowns; 0 for a pose that has no observation
+    pose_blocks: Array
+    pose_right: Array  # (P, K), J^T r of each pose's unknowns
+    coupling: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
-    def nothing(cls, shared: int, poses: int, per_pose: int) -> Normal:
+    def zeros(cls, shared_count: int, pose_count: int, unknowns_per_pose: int) -> NormalEquations:
         """Return the equations of no residuals."""
         return cls(
             0.0,
-            np.zeros((shared, shared)),
-            np.zeros(shared),
-            np.zeros((poses, per_pose, per_pose)),
-            np.zeros((poses, per_pose)),
-            np.zeros((poses, per_pose, shared)),
+            np.zeros((shared_count, shared_count)),
+            np.zeros(shared_count),
+            np.zeros((pose_count, unknowns_per_pose, unknowns_per_pose)),
+            np.zeros((pose_count, unknowns_per_pose)),
+            np.zeros((pose_count, unknowns_per_pose, shared_count)),
         )
 
-    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-        """Eliminate the poses; return the shared equations, and the factors that give the poses.
+    def eliminate_poses(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
+        """Eliminate the poses; return the shared equations, and what gives the poses' changes.
 
-        The result is a matrix (S, S) and a right side (S,), then (P, K, S) and (P, K): the change
-        of a pose is the last minus the third times the shared change. ``damping``: part of the
-        diagonal that is added to it.
+        The result is the matrix (S, S) and the right side (S,) of the shared equations, then a
+        matrix M (P, K, S) and a vector v (P, K): the poses change by v - M x if the shared unknowns
+        change by x. ``damping``: part of the diagonal that is added to the diagonal.
         """
         # Schur's complement. Of the equations
         #     A x + sum_p B_p^T y_p = a      (shared)
@@ -83,18 +85,18 @@ class Normal(NamedTuple):
         # Damping is Marquardt's: A + damping diag(A), which does not depend on the unknowns' units.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963); Triggs et al., section 6.1.
-        grown = self.own + damping * self.own * np.eye(self.own.shape[-1])
-        both = np.concatenate([self.mixed, self.own_right[..., None]], axis=2)
-        solved = np.asarray(np.linalg.solve(grown, both), dtype=np.float64)
-        complement = np.tensordot(self.mixed, solved, axes=((0, 1), (0, 1)))
+        damped = self.pose_blocks + damping * self.pose_blocks * np.eye(self.pose_blocks.shape[-1])
+        right_sides = np.concatenate([self.coupling, self.pose_right[..., None]], axis=2)
+        solved = np.asarray(np.linalg.solve(damped, right_sides), dtype=np.float64)
+        complement = np.tensordot(self.coupling, solved, axes=((0, 1), (0, 1)))
         matrix = self.shared + damping * np.diag(np.diag(self.shared)) - complement[:, :-1]
         return matrix, self.shared_right - complement[:, -1], solved[..., :-1], solved[..., -1]
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Return the changes of the shared unknowns (S,) and of the poses (P, K)."""
-        matrix, right, by_shared, alone = self.reduced(damping)
+        matrix, right, pose_by_shared, pose_constant = self.eliminate_poses(damping)
         shared = solve_scaled(matrix, right)
-        return shared, alone - by_shared @ shared
+        return shared, pose_constant - pose_by_shared @ shared
 
     def covariance(self) -> tuple[Array, Array]:
         """Return the covariances of the shared unknowns (S, S) and of each pose (P, K, K).
@@ -102,57 +104,61 @@ class Normal(NamedTuple):
         They are NaN if ``cost`` is infinite.
         """
         if not math.isfinite(self.cost):
-            return np.full_like(self.shared, np.nan), np.full_like(self.own, np.nan)
+            return np.full_like(self.shared, np.nan), np.full_like(self.pose_blocks, np.nan)
         # With residuals of variance 1 the covariance is the inverse of J^T J. Its upper left block
         # is that of Schur's complement, S^-1; those of the poses are C_p^-1 + D_p S^-1 D_p^T, with
-        # D_p = C_p^-1 B_p: their own part, and that of the shared unknowns' errors.
+        # D_p = C_p^-1 B_p: the poses' own errors, and the effect of the shared unknowns' errors.
         # Source: Hartley and Zisserman, section 5.2 and appendix 6.
-        matrix, _, by_shared, _ = self.reduced()
+        matrix, _, pose_by_shared, _ = self.eliminate_poses()
         shared = inverse_scaled(matrix)
-        return shared, np.linalg.inv(self.own) + by_shared @ shared @ by_shared.swapaxes(1, 2)
+        return shared, np.linalg.inv(
+            self.pose_blocks
+        ) + pose_by_shared @ shared @ pose_by_shared.swapaxes(1, 2)
 
 
 def minimize(
-    at: T,
-    evaluate: Callable[[T], Normal],
-    moved: Callable[[T, Array, Array], T],
+    start: T,
+    evaluate: Callable[[T], NormalEquations],
+    apply_steps: Callable[[T, Array, Array], T],
     *,
-    gain: float,
-    noise: float = 0.0,
+    min_gain: float,
+    rounding_cost: float = 0.0,
     damping: float = 1e-4,
-) -> tuple[T, Normal]:
+) -> tuple[T, NormalEquations]:
     """Minimise the sum of squares; return the solution and the normal equations there.
 
     Levenberg's and Marquardt's method: a step that lowers the sum makes the damping ten times
-    smaller; any other is taken back and makes it ten times larger.
+    smaller; any other step is undone and makes the damping ten times larger.
 
-    ``moved`` returns the solution changed by steps of the shared unknowns (S,) and of the poses (P,
-    K); it raises :class:`CalibrationError` if the steps lead to no valid one. A step that lowers
-    the cost by less than the part ``gain`` of it is the last; for this comparison ``noise`` is
-    added to the cost, since exact samples leave only rounding errors to gain. ``damping`` is the
-    part of the diagonal that is added to it at first; it may be small if the start is near. The
-    best solution found is returned; its cost is infinite if that of the start is.
+    ``apply_steps`` returns a solution changed by steps of the shared unknowns (S,) and of the poses
+    (P, K); it raises :class:`CalibrationError` if the steps lead to no valid solution. The search
+    ends with a step that lowers the cost by less than the part ``min_gain`` of the cost. For this
+    comparison ``rounding_cost`` is added to the cost, since exact samples leave only rounding
+    errors to gain. ``damping`` is the part of the diagonal that is added to the diagonal at first;
+    it may be small if the start is near. The best solution found is returned; its cost is infinite
+    if that of the start is.
     """
-    normal = evaluate(at)
+    solution, normal = start, evaluate(start)
     for _ in range(MAX_STEPS):
         if not math.isfinite(normal.cost):
             break
         try:
-            tried = moved(at, *normal.step(damping))
-            after = evaluate(tried)
+            candidate = apply_steps(solution, *normal.step(damping))
+            candidate_normal = evaluate(candidate)
         except (CalibrationError, np.linalg.LinAlgError):
-            tried, after = at, normal._replace(cost=math.inf)
-        gained, least = normal.cost - after.cost, gain * (normal.cost + noise)
-        if gained < 0:
-            if damping >= MAX_DAMPING or -gained <= least:
+            candidate, candidate_normal = solution, normal._replace(cost=math.inf)
+        gain = normal.cost - candidate_normal.cost
+        smallest_gain = min_gain * (normal.cost + rounding_cost)
+        if gain < 0:
+            if damping >= MAX_DAMPING or -gain <= smallest_gain:
                 break
             damping = max(10.0 * damping, 1e-6)
             continue
-        at, normal = tried, after
+        solution, normal = candidate, candidate_normal
         damping = max(damping / 10.0, MIN_DAMPING)
-        if gained <= least:
+        if gain <= smallest_gain:
             break
-    return at, normal
+    return solution, normal
 
 
 def unit_diagonal(matrix: Array) -> Array:
@@ -175,7 +181,7 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     if len(matrix) > MAX_UNKNOWNS_BY_SVD:
         with contextlib.suppress(np.linalg.LinAlgError):
             return np.asarray(np.linalg.solve(scaled, right / by_row) / by_row, dtype=np.float64)
-    solution: Array = np.linalg.lstsq(scaled, right / by_row, rcond=RANK)[0] / by_row
+    solution: Array = np.linalg.lstsq(scaled, right / by_row, rcond=RANK_TOLERANCE)[0] / by_row
     return solution
 
 
@@ -183,7 +189,7 @@ def inverse_scaled(matrix: Array) -> Array:
     """Return the pseudoinverse (S, S) of a positive matrix whose unknowns have several units."""
     scale = unit_diagonal(matrix)
     outer = np.outer(scale, scale)
-    inverse = np.linalg.pinv(matrix / outer, rcond=RANK, hermitian=True)
+    inverse = np.linalg.pinv(matrix / outer, rcond=RANK_TOLERANCE, hermitian=True)
     return np.asarray(inverse / outer, dtype=np.float64)
 
 
@@ -191,6 +197,6 @@ def independent_parts(covariance: Array) -> Array:
     """Return independent vectors (K, S) whose outer products add up to a covariance."""
     scale = unit_diagonal(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    significant = values > RANK_OF_COVARIANCE * values.max(initial=0.0)
+    significant = values > COVARIANCE_RANK_TOLERANCE * values.max(initial=0.0)
     parts: Array = (vectors[:, significant] * np.sqrt(values[significant])).T * scale
     return parts

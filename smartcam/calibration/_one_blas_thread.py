@@ -21,8 +21,8 @@ class OneBlasThread(ContextDecorator):
     """Limit BLAS to one thread inside of ``with`` or a function; restore the number afterwards.
 
     Whether the limit applies to the calling thread or to the process depends on the version of
-    threadpoolctl (extra ``calibration``). So each thread sets the limit, and
-    restores the number from before the first limit. Without threadpoolctl nothing changes.
+    threadpoolctl (extra ``calibration``). So each thread sets the limit, and restores the number
+    that was there before the first limit. Without threadpoolctl nothing changes.
     """
 
     def __init__(self) -> None:
@@ -32,29 +32,29 @@ class OneBlasThread(ContextDecorator):
     def forked(self) -> None:
         """Reset the state in a fork; its BLAS may stay limited to one thread."""
         self._lock = threading.Lock()
-        self._inside: Counter[int] = Counter()  # depth of nested uses, by thread
-        self._before: Any = None
+        self._depths: Counter[int] = Counter()  # nested uses, by thread
+        self._original_limits: Any = None
 
     def __enter__(self) -> None:
         thread = threading.get_ident()
         with self._lock, suppress(MissingExtraError):
-            self._inside[thread] += 1
-            if self._inside[thread] == 1:
+            self._depths[thread] += 1
+            if self._depths[thread] == 1:
                 controller = load("threadpoolctl").ThreadpoolController()
                 limits = controller.limit(limits=1, user_api="blas")
-                self._before = self._before or limits
+                self._original_limits = self._original_limits or limits
 
     def __exit__(self, *_: object) -> None:
         thread = threading.get_ident()
         with self._lock:
-            self._inside[thread] -= 1
-            if self._inside[thread] > 0:
+            self._depths[thread] -= 1
+            if self._depths[thread] > 0:
                 return
-            del self._inside[thread]
-            if self._before is not None:
-                self._before.restore_original_limits()
-            if not self._inside:
-                self._before = None
+            del self._depths[thread]
+            if self._original_limits is not None:
+                self._original_limits.restore_original_limits()
+            if not self._depths:
+                self._original_limits = None
 
 
 one_blas_thread = OneBlasThread()

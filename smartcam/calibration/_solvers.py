@@ -98,8 +98,8 @@ class Poses(NamedTuple):
         """Return the localizations with these poses, in the same order, and their own headers."""
         rows = zip(localizations, self.points.tolist(), self.quaternions.tolist(), strict=True)
         return [
-            part._replace(pose=Pose(part.pose.header, Position(*at), Quaternion(*turn)))
-            for part, at, turn in rows
+            part._replace(pose=Pose(part.pose.header, Position(*position), Quaternion(*quaternion)))
+            for part, position, quaternion in rows
         ]
 
 
@@ -137,13 +137,13 @@ class CameraPosition2D:
         self.theta: float = float(as_vector([theta], 1, "theta of the origin mark")[0])
         self.scale: float = float(scale)
         cos, sin = np.cos(self.theta), np.sin(self.theta)
-        self._back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        self._rotation = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses relative to the origin mark, metres."""
         # subtract before turning, so that the origin becomes zero
         centred = poses.points - np.array([*self.origin, 0.0])
-        return Poses(self.scale * centred, poses.quaternions).moved(self._back, np.zeros(3))
+        return Poses(self.scale * centred, poses.quaternions).moved(self._rotation, np.zeros(3))
 
 
 class RealWorldPosition:
@@ -219,28 +219,28 @@ class PlaneProjection:
                 "projection: expected poses in the camera's plane, turned about its z, got some "
                 "with a height or a tilt"
             )
-        seen = points[:, :2]
-        depth = seen @ self.matrix[3, :2] + self.matrix[3, 2]
+        camera_points = points[:, :2]
+        depth = camera_points @ self.matrix[3, :2] + self.matrix[3, 2]
         if not np.all(depth > 0):
-            hidden = seen[int(np.argmin(depth))].tolist()
+            hidden_point = camera_points[int(np.argmin(depth))].tolist()
             raise Code.OUT_OF_FIELD.refusal(
-                f"projection: expected points that the camera can see, got {hidden}: behind the "
-                "plane's horizon",
-                got=hidden,
+                f"projection: expected points that the camera can see, got {hidden_point}: behind "
+                "the plane's horizon",
+                got=hidden_point,
             )
         # The x axis (cos, sin) = (w^2 - z^2, 2 z w) goes where the map's derivative takes it; the
         # plane is spanned by the derivative's columns.
-        ahead = np.column_stack([w * w - z * z, 2.0 * z * w])
-        axes = tangent_frames(derivatives(self.matrix, seen), ahead)
-        return Poses(apply_homography(self.matrix, seen), quaternion_from_matrix(axes))
+        directions = np.column_stack([w * w - z * z, 2.0 * z * w])
+        axes = tangent_frames(derivatives(self.matrix, camera_points), directions)
+        return Poses(apply_homography(self.matrix, camera_points), quaternion_from_matrix(axes))
 
 
 class Height:
     """Solver for parts higher than the plane: from their apparent place to their true place.
 
-    A point at ``height`` above the plane appears at the place where its ray meets the plane, which
-    is farther from the point below the camera. Without ``viewpoint`` the rays are taken as parallel
-    to the normal, as with a telecentric lens: then only the height is added.
+    The camera sees a point at ``height`` above the plane where the ray through the point meets the
+    plane: too far from the place right below the camera. Without ``viewpoint`` the rays are taken
+    as parallel to the normal, as with a telecentric lens: then only the height is added.
 
     Args:
         height: metres above the plane, in the direction of ``normal``; negative is below.
@@ -276,18 +276,18 @@ class Height:
         points = poses.points
         if self.viewpoint is None:
             return Poses(points + self.height * self.normal, poses.quaternions)
-        # On the ray p + s (v - p) the height over the plane is s n (v - p); it is h for
+        # On the ray p + s (v - p) the height over the plane is s n (v - p), which is h for
         # s = h / n (v - p).
         rays = self.viewpoint - points
-        above = rays @ self.normal
-        if not np.all(above > max(self.height, 0.0)):
+        distances = rays @ self.normal
+        if not np.all(distances > max(self.height, 0.0)):
             raise Code.SHORT_LEVER.refusal(
                 f"height: expected the viewpoint more than {max(self.height, 0.0):g} m above each "
-                f"point, got {float(above.min()):g} m",
+                f"point, got {float(distances.min()):g} m",
                 self.height,
-                float(above.min()),
+                float(distances.min()),
             )
-        return Poses(points + rays * (self.height / above)[:, None], poses.quaternions)
+        return Poses(points + rays * (self.height / distances)[:, None], poses.quaternions)
 
 
 class ToolOffset:
@@ -330,8 +330,8 @@ class ToolOffset:
             CalibrationError: ``NOT_RIGID``.
         """
         # T_base_flange = T_base_tip T_flange_tip^-1
-        back = Transform.from_quaternion("flange", "tip", tip, quaternion).inverse()
-        return cls(back.translation, back.quaternion)
+        flange_in_tip = Transform.from_quaternion("flange", "tip", tip, quaternion).inverse()
+        return cls(flange_in_tip.translation, flange_in_tip.quaternion)
 
     def solve(self, poses: Poses) -> Poses:
         """Return the tool's poses, in the frame of the given poses."""
@@ -410,16 +410,16 @@ class Chain:
                 ``camera_frame``; and the errors of the solvers.
         """
         if isinstance(localizations, Localization):
-            return self._solved([localizations])[0]
-        return self._solved(list(localizations))
+            return self._map_localizations([localizations])[0]
+        return self._map_localizations(list(localizations))
 
-    def _solved(self, parts: list[Localization]) -> list[Localization]:
+    def _map_localizations(self, parts: list[Localization]) -> list[Localization]:
         check_frames(parts, self.camera_frame, "chain: ")
-        solved = []
+        mapped = []
         for part in self.solve(Poses.of(parts)).put(parts):
             header = part.pose.header._replace(frame_id=self.frame)
-            solved.append(part._replace(pose=part.pose._replace(header=header)))
-        return solved
+            mapped.append(part._replace(pose=part.pose._replace(header=header)))
+        return mapped
 
 
 def check_frames(
@@ -464,11 +464,11 @@ def chain_of(
         projection = PlaneProjection(calibration.matrix)
         return Chain([projection], frame=frame, camera_frame=camera_frame, y_down=y_down)
     sheet = as_vector(origin, 2, "origin")
-    turned = matrix_from_quaternion(quaternion_about_z(theta))
+    rotation = matrix_from_quaternion(quaternion_about_z(theta))
     return Chain(
         [
             CameraPosition2D(sheet, theta, calibration.scale),
-            RealWorldPosition(calibration.transform([sheet])[0], calibration.rotation @ turned),
+            RealWorldPosition(calibration.transform([sheet])[0], calibration.rotation @ rotation),
         ],
         frame=frame,
         camera_frame=camera_frame,

@@ -11,9 +11,9 @@ from smartcam._extras import load
 if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
-MAX_MOVED_SPREAD: Final = 0.2
-"""Largest distance of an offset from the mean offset, as a part of that mean, of offsets that count
-as one common move. Without this test a sheet pushed by 3 to 50 mm before the last two to four of
+MAX_MOVE_SPREAD: Final = 0.2
+"""Offsets count as one common move if none differs from their mean by more than this part of the
+mean. Without this test a sheet pushed by 3 to 50 mm before the last two to four of
 nine touches, or by 20 mm before the last three of fourteen views, was called good."""
 
 
@@ -27,11 +27,8 @@ class Noise(NamedTuple):
     def chance(self, squares: float, count: float) -> float:
         """Return the p-value: the probability that noise gives ``squares`` (m^2) or more.
 
-        ``squares``: sum of ``count`` squared residuals.
-
-
-        This is a chi-square test if the variance was given, and an F-test if it was estimated from
-        other squares.
+        ``squares``: sum of ``count`` squared residuals. This is a chi-square test
+        if the variance was given, and an F-test if it was estimated from other squares.
         """
         special = load("scipy.special")
         if self.freedom is None:
@@ -45,10 +42,10 @@ def normal_deviations(chance: float | Array) -> float:
 
 
 def common_move(offsets: Array) -> Array | None:
-    """Return the mean of two or more offsets (N, K) that are alike; None if they are not."""
+    """Return the mean of two or more offsets (N, K) if they are nearly the same, else None."""
     if len(offsets) < 2:
         return None
-    middle: Array = offsets.mean(axis=0)
-    distances = np.linalg.norm(offsets - middle, axis=1)
-    alike = float(distances.max()) < MAX_MOVED_SPREAD * float(np.linalg.norm(middle))
-    return middle if alike else None
+    mean: Array = offsets.mean(axis=0)
+    distances = np.linalg.norm(offsets - mean, axis=1)
+    is_common = float(distances.max()) < MAX_MOVE_SPREAD * float(np.linalg.norm(mean))
+    return mean if is_common else None

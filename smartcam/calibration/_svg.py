@@ -1,4 +1,4 @@
-"""Write the elements of pictures as SVG, with the same bytes on every machine."""
+"""Write SVG elements, with the same bytes on every machine."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Source of the colours: Okabe and Ito, Color Universal Design (2008).
 
 
 def document(width: float, height: float, parts: Iterable[str], style: str = STYLE) -> str:
-    """Return a whole picture of a fixed size; lines end with a line feed."""
+    """Return an SVG document of a fixed size with ``parts`` as its elements, each on a line."""
     size = f"{width:.0f}", f"{height:.0f}"
     return "\n".join(
         [
@@ -53,40 +53,44 @@ def document(width: float, height: float, parts: Iterable[str], style: str = STY
     )
 
 
-def line(start: Place, end: Place, kind: str, more: str = "") -> str:
-    """Return a line; ``more``: further attributes, after a space."""
+def line(start: Place, end: Place, css_class: str, attributes: str = "") -> str:
+    """Return a line; ``attributes`` begins with a space."""
     return (
         f'<line x1="{start[0]:.2f}" y1="{start[1]:.2f}" x2="{end[0]:.2f}" y2="{end[1]:.2f}" '
-        f'class="{kind}"{more}/>'
+        f'class="{css_class}"{attributes}/>'
     )
 
 
-def text(place: Place, content: str, kind: str = "", more: str = "") -> str:
-    """Return a text that begins at a place; ``more``: further attributes, after a space."""
-    of_kind = f' class="{kind}"' if kind else ""
-    return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(content)}</text>'
+def text(place: Place, content: str, css_class: str = "", attributes: str = "") -> str:
+    """Return a text that begins at ``place``; ``attributes`` begins with a space."""
+    class_attribute = f' class="{css_class}"' if css_class else ""
+    return (
+        f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{class_attribute}{attributes}>'
+        f"{escape(content)}</text>"
+    )
 
 
-def circle(place: Place, radius: float, kind: str) -> str:
+def circle(place: Place, radius: float, css_class: str) -> str:
     """Return a circle around a place."""
-    return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius:g}" class="{kind}"/>'
+    return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius:g}" class="{css_class}"/>'
 
 
-def polygon(corners: Array, kind: str, title: str = "") -> str:
-    """Return a polygon of corners (N, 2); ``title`` is shown where the pointer is on it."""
+def polygon(corners: Array, css_class: str, title: str = "") -> str:
+    """Return a polygon of corners (N, 2); ``title`` is shown while the pointer is on it."""
     places = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners.tolist())
-    return f'<polygon points="{places}" class="{kind}"' + _titled("polygon", title)
+    return f'<polygon points="{places}" class="{css_class}"' + _tag_end("polygon", title)
 
 
-def rectangle(place: Place, size: Place, paint: str, title: str = "") -> str:
-    """Return a rectangle; ``paint``: its class or fill, as an attribute."""
+def rectangle(place: Place, size: Place, paint_attribute: str, title: str = "") -> str:
+    """Return a rectangle; ``paint_attribute`` is its ``class`` or ``fill`` attribute."""
     return (
         f'<rect x="{place[0]:.2f}" y="{place[1]:.2f}" width="{size[0]:.2f}" '
-        f'height="{size[1]:.2f}" {paint}' + _titled("rect", title)
+        f'height="{size[1]:.2f}" {paint_attribute}' + _tag_end("rect", title)
     )
 
 
-def _titled(element: str, title: str) -> str:
+def _tag_end(element: str, title: str) -> str:
+    """Return the end of an element's start tag, its title if it has one, and its end tag."""
     return f"><title>{escape(title)}</title></{element}>" if title else "/>"
 
 

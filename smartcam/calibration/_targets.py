@@ -30,8 +30,8 @@ MAX_POINTS = 10_000
 """A target has at most this many points."""
 
 MAX_LENGTH_M = 1.0
-"""Largest side of a square or marker, and largest distance of dots, metres: a printed sheet has
-some to a few hundred millimetres, so a larger number is one in millimetres."""
+"""Largest side of a square or marker, and largest distance of dots, metres: those of printed sheets
+are below a few hundred millimetres, so a larger number is probably in millimetres."""
 
 AREA_DISTANCE_SQUARES = 0.3
 """Distance along x and along y from an outer corner of a checkerboard to the centre of the round
@@ -175,14 +175,14 @@ class CircleGrid:
         _check_flags(self.kind, asymmetric=self.asymmetric)
         if self.origin_diameter is not None:
             _check_lengths(self.kind, origin_diameter=self.origin_diameter)
-        between = (self.diameter + (self.origin_diameter or self.diameter)) / 2
-        least = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
-        if between >= least:
+        mean_diameter = (self.diameter + (self.origin_diameter or self.diameter)) / 2
+        min_distance = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
+        if mean_diameter >= min_distance:
             raise Code.SHAPE.refusal(
                 f"circles: expected dots that do not touch each other at a distance of "
-                f"{least:g} m, got a mean diameter of two neighbours of {between:g} m",
-                least,
-                between,
+                f"{min_distance:g} m, got a mean diameter of two neighbours of {mean_diameter:g} m",
+                min_distance,
+                mean_diameter,
             )
         if self.origin_diameter is not None and self.origin_diameter <= self.diameter:
             raise Code.SHAPE.refusal(
@@ -244,8 +244,8 @@ class MarkerGrid:
     half_turn_symmetric: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        _check_counts(self.kind, self.columns, self.rows, least=1)
-        _check_counts(self.kind, 2 * self.columns, 2 * self.rows, least=1)
+        _check_counts(self.kind, self.columns, self.rows, minimum=1)
+        _check_counts(self.kind, 2 * self.columns, 2 * self.rows, minimum=1)
         _check_lengths(self.kind, marker=self.marker, gap=self.gap)
         _check_flags(self.kind, kalibr=self.kalibr)
         _check_whole(self.kind, 1, border=self.border)
@@ -325,19 +325,19 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     Raises:
         CalibrationError: SHAPE: the data do not describe a target.
     """
-    given = dict(data) if hasattr(data, "items") else {}
-    named = given.pop("kind", None)
-    kind = _KINDS.get(named) if isinstance(named, str) else None
-    if kind is None:
+    fields = dict(data) if hasattr(data, "items") else {}
+    kind_name = fields.pop("kind", None)
+    target_class = _KINDS.get(kind_name) if isinstance(kind_name, str) else None
+    if target_class is None:
         raise Code.SHAPE.refusal(
-            f"target: expected a kind of {sorted(_KINDS)}, got {shown(named)}",
+            f"target: expected a kind of {sorted(_KINDS)}, got {shown(kind_name)}",
             sorted(_KINDS),
-            named,
+            kind_name,
         )
     try:
-        return kind(**given)
+        return target_class(**fields)
     except TypeError as exc:
-        raise Code.SHAPE.refusal(f"target: {exc}", got=sorted(given)) from exc
+        raise Code.SHAPE.refusal(f"target: {exc}", got=sorted(fields)) from exc
 
 
 def resized(target: T, factor: float, digits: int | None = None) -> T:
@@ -362,8 +362,8 @@ def _grid(columns: int, rows: int, spacing: float) -> Array:
     return points
 
 
-def _check_counts(kind: str, columns: Any, rows: Any, least: int = 3) -> None:
-    _check_whole(kind, least, columns=columns, rows=rows)
+def _check_counts(kind: str, columns: Any, rows: Any, minimum: int = 3) -> None:
+    _check_whole(kind, minimum, columns=columns, rows=rows)
     if columns * rows > MAX_POINTS:
         raise Code.SHAPE.refusal(
             f"{kind}: expected at most {MAX_POINTS} points, got {shown(columns)} x {shown(rows)}",
@@ -372,14 +372,14 @@ def _check_counts(kind: str, columns: Any, rows: Any, least: int = 3) -> None:
         )
 
 
-def _check_whole(kind: str, least: int, **numbers: Any) -> None:
-    for name, count in numbers.items():
-        if not isinstance(count, int) or isinstance(count, bool) or count < least:
+def _check_whole(kind: str, minimum: int, **numbers: Any) -> None:
+    for name, number in numbers.items():
+        if not isinstance(number, int) or isinstance(number, bool) or number < minimum:
             raise Code.SHAPE.refusal(
-                f"{kind}: expected {name} to be a whole number of at least {least}, "
-                f"got {shown(count)}",
-                least,
-                count,
+                f"{kind}: expected {name} to be a whole number of at least {minimum}, "
+                f"got {shown(number)}",
+                minimum,
+                number,
             )
 
 
@@ -395,15 +395,15 @@ def _check_flags(kind: str, **flags: Any) -> None:
 
 def _check_lengths(kind: str, **lengths: Any) -> None:
     for name, length in lengths.items():
-        number = isinstance(length, int | float) and not isinstance(length, bool)
-        if number and MAX_LENGTH_M < length < math.inf:
+        is_number = isinstance(length, int | float) and not isinstance(length, bool)
+        if is_number and MAX_LENGTH_M < length < math.inf:
             raise Code.UNIT_UNKNOWN.refusal(
                 f"{kind}: expected {name} to be a length of {MAX_LENGTH_M:g} m at most, got "
                 f"{shown(length)} m; is it in millimetres?",
                 MAX_LENGTH_M,
                 length,
             )
-        if not (number and math.isfinite(length) and length > 0):
+        if not (is_number and math.isfinite(length) and length > 0):
             raise Code.SHAPE.refusal(
                 f"{kind}: expected {name} to be a length in metres, got {shown(length)}",
                 "metres",

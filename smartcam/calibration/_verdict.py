@@ -1,8 +1,8 @@
 """Judge a calibration: its quality, its error in millimetres, and the next action.
 
 A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
-twice that error is within what the user allows; the default is :data:`MAX_ERROR_SHARE` of the
-field. Loading a calibration that is not good logs a warning.
+twice that error is at most the allowed one. The user gives the allowed error; the default is
+:data:`MAX_ERROR_SHARE` of the field. Loading a calibration that is not good logs a warning.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Allowed(NamedTuple):
     """The largest error that is allowed."""
 
     error: float  # error that 95 of 100 new points may have, mm
-    given: bool  # whether the user gave the error
+    is_from_user: bool  # False: the default, a part of the field
 
     @classmethod
     def of(cls, error: float | None, field: float) -> Allowed:
@@ -54,14 +54,14 @@ class Allowed(NamedTuple):
     @property
     def text(self) -> str:
         """The error that is allowed, in words."""
-        if self.given:
+        if self.is_from_user:
             return f"{self.error:.3g} mm are allowed"
         share = f"{100 * MAX_ERROR_SHARE:g} % of the field"
         return f"{self.error:.3g} mm are allowed, {share}, the default"
 
 
-_LOOK: Final = ("see the warning", "more")
-_AGAIN: Final = "touch point {number} again"
+_DEFAULT_CURE: Final = ("see the warning", "more")
+_TOUCH_AGAIN: Final = "touch point {number} again"
 
 CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.MIRRORED: ("begin anew with --y-down, or say where the tool points", "more"),
@@ -70,12 +70,13 @@ CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.COINCIDENT: ("a point was touched twice: remove one", "remove"),
     Code.TOO_FEW: ("touch more points", "more"),
     Code.WRONG_ORDER: ("exchange the touches that are named, or touch the points again", "reorder"),
-    Code.OUTLIER: (_AGAIN, "redo"),
-    Code.NOT_PLANAR: (_AGAIN, "redo"),
-    Code.POOR_FIT: (_AGAIN, "redo"),
+    Code.OUTLIER: (_TOUCH_AGAIN, "redo"),
+    Code.NOT_PLANAR: (_TOUCH_AGAIN, "redo"),
+    Code.POOR_FIT: (_TOUCH_AGAIN, "redo"),
     Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
 }
-"""Advice and matching option for each possible fault; the first that applies counts."""
+"""Advice, and the option of a wizard's step that follows it, for each fault. The first fault that a
+calibration has counts."""
 
 VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
     Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),
@@ -91,7 +92,7 @@ VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
 
 
 class Judgement(NamedTuple):
-    """A verdict, and the advice."""
+    """A verdict, and the option of a wizard's step that is advised."""
 
     verdict: CalibrationVerdict
     # error that 95 of 100 new points may have, mm; None: not good, or not known
@@ -100,7 +101,7 @@ class Judgement(NamedTuple):
     number: int | None = None  # number, from 1, of the point or view that the advice is about
 
     def chosen(self, options: Iterable[str]) -> str:
-        """Return the advised one of some options; a poor result is never just accepted."""
+        """Return the advised one of ``options``, which is never "accept" for a poor result."""
         return next(choice for choice in (self.option, "redo", "more") if choice in options)
 
     @property
@@ -111,36 +112,35 @@ class Judgement(NamedTuple):
 
 def judge(
     held_out: float | None,
-    wrong: Iterable[tuple[Code, str]],
+    warnings: Iterable[tuple[Code, str]],
     *,
     worst: int,
     predicted: float | None = None,
     allowed: Allowed,
     cures: Mapping[Code, tuple[str, str]] = CURES,
-    more: str = "touch more points",
+    advice: str = "touch more points",
     where: str = "",
 ) -> Judgement:
     """Return the judgement of a calibration.
 
-    ``held_out``: RMS error at points that were left out, mm. ``wrong``: warnings; those without a
-    cure do not count. ``worst``: number of the point to blame if a warning names none.
+    ``held_out``: RMS error at points that were left out, mm. ``warnings``: those without
+    a cure do not count. ``worst``: number of the point to blame if a warning names none.
     ``predicted``: RMS error that noise causes, mm; the promised error is never less. ``allowed``:
-    largest error that may be promised. ``more``: work that would show how good it is. ``where``:
-    text for people: the place of the promise.
+    largest error that may be promised. ``advice``: work that would show how good the calibration
+    is. ``where``: the place for which the promised error holds, as a part of the text.
     """
-    wrong = list(wrong)
-    texts = dict(reversed(wrong))
+    texts = dict(reversed(list(warnings)))
     for code in cures:
         if code in texts:
             return refused(code, texts[code], worst=worst, cures=cures)
     if held_out is None:
         return Judgement(
-            CalibrationVerdict("unknown", f"Not known how good: {more}"), option="more"
+            CalibrationVerdict("unknown", f"Not known how good: {advice}"), option="more"
         )
     good_for = _rounded_up(_RMS_OF_95_PERCENT * max(held_out, predicted or 0.0))
     promise = f"95 of 100 new points lie within {good_for:g} mm{where}"
     if good_for > max(allowed.error, _rounded_up(0.0)):
-        text = f"Not good enough: {promise}, but {allowed.text}: {more}"
+        text = f"Not good enough: {promise}, but {allowed.text}: {advice}"
         return Judgement(CalibrationVerdict("poor", text), option="more")
     if Code.SIDE_UNKNOWN in texts:
         text = f"Not known how good: say where the tool points. If y is not mirrored, {promise}"
@@ -157,9 +157,9 @@ def refused(
     cures: Mapping[Code, tuple[str, str]] = CURES,
 ) -> Judgement:
     """Return the judgement that a calibration is not good; ``text`` names the fault."""
-    named = re.search(r"\bpoints? (\d+)", text)
-    number = int(named[1]) if named else worst
-    cure, option = next((how for curable, how in cures.items() if curable == code), _LOOK)
+    point_number = re.search(r"\bpoints? (\d+)", text)
+    number = int(point_number[1]) if point_number else worst
+    cure, option = next((pair for fault, pair in cures.items() if fault == code), _DEFAULT_CURE)
     verdict = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
     return Judgement(verdict, option=option, number=number)
 
@@ -182,7 +182,7 @@ def doubt_of(calibration: Any) -> str:
     return f"this calibration is not known to be good. {verdict.text}"
 
 
-def warn(calibration: Any, name: str) -> None:
+def warn_unless_good(calibration: Any, name: str) -> None:
     """Log a warning if the calibration of a file is not known to be good."""
     if doubt := doubt_of(calibration):
         _log.warning("%s: %s", name, doubt)

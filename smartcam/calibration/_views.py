@@ -1,4 +1,4 @@
-"""Store the points of a target that were found in one image."""
+"""Hold the points of a target that were found in one image."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class TargetView(storage.Stored):
     Pixels count from the centre of the upper left pixel: u to the right, v down.
 
     Attributes:
-        target: target of the search.
+        target: target that the image shows.
         size: width and height of the image, pixels.
         ids: (N,), numbers of the points that were found, ascending. Read-only, as are the next two.
         points: (N, 2), places of these points in the image, pixels.
         covariance: (N, 2, 2), of each point, pixels^2, from the noise of the image; 0 for points
-            without noise.
-        margin: margin of the origin over the other corners: the number of grey levels, of
-            255, by which its mark, or the rim of its larger dot, is darker; None if ids or colours
-            of squares show the origin, or if the target looks the same when turned.
+            that are exact.
+        margin: number of grey levels, of 255, by which the origin's mark, or the rim of its larger
+            dot, is darker than the same place at the other corners; None if ids or colours of
+            squares show the origin, or if the target looks the same when turned.
         name: name of the image, for messages.
         warnings: points that were left out because they contradict the target.
 
@@ -66,16 +66,16 @@ class TargetView(storage.Stored):
 
     def __post_init__(self) -> None:
         """Copy the arrays as read-only ones, and check them."""
-        checked(self.name, str, "view of a target: name")
-        called = f"target in {self.name}" if self.name else "view of a target"
-        target = checked(self.target, get_args(Target), f"{called}: target")
-        ids = _as_ids(self.ids, len(target.points), called)
-        points = as_points(self.points, 2, f"{called}: points").copy()
+        check_type(self.name, str, "view of a target: name")
+        label = f"target in {self.name}" if self.name else "view of a target"
+        target = check_type(self.target, get_args(Target), f"{label}: target")
+        ids = _as_ids(self.ids, len(target.points), label)
+        points = as_points(self.points, 2, f"{label}: points").copy()
         if len(points) != len(ids):
-            expected = f"{called}: points: expected shape ({len(ids)}, 2) as there are ids"
+            expected = f"{label}: points: expected shape ({len(ids)}, 2) as there are ids"
             raise Code.SHAPE.unexpected(expected, (len(ids), 2), points.shape)
-        covariance = as_covariances(self.covariance, len(ids), f"{called}: covariance").copy()
-        check_size(self.size, called)
+        covariance = as_covariances(self.covariance, len(ids), f"{label}: covariance").copy()
+        check_size(self.size, label)
         for name, value in (("ids", ids), ("points", points), ("covariance", covariance)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -102,14 +102,15 @@ class TargetView(storage.Stored):
         near 0 if points have wrong numbers.
         """
         # det(A^T B) is the sum, over all triples of points, of the products of their triangles'
-        # signed areas (Cauchy and Binet), and a plane before a camera keeps all signs. Over the
-        # root of det(A^T A) det(B^T B) it is the product of the canonical correlations.
+        # signed areas (Cauchy and Binet), and a plane in front of a camera keeps all signs. Divided
+        # by the root of det(A^T A) det(B^T B) it is the product of the canonical
+        # correlations.
         # Source: Hotelling, Relations Between Two Sets of Variates (1936).
-        flat, seen = self.object_points[:, :2], self.points
-        both = flat - flat.mean(axis=0), seen - seen.mean(axis=0)
-        spread = math.prod(float(np.linalg.det(points.T @ points)) for points in both)
-        turn = float(np.linalg.det(both[0].T @ both[1]))
-        return turn / math.sqrt(spread) if spread > 0 else math.nan
+        flat, pixels = self.object_points[:, :2], self.points
+        centred = flat - flat.mean(axis=0), pixels - pixels.mean(axis=0)
+        spread = math.prod(float(np.linalg.det(points.T @ points)) for points in centred)
+        determinant = float(np.linalg.det(centred[0].T @ centred[1]))
+        return determinant / math.sqrt(spread) if spread > 0 else math.nan
 
     @property
     def sigmas(self) -> Array:
@@ -118,40 +119,40 @@ class TargetView(storage.Stored):
         return sigmas
 
 
-def label(view: TargetView, number: int) -> str:
+def view_name(view: TargetView, number: int) -> str:
     """Return a view's name for messages, or its number."""
     return view.name or f"view {number}"
 
 
-def checked(value: Any, kinds: type | tuple[type, ...], label: str) -> Any:
-    """Return a value if it is of one of some kinds; otherwise raise SHAPE, which describes it."""
-    if isinstance(value, kinds):
+def check_type(value: Any, types: type | tuple[type, ...], label: str) -> Any:
+    """Return a value that is of one of the types; otherwise raise SHAPE, which names its type."""
+    if isinstance(value, types):
         return value
-    names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
+    type_names = [type_.__name__ for type_ in (types if isinstance(types, tuple) else (types,))]
     raise Code.SHAPE.unexpected(
-        f"{label}: expected a {' or '.join(names)}", names, described(value)
+        f"{label}: expected a {' or '.join(type_names)}", type_names, describe_type(value)
     )
 
 
-def described(value: Any) -> str:
-    """Return the kind of a value, in a few words."""
+def describe_type(value: Any) -> str:
+    """Return the name of a value's type, with the shape of an array."""
     shape = getattr(value, "shape", None)
     kind = "None" if value is None else type(value).__name__
     return kind if shape is None else f"{kind} of shape {tuple(shape)}"
 
 
 def as_views(views: Iterable[TargetView], label: str) -> list[TargetView]:
-    """Return views as a list; raise SHAPE for no list, or for another kind of element."""
+    """Return views as a list; raise SHAPE for no list, or for an element of another type."""
     return as_list(views, TargetView, f"{label}: view")
 
 
-def as_list(values: Any, kinds: type | tuple[type, ...], label: str) -> list[Any]:
-    """Return values as a list; raise SHAPE unless each is of one of some kinds."""
+def as_list(values: Any, types: type | tuple[type, ...], label: str) -> list[Any]:
+    """Return values as a list; raise SHAPE unless each is of one of the types."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
         raise Code.SHAPE.unexpected(
-            f"{label}: expected a list of such", "a list", described(values)
+            f"{label}: expected a list of such", "a list", describe_type(values)
         )
-    return [checked(value, kinds, f"{label} {number}") for number, value in enumerate(values)]
+    return [check_type(value, types, f"{label} {number}") for number, value in enumerate(values)]
 
 
 def as_covariances(values: Any, count: int, label: str) -> Array:
@@ -160,14 +161,14 @@ def as_covariances(values: Any, count: int, label: str) -> Array:
     Raises SHAPE, NOT_FINITE, or NO_COVARIANCE if one is not symmetric or has a negative variance.
     """
     try:
-        given = np.asarray(values, dtype=np.float64)
+        matrices = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, ArithmeticError) as exc:
         raise Code.SHAPE.unexpected(f"{label}: expected numbers", (count, 2, 2), exc) from exc
-    if given.shape != (count, 2, 2):
+    if matrices.shape != (count, 2, 2):
         raise Code.SHAPE.unexpected(
-            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
+            f"{label}: expected shape ({count}, 2, 2)", (count, 2, 2), matrices.shape
         )
-    covariances = as_points(given.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
+    covariances = as_points(matrices.reshape(-1, 4), 4, label).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
     trace = np.trace(covariances, axis1=1, axis2=2)
     uneven = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(
@@ -189,29 +190,29 @@ def as_covariances(values: Any, count: int, label: str) -> Array:
     return covariances
 
 
-def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def _as_ids(values: Any, point_count: int, label: str) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     try:
-        given = np.asarray(values)
+        array = np.asarray(values)
     except ValueError as exc:
         raise Code.SHAPE.unexpected(
-            f"{called}: ids: expected whole numbers", "(N,)", str(exc)
+            f"{label}: ids: expected whole numbers", "(N,)", str(exc)
         ) from exc
-    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-        received = f"{given.dtype} of shape {given.shape}"
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        received = f"{array.dtype} of shape {array.shape}"
         raise Code.SHAPE.unexpected(
-            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", received
+            f"{label}: ids: expected whole numbers of shape (N,)", "(N,)", received
         )
-    wrong = given[(given < 0) | (given >= known)]
+    wrong = array[(array < 0) | (array >= point_count)]
     if len(wrong) and wrong[0] < 0:
-        raise Code.SHAPE.unexpected(f"{called}: ids: expected 0 or more", 0, int(wrong[0]))
+        raise Code.SHAPE.unexpected(f"{label}: ids: expected 0 or more", 0, int(wrong[0]))
     if len(wrong):
         raise Code.SHAPE.unexpected(
-            f"{called}: ids: expected less than {known}", known, int(wrong[0])
+            f"{label}: ids: expected less than {point_count}", point_count, int(wrong[0])
         )
-    ids = given.astype(np.intp)
-    back = np.flatnonzero(np.diff(ids) <= 0)
-    if len(back):
-        received = ids[back[0] : back[0] + 2].tolist()
-        expected = f"{called}: ids: expected each once, ascending (points in the order of the ids)"
+    ids = array.astype(np.intp)
+    unsorted = np.flatnonzero(np.diff(ids) <= 0)
+    if len(unsorted):
+        received = ids[unsorted[0] : unsorted[0] + 2].tolist()
+        expected = f"{label}: ids: expected each once, ascending (points in the order of the ids)"
         raise Code.SHAPE.unexpected(expected, "ascending", received)
     return ids

@@ -1,4 +1,4 @@
-"""Find out what is wrong with a camera, or with the connection to it, and name the cure.
+"""Find out what is wrong with a camera or with the connection to it, and how to cure it.
 
 :func:`examine` runs one check after the other, beginning with the basics: the name, the session,
 status, application, round trip, run state, triggers, layout, clock. It changes nothing on the
@@ -26,7 +26,7 @@ from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
 from smartcam.doctor._context import DoctorOptions, Examination, Witness
 from smartcam.doctor._findings import Exit, Finding
-from smartcam.doctor._found import serves_one
+from smartcam.doctor._found import may_serve_one_client
 from smartcam.doctor._search import find
 from smartcam.exceptions import (
     CameraFaultError,
@@ -53,19 +53,19 @@ __all__ = [
     "find",
 ]
 
-NOTICE = Finding(
+EXCLUSIVE_NOTICE = Finding(
     check="notice",
     severity="ok",
     text="connecting takes the camera from another client, if it serves one: the newcomer wins",
     cure="A program that uses smartcam takes it back by itself.",
 )
 
-SHARED = Finding(
+SHARED_NOTICE = Finding(
     check="notice",
     severity="ok",
     text="the camera's agent shares it: this examination takes it from no program",
 )
-SEVERAL = Finding(
+SEVERAL_CLIENTS_NOTICE = Finding(
     check="notice",
     severity="ok",
     text="the camera serves several clients: this examination takes it from none",
@@ -80,78 +80,86 @@ MAX_TRIGGERS = 10_000
 
 
 class _DoctorCheck(NamedTuple):
-    """One check."""
+    """One check of an examination."""
 
-    name: str  # name of the examination in its findings
-    run: Callable[[Examination], Awaitable[None]]  # function that checks, and reports to the exam
+    name: str  # name of the check in its findings
+    # function that checks, and reports its findings to the examination
+    run: Callable[[Examination], Awaitable[None]]
     limit: Callable[[DoctorOptions], float]  # seconds that it may take with these options
-    in_session: bool = True  # whether the examination needs a session
+    in_session: bool = True  # whether the check needs a session
 
 
-def _requests(options: DoctorOptions) -> float:
-    return options.step(5.0) + state_checks.QUERIES_WITHIN
+def _limit_of_requests(options: DoctorOptions) -> float:
+    return options.step_timeout(5.0) + state_checks.MAX_QUERYING_SECONDS
 
 
-def _switch(options: DoctorOptions) -> float:
-    return 2 * options.step(10.0)  # the wait for the turn, and the switch
+def _limit_of_switch(options: DoctorOptions) -> float:
+    return 2 * options.step_timeout(10.0)  # waiting for the camera to be free, and switching
 
 
-def _once(options: DoctorOptions) -> float:
-    return options.step(10.0) + 1.0
+def _limit_of_one_step(options: DoctorOptions) -> float:
+    return options.step_timeout(10.0) + 1.0
 
 
-_NAME = _DoctorCheck("name", session_checks.resolve, _once, in_session=False)
+_NAME_CHECK = _DoctorCheck("name", session_checks.resolve, _limit_of_one_step, in_session=False)
 
-_AT_THE_WIRE = (
-    _NAME,
+_WIRE_CHECKS = (
+    _NAME_CHECK,
     _DoctorCheck(
         "session",
         session_checks.connect,
-        # a session that fails, all other ways, and a session by one of them; and their ends
+        # a session that fails, all other ways, a session by one of them, more sessions, their ends
         lambda options: (
-            4 * options.step(10.0) + session_checks.CONNECTS_WITHIN + session_checks.SESSION_COUNT
+            4 * options.step_timeout(10.0)
+            + session_checks.MAX_CONNECTING_SECONDS
+            + session_checks.SESSION_COUNT
         ),
         in_session=False,
     ),
 )
 
 
-def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
-    """Return the checks on the way to a camera of a fleet, and the camera's address."""
+def _checks_of_fleet_camera(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
+    """Return the checks up to a session with a camera of a fleet, and the camera's address."""
     with from_part("fleet", "an examination of a camera of a fleet needs"):
         from smartcam.doctor import _fleet_checks as checks
 
-    steps = (
-        _NAME,
-        _DoctorCheck("bus", checks.reach, _switch, in_session=False),
+    fleet_checks = (
+        _NAME_CHECK,
+        _DoctorCheck("bus", checks.reach_bus, _limit_of_switch, in_session=False),
         _DoctorCheck(
-            "agent", checks.find, lambda options: 5 * checks.LOOKS_WITHIN, in_session=False
+            "agent",
+            checks.find_agent,
+            lambda options: 5 * checks.AGENT_SEARCH_SECONDS,
+            in_session=False,
         ),
-        _DoctorCheck("session", checks.connect, _switch, in_session=False),
-        _DoctorCheck("reservation", checks.reserve, _once),
+        _DoctorCheck("session", checks.connect, _limit_of_switch, in_session=False),
+        _DoctorCheck("reservation", checks.reserve, _limit_of_one_step),
     )
-    return steps, checks.address_of(url)
+    return fleet_checks, checks.fleet_camera_address(url)
 
 
 _CHECKS = (
-    _DoctorCheck("status", state_checks.look_at_status, _requests),
+    _DoctorCheck("status", state_checks.look_at_status, _limit_of_requests),
     _DoctorCheck(
         "application",
         trigger_checks.look_at_application,
-        lambda options: _requests(options) + _switch(options),
+        lambda options: _limit_of_requests(options) + _limit_of_switch(options),
     ),
-    _DoctorCheck("round trip", state_checks.measure_round_trip, _requests),
+    _DoctorCheck("round trip", state_checks.measure_round_trip, _limit_of_requests),
     _DoctorCheck("run state", state_checks.watch, lambda options: options.seconds + 1.0),
     _DoctorCheck(
-        "trigger", trigger_checks.trigger, lambda options: options.count * options.step(5.0) + 1.0
+        "trigger",
+        trigger_checks.send_triggers,
+        lambda options: options.count * options.step_timeout(5.0) + 1.0,
     ),
-    _DoctorCheck("application", trigger_checks.give_back, _switch),
+    _DoctorCheck("application", trigger_checks.restore_application, _limit_of_switch),
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
-    _DoctorCheck("clock", state_checks.look_at_clock, _requests),
+    _DoctorCheck("clock", state_checks.look_at_clock, _limit_of_requests),
 )
-"""The checks in their order, after the checks of the wire or of the fleet. The limits only matter
-for an internal error, since each step has a bound of its own. Their sum, and a second for the end
-of the session, bounds the whole."""
+"""The checks in a session, in order; those of the wire or of the fleet come first. The limits only
+matter for an internal error, since each step has its own time limit. The whole examination takes at
+most the sum of all limits, and a second for the end of the session."""
 
 
 async def examine(
@@ -192,8 +200,8 @@ async def examine(
     """
     if application is not None:
         application = check_application(application, owner="doctor")
-    gige = _is_gige(url)
-    if gige and (trigger or application is not None or interpret_as is not None):
+    is_gige_camera = _is_gige(url)
+    if is_gige_camera and (trigger or application is not None or interpret_as is not None):
         raise ConfigurationError(
             "doctor: a GigE camera has no applications and no results: trigger, application and "
             "interpret_as are for smart cameras"
@@ -205,7 +213,7 @@ async def examine(
     trigger = check_flag(trigger, "trigger", "doctor")
     if trace is not None:
         check_callable(trace, "trace", "doctor")
-    if gige:
+    if is_gige_camera:
         with from_part("frames", "an examination of a GigE camera needs"):
             from smartcam.doctor._gige_checks import examine_gige
 
@@ -225,18 +233,22 @@ async def examine(
         seconds=seconds,
         count=count,
     )
-    fleet = is_fleet(url)
-    steps, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
+    in_fleet = is_fleet(url)
+    first_checks, address = (
+        _checks_of_fleet_camera(url) if in_fleet else (_WIRE_CHECKS, parse_address(url))
+    )
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # checks the options
-    alone = not fleet and serves_one(load_protocol(address.protocol))
-    yield SHARED if fleet else NOTICE if alone else SEVERAL
-    async with exam.stack, exam.borrowed:
-        for check in (*steps, *_CHECKS):
-            goes_on = await _run(check, exam)
-            for finding in exam.take():
+    is_exclusive = not in_fleet and may_serve_one_client(load_protocol(address.protocol))
+    yield (
+        SHARED_NOTICE if in_fleet else EXCLUSIVE_NOTICE if is_exclusive else SEVERAL_CLIENTS_NOTICE
+    )
+    async with exam.cleanup, exam.application_cleanup:
+        for check in (*first_checks, *_CHECKS):
+            continues = await _run(check, exam)
+            for finding in exam.take_findings():
                 yield finding
-            if not goes_on:
+            if not continues:
                 return
 
 
@@ -245,13 +257,13 @@ def _is_gige(url: object) -> bool:
 
 
 async def _run(check: _DoctorCheck, exam: Examination) -> bool:
-    """Run a check within its limit; return whether the next ones make sense."""
+    """Run a check within its limit; return whether to run the next one."""
     limit, exam.check = check.limit(exam.options), check.name
     try:
         async with asyncio.timeout(limit):
             await check.run(exam)
             if not check.in_session:
-                failed = any(finding.exit_code for finding in exam.pending)
+                failed = any(finding.exit_code for finding in exam.pending_findings)
                 return not failed or exam.camera is not None
             if not exam.connected_camera.connected and check.name != "clock":
                 await exam.connected_camera.query_application()  # raises the reason
@@ -265,7 +277,7 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         exam.fail(
             f"the camera did not get ready in time: {exc}",
             "Give it more time (--timeout), and see whether somebody works on its pages.",
-            exit_code=Exit.RAN_OUT,
+            exit_code=Exit.TIMED_OUT,
         )
     except SmartCamError as exc:
         refused = isinstance(exc, (CameraFaultError, CommandRejectedError, UnsupportedError))
@@ -276,7 +288,7 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
         exam.fail(
             f"this check did not end within {limit:g} s",
             "Try again; then please tell us, with --trace.",
-            exit_code=Exit.RAN_OUT,
+            exit_code=Exit.TIMED_OUT,
         )
     return exam.camera is not None and exam.camera.connected
 

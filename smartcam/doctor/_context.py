@@ -38,8 +38,8 @@ MAX_CONTAINERS = 32
 """Largest number of containers kept, for the comparison with the layout: 2 MB of the largest."""
 
 
-def called(application: int | None) -> str:
-    """Return the application's name for texts; some cameras have applications without ids."""
+def application_text(application: int | None) -> str:
+    """Return the application's name in texts; some cameras have applications without ids."""
     return (
         "the application"
         if application is None or application < 0
@@ -69,8 +69,8 @@ class DoctorOptions:
     seconds: float = 3.0
     count: int = 10
 
-    def step(self, default: float) -> float:
-        """Return the bound of a step, seconds."""
+    def step_timeout(self, default: float) -> float:
+        """Return the timeout of a step, in seconds."""
         return default if self.timeout is None else self.timeout
 
 
@@ -79,20 +79,20 @@ class Witness(Observer):
 
     Attributes:
         statuses: the last statuses, each different from the status before.
-        results: number of results since the arrivals were last forgotten.
-        arrivals: loop times at which the last results arrived, in seconds.
-        containers: the last results; each value is a :class:`Reading` if an interpreter was
+        result_count: number of results since ``forget_arrivals``.
+        arrival_times: loop times at which the last results arrived, in seconds.
+        last_results: the last results; each value is a :class:`Reading` if an interpreter was
             given.
-        unreadable: reason why the first result could not be given to an interpreter: an endian
+        read_error: reason why the first result could not be given to an interpreter: an endian
             field that is neither little nor big, or cells that do not fit the layout.
     """
 
     def __init__(self) -> None:
         self.statuses: deque[Status] = deque(maxlen=MAX_OBSERVED)
-        self.arrivals: deque[float] = deque(maxlen=MAX_OBSERVED)
-        self.containers: deque[Result] = deque(maxlen=MAX_CONTAINERS)
-        self.results: int = 0
-        self.unreadable: InterpretationError | None = None
+        self.arrival_times: deque[float] = deque(maxlen=MAX_OBSERVED)
+        self.last_results: deque[Result] = deque(maxlen=MAX_CONTAINERS)
+        self.result_count: int = 0
+        self.read_error: InterpretationError | None = None
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep a status."""
@@ -101,30 +101,30 @@ class Witness(Observer):
 
     def on_result(self, result: Result) -> None:
         """Keep a result."""
-        self._arrived()
-        self.containers.append(result)
+        self._count_arrival()
+        self.last_results.append(result)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep the reason why a result could not be given to an interpreter."""
         if isinstance(error, InterpretationError):
-            self._arrived()
-            self.unreadable = self.unreadable or error
+            self._count_arrival()
+            self.read_error = self.read_error or error
 
     def forget_arrivals(self) -> None:
         """Count results from 0 again."""
-        self.results = 0
-        self.arrivals.clear()
+        self.result_count = 0
+        self.arrival_times.clear()
 
-    def _arrived(self) -> None:
-        self.results += 1
-        self.arrivals.append(asyncio.get_running_loop().time())
+    def _count_arrival(self) -> None:
+        self.result_count += 1
+        self.arrival_times.append(asyncio.get_running_loop().time())
 
 
 class Diagnosis(NamedTuple, Generic[T]):
-    """One of several possible causes; the first that fits counts."""
+    """One of several possible causes; the first that fits is reported."""
 
-    fits: Callable[[T], bool]  # function that judges from observations whether it fits
-    text: str  # text with fields to fill in
+    fits: Callable[[T], bool]  # function that decides from observations whether it fits
+    text: str  # text of the finding, with fields to fill in
     cure: str  # text of the cure, also with fields
     exit_code: Exit = Exit.NO_SESSION  # exit code of the finding
 
@@ -148,11 +148,11 @@ class Reading(NamedTuple):
     error: InterpretationError | None  # reason why they do not fit, None if they do
 
 
-class Keeper(Interpreter):
-    """Interprets as another interpreter does, and returns a :class:`Reading` in any case.
+class ReadingInterpreter(Interpreter):
+    """Runs another interpreter and always returns a :class:`Reading`, even after an error.
 
-    The layout's sequence number is an ordinary field here: setting the number of the next run
-    would change the camera.
+    A sequence number in the layout is read as an ordinary field: a client would otherwise set the
+    camera's next number.
 
     Args:
         inner: the other interpreter.
@@ -179,21 +179,22 @@ class Keeper(Interpreter):
 class Examination:
     """A running examination."""
 
-    options: DoctorOptions  # options that the user gave
-    address: Address  # address of the camera, with the dialect once found
+    options: DoctorOptions  # options from the user
+    address: Address  # address of the camera; with the dialect once it is known
     trace: Callable[[TraceEntry], None] | None  # called with every frame
     witness: Witness  # observer of the camera's messages
-    stack: AsyncExitStack = field(default_factory=AsyncExitStack)  # steps to undo at the end
-    # the application that was loaded for the triggers, to be switched back
-    borrowed: AsyncExitStack = field(default_factory=AsyncExitStack)
+    # closes the session and the bus at the end
+    cleanup: AsyncExitStack = field(default_factory=AsyncExitStack)
+    # loads the application from before the triggers again
+    application_cleanup: AsyncExitStack = field(default_factory=AsyncExitStack)
     bus: Bus | None = None  # bus of a fleet; None before it answered
     camera: Camera | None = None  # the client, None before the session
-    connected_at: float = 0.0  # loop time of the session
+    connected_at: float = 0.0  # loop time at which the session began
     wants_trigger: bool = False  # whether triggers are still wanted
     may_trigger: bool = False  # whether the camera waits for triggers
     check: str = ""  # name of the check that runs
     # findings that were not handed out yet
-    pending: list[Finding] = field(default_factory=list[Finding])
+    pending_findings: list[Finding] = field(default_factory=list[Finding])
 
     def report(
         self,
@@ -206,7 +207,7 @@ class Examination:
         **details: Any,
     ) -> None:
         """Report a finding of the present check; arguments as ``Finding``."""
-        self.pending.append(
+        self.pending_findings.append(
             Finding(
                 check=check or self.check,
                 severity=severity,
@@ -223,9 +224,9 @@ class Examination:
         """Report an error."""
         self.report("error", text, cure, exit_code=exit_code, **details)
 
-    def take(self) -> list[Finding]:
+    def take_findings(self) -> list[Finding]:
         """Return the findings since the last call."""
-        taken, self.pending = self.pending, []
+        taken, self.pending_findings = self.pending_findings, []
         return taken
 
     @property
@@ -258,19 +259,19 @@ class Examination:
 
         Raises ConfigurationError: a timeout is not valid.
         """
-        chosen = self.options
+        exam_options = self.options
         options: CameraOptions = {
             "reconnect": None,
-            "connect_timeout": chosen.step(10.0),
-            "request_timeout": chosen.step(5.0),
-            "switch_timeout": chosen.step(10.0),
+            "connect_timeout": exam_options.step_timeout(10.0),
+            "request_timeout": exam_options.step_timeout(5.0),
+            "switch_timeout": exam_options.step_timeout(10.0),
         }
-        if chosen.y_down or not self.in_fleet:  # the agent may know the direction
-            options["y_down"] = chosen.y_down
-        if chosen.interpreter is not None:
-            options["interpret_as"] = Keeper(chosen.interpreter)
-        frames = [FrameObserver(self.trace)] if self.trace is not None else []
-        observers = [self.witness, *frames]
+        if exam_options.y_down or not self.in_fleet:  # the agent may know the direction
+            options["y_down"] = exam_options.y_down
+        if exam_options.interpreter is not None:
+            options["interpret_as"] = ReadingInterpreter(exam_options.interpreter)
+        frame_observers = [FrameObserver(self.trace)] if self.trace is not None else []
+        observers = [self.witness, *frame_observers]
         camera: Camera
         if self.in_fleet:
             camera = connect(self.address.url, observers=observers, **options)
@@ -278,7 +279,7 @@ class Examination:
             settings = CameraSettings.make(self.address.url, None, options)
             settings = replace(settings, address=self.address)
             camera = SmartCamera(settings, observers=observers)
-        self.stack.push_async_callback(camera.close)
+        self.cleanup.push_async_callback(camera.close)
         return camera
 
     @property

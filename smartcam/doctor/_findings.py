@@ -21,8 +21,8 @@ class Exit(enum.IntEnum):
     DONE = 0
     """Only hints and warnings, if any."""
     NO_SESSION = 3
-    """There is no session, or it broke."""
-    RAN_OUT = 4
+    """There is no session, or it was lost."""
+    TIMED_OUT = 4
     """A wait in a session timed out."""
     REFUSED = 5
     """The camera refused, is stopped, or has a System Error."""
@@ -65,7 +65,7 @@ def summary(findings: Iterable[Finding]) -> Finding:
     }
     ranks = [SEVERITIES.index(finding.severity) for finding in all_found]
     worst = all_found[ranks.index(max(ranks))] if all_found else None
-    words = [
+    count_texts = [
         f"{count} {name}{'s' if count > 1 else ''}"
         for name, count in reversed(counts.items())
         if count and name != "ok"
@@ -73,7 +73,7 @@ def summary(findings: Iterable[Finding]) -> Finding:
     return Finding(
         check="summary",
         severity=worst.severity if worst is not None else "ok",
-        text=", ".join(words) or "nothing is wrong",
+        text=", ".join(count_texts) or "nothing is wrong",
         details=counts,
         exit_code=worst.exit_code if worst is not None else Exit.DONE,
     )

@@ -32,22 +32,23 @@ if TYPE_CHECKING:
     from smartcam.fleet import FleetCamera
     from smartcam.settings import Address
 
-LOOKS_WITHIN = 1.0
-"""Seconds within which an agent that was just started, or has joined its router, appears."""
+AGENT_SEARCH_SECONDS = 1.0
+"""Seconds to wait for an agent that was just started or has just joined its router."""
 
-LOOK_AGAIN = 0.1
+AGENT_SEARCH_INTERVAL = 0.1
+"""Seconds between two searches for agents."""
 
 MAX_CAMERAS_LISTED = 20
 """Largest number of cameras that a finding names."""
 
-SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
-LISTENS = (
+SERVE_CURE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
+LISTEN_CURE = (
     "Without one it is tcp/127.0.0.1:7447, which only programs on the same computer reach; "
     "tls/0.0.0.0:7447 is for all that have a certificate."
 )
 
 
-def address_of(url: str) -> Address:
+def fleet_camera_address(url: str) -> Address:
     """Return the address of a camera of a fleet.
 
     Raises:
@@ -65,52 +66,55 @@ def address_of(url: str) -> Address:
 # ---------------------------------------------------------------------- the bus
 
 
-async def reach(exam: Examination) -> None:
+async def reach_bus(exam: Examination) -> None:
     """Check ``bus``: whether the port accepts a connection, and a bus answers there."""
-    address, limit = FleetAddress.parse(exam.address.url), exam.options.step(10.0)
-    place, cure = exam.host_and_port, SERVE.format(host=exam.address.host) + LISTENS
+    address, limit = FleetAddress.parse(exam.address.url), exam.options.step_timeout(10.0)
+    host_and_port, cure = (
+        exam.host_and_port,
+        SERVE_CURE.format(host=exam.address.host) + LISTEN_CURE,
+    )
     try:
         async with asyncio.timeout(limit):
             _, writer = await asyncio.open_connection(exam.address.host, exam.address.port)
     except TimeoutError:
         exam.fail(
-            f"nobody answers at {place} within {limit:g} s",
+            f"nobody answers at {host_and_port} within {limit:g} s",
             "Look at address, network, cable, power and firewall.",
         )
         return
     except OSError as exc:
-        why = os.strerror(exc.errno) if exc.errno else exc
-        exam.fail(f"nothing takes a connection at {place}: {why}", cure)
+        reason = os.strerror(exc.errno) if exc.errno else exc
+        exam.fail(f"nothing takes a connection at {host_and_port}: {reason}", cure)
         return
     writer.transport.abort()
-    if not await _certificates(exam, address):
+    if not await _check_certificates(exam, address):
         return
-    end = ZenohEnd(address.link)
+    bus = ZenohEnd(address.link)
     begin = asyncio.get_running_loop().time()
     try:
-        await end.open(limit)
+        await bus.open(limit)
     except ConnectFailedError as exc:
-        tls = address.scheme == "fleet+tls"
+        is_tls = address.scheme == "fleet+tls"
         exam.fail(
-            f"something listens at {place}, and it is no bus of a fleet: {exc.attempts[0]}",
+            f"something listens at {host_and_port}, and it is no bus of a fleet: {exc.attempts[0]}",
             "Look at the certificates: their authority, the host's name in the agent's, and "
             "whether this program's is one of its clients."
-            if tls
+            if is_tls
             else "Something else has this port, or it wants TLS (fleet+tls://). " + cure,
         )
         return
-    exam.stack.push_async_callback(end.close)
-    exam.bus = end
-    taken = 1e3 * (asyncio.get_running_loop().time() - begin)
+    exam.cleanup.push_async_callback(bus.close)
+    exam.bus = bus
+    milliseconds = 1e3 * (asyncio.get_running_loop().time() - begin)
     exam.report(
         "ok",
-        f"the bus at {place} answers, after {taken:.1f} ms",
+        f"the bus at {host_and_port} answers, after {milliseconds:.1f} ms",
         url=address._replace(camera="").url,
     )
 
 
-async def _certificates(exam: Examination, address: FleetAddress) -> bool:
-    """Check the certificates of both sides, if any; return whether they are good enough."""
+async def _check_certificates(exam: Examination, address: FleetAddress) -> bool:
+    """Check the certificates of both sides, if any; return True if they allow a connection."""
     if address.certificates is None:
         return True
     folder, loop = Path(address.certificates), asyncio.get_running_loop()
@@ -148,31 +152,36 @@ async def _certificates(exam: Examination, address: FleetAddress) -> bool:
 # ---------------------------------------------------------------------- the agent
 
 
-async def find(exam: Examination) -> None:
+async def find_agent(exam: Examination) -> None:
     """Check ``agent``: whether there is an agent that has the camera."""
     address = FleetAddress.parse(exam.address.url)
-    cameras = await _cameras(exam, address)
+    cameras = await _list_cameras(exam, address)
     agents = sorted({agent for _, agent, _ in cameras})
-    named = address.fleet
-    of = "" if named is None else f" of the fleet {named}"
+    fleet_name = address.fleet
+    fleet_text = "" if fleet_name is None else f" of the fleet {fleet_name}"
     if not cameras:
         exam.fail(
-            f"the bus answers, and no agent{of} is there",
+            f"the bus answers, and no agent{fleet_text} is there",
             "Something is a router there, and no smartcam serve has joined it. Is it running, and "
             "does the connect: of its fleet file name this router?"
-            + ("" if named is None else f" Is it of the fleet {named} (fleet: {named})?"),
+            + (
+                ""
+                if fleet_name is None
+                else f" Is it of the fleet {fleet_name} (fleet: {fleet_name})?"
+            ),
         )
         return
-    sharing = [(fleet, agent) for fleet, agent, name in cameras if name == address.camera]
-    fleets = sorted({fleet for fleet, _ in sharing})
+    agents_of_camera = [(fleet, agent) for fleet, agent, name in cameras if name == address.camera]
+    fleets = sorted({fleet for fleet, _ in agents_of_camera})
     details: dict[str, Any] = {"agents": agents, "cameras": len({camera[2] for camera in cameras})}
-    if not sharing:
+    if not agents_of_camera:
         names = sorted({name for _, _, name in cameras})
         listed = ", ".join(names[:MAX_CAMERAS_LISTED]) + (
             " ..." if len(names) > MAX_CAMERAS_LISTED else ""
         )
+        suggestion = did_you_mean(address.camera, names)
         exam.fail(
-            f"no agent{of} has a camera {address.camera}{did_you_mean(address.camera, names)}",
+            f"no agent{fleet_text} has a camera {address.camera}{suggestion}",
             f"Agents there: {', '.join(agents)}. Their cameras: {listed}.",
             **details,
         )
@@ -183,7 +192,7 @@ async def find(exam: Examination) -> None:
             **details,
         )
     else:
-        names = [agent for _, agent in sharing]
+        names = [agent for _, agent in agents_of_camera]
         several = len(names) > 1
         exam.report(
             "hint" if several else "ok",
@@ -194,21 +203,21 @@ async def find(exam: Examination) -> None:
         )
 
 
-async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
-    """Return fleet, agent and name of all cameras, including cameras that have just appeared."""
+async def _list_cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
+    """Return fleet, agent and name of all cameras; wait a while for the wanted one."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
         raise LookupError("there is no bus; checks that use it run after the check that reaches it")
-    end = loop.time() + LOOKS_WITHIN
+    deadline = loop.time() + AGENT_SEARCH_SECONDS
     pattern = Keys(address.fleet or "*").camera("*", "**")
     while True:
         cameras: list[tuple[str, str, str]] = []
-        for key in await bus.present(pattern, max(LOOK_AGAIN, end - loop.time())):
+        for key in await bus.present(pattern, max(AGENT_SEARCH_INTERVAL, deadline - loop.time())):
             _, fleet, _, _, agent, *chunks = key.split("/")
             cameras.append((fleet, agent, "/".join(chunks)))
-        if loop.time() > end or any(name == address.camera for *_, name in cameras):
+        if loop.time() > deadline or any(name == address.camera for *_, name in cameras):
             return sorted(cameras)
-        await asyncio.sleep(LOOK_AGAIN)
+        await asyncio.sleep(AGENT_SEARCH_INTERVAL)
 
 
 # ---------------------------------------------------------------------- the session
@@ -221,12 +230,12 @@ async def connect(exam: Examination) -> None:
     try:
         await camera.open()
     except ConnectFailedError as exc:
-        lost = isinstance(exc.__cause__, ConnectionLostError)
+        has_lost_camera = isinstance(exc.__cause__, ConnectionLostError)
         exam.fail(
             exc.attempts[0],
             "Ask the doctor about the camera's own address, on the agent's host: the url: of its "
             "fleet file, which smartcam serve --json prints, too."
-            if lost
+            if has_lost_camera
             else "The agent is there and does not answer: is it stopped, or so busy? Restart it.",
         )
         return
@@ -240,18 +249,18 @@ async def connect(exam: Examination) -> None:
 
 
 async def reserve(exam: Examination) -> None:
-    """Check ``reservation``: triggers need a camera that only this program uses."""
+    """Check ``reservation``: reserve the camera, since triggers need one that nobody else uses."""
     if not exam.wants_trigger:
         return
-    exam.wants_trigger = False  # until it is reserved
-    camera, limit = cast("FleetCamera[Any]", exam.connected_camera), exam.options.step(10.0)
+    exam.wants_trigger = False  # until the camera is reserved
+    camera, limit = cast("FleetCamera[Any]", exam.connected_camera), exam.options.step_timeout(10.0)
     try:
-        await exam.stack.enter_async_context(camera.reserve(limit))
+        await exam.cleanup.enter_async_context(camera.reserve(limit))
     except ResponseTimeoutError as exc:
         exam.fail(
             f"no triggers are sent: {exc}",
             "Wait for the program that has it, or leave out --trigger.",
-            exit_code=Exit.RAN_OUT,
+            exit_code=Exit.TIMED_OUT,
         )
         return
     except NotAllowedError as exc:
@@ -273,7 +282,7 @@ def explain_loss(exam: Examination, error: SmartCamError) -> None:
         f"the session ended after {age:.1f} s: {error}",
         "Look at the agent: does smartcam serve still run, what does it say? And ask the doctor "
         "about the camera's own address, on the agent's host.",
-        exit_code=Exit.RAN_OUT if isinstance(error, ResponseTimeoutError) else Exit.NO_SESSION,
+        exit_code=Exit.TIMED_OUT if isinstance(error, ResponseTimeoutError) else Exit.NO_SESSION,
         after=age,
         error=str(error),
     )

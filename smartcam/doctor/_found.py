@@ -14,7 +14,7 @@ from smartcam.registry import PROTOCOLS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.doctor._opening import Opened
+    from smartcam.doctor._opening import OpenedPort
     from smartcam.doctor._probing import CameraAnswer
 
 Evidence = Literal["greeted", "silent", "said", "ended", "other"]
@@ -58,7 +58,7 @@ class FoundPort:
             return (self.answer.url,)
         host = f"[{self.host}]" if ":" in self.host else self.host
         known = tcp_protocols()
-        return tuple(f"{_scheme(known[name])}://{host}:{self.port}" for name in self.protocols)
+        return tuple(f"{_tcp_scheme(known[name])}://{host}:{self.port}" for name in self.protocols)
 
     @property
     def greeting(self) -> str:
@@ -89,10 +89,10 @@ def tcp_protocols() -> dict[str, Protocol]:
     return protocols
 
 
-def ports_of(
-    further: Iterable[int], names: Iterable[str] | None
+def choose_ports(
+    more_ports: Iterable[int], names: Iterable[str] | None
 ) -> dict[int, tuple[Protocol, ...]]:
-    """Return the ports to open, and the protocols that may be spoken there.
+    """Return the ports to open, and for each the protocols that it may use.
 
     Raises:
         ConfigurationError: a name is no protocol over TCP, or a number is no port.
@@ -100,8 +100,8 @@ def ports_of(
     known = tcp_protocols()
     chosen = [*known]
     if names is not None:
-        given = check_all(names, "protocols", "names of protocols", "find")
-        chosen = [*dict.fromkeys(check_text(name, "protocol", "find") for name in given)]
+        given_names = check_all(names, "protocols", "names of protocols", "find")
+        chosen = [*dict.fromkeys(check_text(name, "protocol", "find") for name in given_names)]
     for name in chosen:
         if name not in known:
             raise ConfigurationError(
@@ -114,31 +114,31 @@ def ports_of(
     for name in chosen:
         port = known[name].default_port
         by_port[port] = (*by_port.get(port, ()), known[name])
-    for number in check_all(further, "ports", "numbers of ports", "find"):
+    for number in check_all(more_ports, "ports", "numbers of ports", "find"):
         port = check_integer(number, "port", 1, 0xFFFF, "find")
-        here = by_port.get(port, ())
+        port_protocols = by_port.get(port, ())
         by_port[port] = (
-            *here,
-            *(known[name] for name in chosen if known[name] not in here),
+            *port_protocols,
+            *(known[name] for name in chosen if known[name] not in port_protocols),
         )
     if len(by_port) > MAX_PORTS:
         raise ConfigurationError(f"find: {len(by_port)} ports: expected {MAX_PORTS} at most")
     return by_port
 
 
-def serves_one(protocol: Protocol) -> bool:
-    """Return True if cameras of a protocol may serve only one client."""
+def may_serve_one_client(protocol: Protocol) -> bool:
+    """Return True if some cameras of a protocol serve only one client."""
     return any(dialect.exclusive for dialect in protocol.dialects.values())
 
 
-def _scheme(protocol: Protocol) -> str:
-    return next(name for name, kind in protocol.schemes.items() if kind is Transport.TCP)
+def _tcp_scheme(protocol: Protocol) -> str:
+    return next(name for name, transport in protocol.schemes.items() if transport is Transport.TCP)
 
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
     """Raise ConfigurationError if asking at these ports may take a camera from its client."""
-    known = [protocol for several in ports.values() for protocol in several]
-    names = sorted({protocol.name for protocol in known if serves_one(protocol)})
+    protocols = [protocol for port_protocols in ports.values() for protocol in port_protocols]
+    names = sorted({protocol.name for protocol in protocols if may_serve_one_client(protocol)})
     if names:
         raise ConfigurationError(
             f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
@@ -151,11 +151,17 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 # ---------------------------------------------------------------------- received bytes
 
 
-def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
-    """Return an open port with the protocols that fit the received bytes."""
+def describe_port(
+    host: str, port: int, opened: OpenedPort, protocols: tuple[Protocol, ...]
+) -> FoundPort:
+    """Return the description of an open port: the protocols that fit the received bytes."""
     received = opened.received.lstrip()
-    greeted = [each for each in protocols if each.greeting and received.startswith(each.greeting)]
-    possible = greeted or [each for each in protocols if _may_be(each, opened)]
+    greeted = [
+        protocol
+        for protocol in protocols
+        if protocol.greeting and received.startswith(protocol.greeting)
+    ]
+    possible = greeted or [protocol for protocol in protocols if _may_use(protocol, opened)]
     evidence: Evidence = "silent"
     if greeted:
         evidence = "greeted"
@@ -163,7 +169,7 @@ def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, 
         evidence = "other"
     elif opened.received:
         evidence = "said"
-    elif opened.ended:
+    elif opened.is_closed:
         evidence = "ended"
     return FoundPort(
         host=host,
@@ -175,12 +181,12 @@ def found_port(host: str, port: int, opened: Opened, protocols: tuple[Protocol, 
     )
 
 
-def _may_be(protocol: Protocol, opened: Opened) -> bool:
-    """Return True if a camera of the protocol may behave like this without a greeting."""
+def _may_use(protocol: Protocol, opened: OpenedPort) -> bool:
+    """Return True if a camera of the protocol may behave like this port, which sent no greeting."""
     if opened.received:
         return protocol.greeting is None
     # a device that closes silently may serve as many clients as it accepts
-    return opened.ended or not protocol.greeting
+    return opened.is_closed or not protocol.greeting
 
 
 def is_decided(received: bytes, protocols: tuple[Protocol, ...]) -> bool:

@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from smartcam.frames._inside import GenicamFeatures, GigEDriver, PacketCounts
 
 PACKET_OVERHEAD_BYTES: Final = 36 + 38
-"""Bytes of a stream's packet beside pixels: IP, UDP and GVSP, and the Ethernet frame."""
+"""Bytes of a stream's packet besides the pixels: IP, UDP, GVSP and the Ethernet frame."""
 
 STANDARD_MTU: Final = 1500
 JUMBO_MTU: Final = 9000
 
 MAX_LINK_LOAD: Final = 0.9
-"""Part of a link's speed above which a stream, or a switch between, loses packets."""
+"""Part of a link's speed above which a stream loses packets, here or in a switch."""
 
 SMALL_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer below which a busy machine loses packets of a large picture."""
@@ -46,7 +46,7 @@ SPEED_UNKNOWN: Final = 0.0
 
 _SIOCGIFADDR: Final = 0x8915  # linux/sockios.h
 
-FRAMES_NOT_SHOWN: Final = "smartcam frames measure shows the same for as long as you like."
+MEASURE_HINT: Final = "smartcam frames measure shows the same for as long as you like."
 
 
 class _ExaminationOverError(Exception):
@@ -66,10 +66,10 @@ class _GigEExamination:
     port: int = 0
     label: str = ""
     path_mtu: int = STANDARD_MTU
-    local: str = ""
-    payload: int = 0
-    rate: float | None = None
-    camera_link: float = SPEED_UNKNOWN  # bits per second
+    local_address: str = ""
+    payload_bytes: int = 0
+    frame_rate: float | None = None
+    camera_link_speed: float = SPEED_UNKNOWN  # bits per second
 
     def add(
         self,
@@ -120,24 +120,24 @@ async def examine_gige(
     checks: tuple[tuple[str, Callable[[_GigEExamination], Awaitable[None]]], ...] = (
         ("address", _find_address),
         ("subnet", _look_at_networks),
-        ("answers", _ask),
+        ("answers", _ask_camera),
         ("control", _look_at_control),
-        ("features", _read_features),
-        ("stream", _stream),
+        ("features", _check_link),
+        ("stream", _check_stream),
     )
     for exam.check, check in checks:
-        over = False
+        is_over = False
         try:
             await check(exam)
         except _ExaminationOverError:
-            over = True
+            is_over = True
         except FrameSourceError as exc:
             exam.fail(f"this check failed: {exc}", "", Exit.NO_SESSION)
-            over = True
+            is_over = True
         findings, exam.findings = exam.findings, []
         for finding in findings:
             yield finding
-        if over:
+        if is_over:
             return
 
 
@@ -145,7 +145,7 @@ async def examine_gige(
 
 
 async def _find_address(exam: _GigEExamination) -> None:
-    """Find the address that the URL means."""
+    """Check ``address``: find the address that the URL means."""
     try:
         host, exam.port = await places.place(exam.address, places.wanted(exam.address))
         addresses = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
@@ -164,37 +164,41 @@ async def _find_address(exam: _GigEExamination) -> None:
 
 
 async def _look_at_networks(exam: _GigEExamination) -> None:
-    """Check whether the camera's address is in one of this machine's networks."""
+    """Check ``subnet``: whether the camera's address is in one of this machine's networks."""
     networks = [network for network in discovery.networks() if network.network is not None]
     if not networks:
         exam.add("hint", "the networks of this machine cannot be listed here")
         return
     host = ipaddress.IPv4Address(exam.host)
-    around = [each for each in networks if each.network is not None and host in each.network]
-    named = ", ".join(f"{network.address} in {network.network}" for network in networks)
-    if not around:
+    networks_of_camera = [
+        network for network in networks if network.network is not None and host in network.network
+    ]
+    networks_text = ", ".join(f"{network.address} in {network.network}" for network in networks)
+    if not networks_of_camera:
         exam.add(
             "warning",
-            f"{exam.host} is of another subnet than this machine, which is {named}",
+            f"{exam.host} is of another subnet than this machine, which is {networks_text}",
             f"Give the camera an address of a network here, or this machine one of {exam.host}'s: "
             "by the maker's tool (ForceIP), or by ip address add. Through a router a camera is not "
             "found by a search, and its stream rarely comes.",
             details={"networks": [str(network.network) for network in networks]},
         )
-    elif len(around) > 1:
+    elif len(networks_of_camera) > 1:
         exam.add(
             "warning",
-            f"{exam.host} is of {len(around)} networks of this machine: "
-            f"{', '.join(f'{network.address} in {network.network}' for network in around)}",
+            f"{exam.host} is of {len(networks_of_camera)} networks of this machine: "
+            + ", ".join(
+                f"{network.address} in {network.network}" for network in networks_of_camera
+            ),
             "Give the two interfaces different subnets: the system sends by one of them, which may "
             "be the wrong one.",
         )
     else:
-        exam.add("ok", f"{exam.host} is of the same subnet: {around[0].network}")
+        exam.add("ok", f"{exam.host} is of the same subnet: {networks_of_camera[0].network}")
 
 
-async def _ask(exam: _GigEExamination) -> None:
-    """Ask the camera for a value that every program may read."""
+async def _ask_camera(exam: _GigEExamination) -> None:
+    """Check ``answers``: read a register that every program may read."""
     try:
         control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
     except FrameSourceError as exc:
@@ -204,55 +208,59 @@ async def _ask(exam: _GigEExamination) -> None:
             "machine's.",
         ) from exc
     try:
-        exam.local, exam.path_mtu = control.local_address, control.path_mtu
-        began = time.monotonic()
+        exam.local_address, exam.path_mtu = control.local_address, control.path_mtu
+        start = time.monotonic()
         try:
-            taken = await control.read_register(Register.CONTROL_PRIVILEGE)
+            privilege = await control.read_register(Register.CONTROL_PRIVILEGE)
         except FrameSourceError as exc:
             raise await _no_answer_error(exam, exc) from exc
-        took = time.monotonic() - began
-        other = await _register_or_0(control, Register.PRIMARY_APPLICATION_ADDRESS)
+        round_trip = time.monotonic() - start
+        owner_address = await _register_or_0(control, Register.PRIMARY_APPLICATION_ADDRESS)
     finally:
         control.close()
-    exam.add("ok", f"it answers, after {took * 1e3:.1f} ms", details={"round_trip": took})
+    exam.add(
+        "ok", f"it answers, after {round_trip * 1e3:.1f} ms", details={"round_trip": round_trip}
+    )
     exam.check = "control"
-    if taken:
-        where = f" at {ipaddress.IPv4Address(other)}" if other else ""
-        is_own = other and str(ipaddress.IPv4Address(other)) in {
+    if privilege:
+        owner_text = f" at {ipaddress.IPv4Address(owner_address)}" if owner_address else ""
+        is_on_this_machine = owner_address and str(ipaddress.IPv4Address(owner_address)) in {
             network.address for network in discovery.networks()
         }
         raise exam.fail(
-            f"another application{where} controls it{', on this machine' if is_own else ''}: "
-            "one at a time can",
+            f"another application{owner_text} controls it"
+            f"{', on this machine' if is_on_this_machine else ''}: one at a time can",
             "Close the other program: a viewer of the maker, a process of yours that is left over, "
             "an agent. One that was killed loses the camera after its heartbeat's time, some "
             "seconds; while a debugger holds a program, that time can be minutes.",
-            details={"controlled_by": where.removeprefix(" at ")},
+            details={"controlled_by": owner_text.removeprefix(" at ")},
         )
 
 
 async def _no_answer_error(
     exam: _GigEExamination, error: FrameSourceError
 ) -> _ExaminationOverError:
-    """Report why nothing answered, as far as possible."""
-    others = await discovery.find(discovery.networks())
-    at = [camera for camera in others if exam.host in (camera.address, camera.info.address)]
-    listed = ", ".join(f"gige://{camera.address} {camera.info.label}" for camera in others)
+    """Return the error that nothing answered, with the cause if it can be found."""
+    cameras = await discovery.find(discovery.networks())
+    cameras_there = [
+        camera for camera in cameras if exam.host in (camera.address, camera.info.address)
+    ]
+    cameras_text = ", ".join(f"gige://{camera.address} {camera.info.label}" for camera in cameras)
     if "refused" in str(error).lower():
         return exam.fail(
             f"{exam.host} is there, and nothing listens at UDP port {exam.port}: it is no GigE "
             "Vision camera, or its service is down",
-            f"Found on this machine's networks: {listed}."
-            if listed
+            f"Found on this machine's networks: {cameras_text}."
+            if cameras_text
             else "See whether the address is the camera's, and switch it off and on.",
         )
-    if at:
+    if cameras_there:
         return exam.fail(
             f"it answers a search, and not a question to {exam.host} itself"
             + (
                 ""
-                if at[0].reachable
-                else f": its address {at[0].info.address} is of another subnet"
+                if cameras_there[0].reachable
+                else f": its address {cameras_there[0].info.address} is of another subnet"
             ),
             "Give it an address of this subnet (ForceIP), or let UDP port 3956 through the "
             "firewall in both directions.",
@@ -260,12 +268,12 @@ async def _no_answer_error(
     return exam.fail(
         f"nothing answers at {exam.host}, UDP port {exam.port}: {error}",
         (
-            f"Cameras that answer a search: {listed}. Is it one of these?"
-            if listed
+            f"Cameras that answer a search: {cameras_text}. Is it one of these?"
+            if cameras_text
             else "See to its power, cable and address (ping), then to a firewall, which must let "
             "UDP port 3956 through: nothing answered a search either."
         ),
-        details={"others": [camera.address for camera in others]},
+        details={"others": [camera.address for camera in cameras]},
     )
 
 
@@ -276,17 +284,17 @@ async def _register_or_0(control: ControlChannel, address: int) -> int:
 
 
 async def _look_at_control(exam: _GigEExamination) -> None:
-    """Take control, which was free a moment ago, and read the camera's description."""
-    async with _session(exam) as features:
+    """Check ``control``: take control of the camera and read its features."""
+    async with _FeatureSession(exam) as features:
         exam.add("ok", f"{exam.label}: no program controlled it, and this one may")
-        exam.payload = int(await _number(features, "PayloadSize") or 0)
-        exam.rate = await _number(
+        exam.payload_bytes = int(await _read_number(features, "PayloadSize") or 0)
+        exam.frame_rate = await _read_number(
             features, "AcquisitionResultingFrameRate", "ResultingFrameRate", "AcquisitionFrameRate"
         )
-        bytes_a_second = await _number(features, "DeviceLinkSpeed")
-        megabits = await _number(features, "GevLinkSpeed")
-        exam.camera_link = (bytes_a_second or 0) * 8 or (megabits or 0) * 1e6
-        mode = await _text(features, "AcquisitionMode")
+        bytes_a_second = await _read_number(features, "DeviceLinkSpeed")
+        megabits = await _read_number(features, "GevLinkSpeed")
+        exam.camera_link_speed = (bytes_a_second or 0) * 8 or (megabits or 0) * 1e6
+        mode = await _read_text(features, "AcquisitionMode")
     exam.check = "features"
     if mode not in ("", "Continuous"):
         exam.add(
@@ -297,8 +305,8 @@ async def _look_at_control(exam: _GigEExamination) -> None:
         )
 
 
-class _session:  # noqa: N801 - used as a function
-    """Features of the camera while this program controls it."""
+class _FeatureSession:
+    """A context that takes control of the camera and gives its features."""
 
     def __init__(self, exam: _GigEExamination) -> None:
         self._exam = exam
@@ -315,8 +323,8 @@ class _session:  # noqa: N801 - used as a function
             await self._session.close()
 
 
-async def _number(features: GenicamFeatures, *names: str) -> float | None:
-    """Return the first of several features that the camera has, as a number."""
+async def _read_number(features: GenicamFeatures, *names: str) -> float | None:
+    """Return the first feature of these names that the camera has, as a number."""
     for name in names:
         if name in features:
             with contextlib.suppress(FrameSourceError):
@@ -326,51 +334,51 @@ async def _number(features: GenicamFeatures, *names: str) -> float | None:
     return None
 
 
-async def _text(features: GenicamFeatures, name: str) -> str:
+async def _read_text(features: GenicamFeatures, name: str) -> str:
     if name in features:
         with contextlib.suppress(FrameSourceError):
             return str(await features.get(name))
     return ""
 
 
-async def _read_features(exam: _GigEExamination) -> None:
-    """Check this side: the MTU, the link, the buffer."""
+async def _check_link(exam: _GigEExamination) -> None:
+    """Check ``link`` and ``buffer``: the link's speed, and this machine's receive buffer."""
     exam.check = "link"
-    link = _link_speed(exam.local)
-    known = [speed for speed in (link, exam.camera_link) if speed]
-    if exam.payload and exam.rate and known:
-        _look_at_bandwidth(exam, min(known))
-    elif known:
-        exam.add("ok", f"the link has {min(known) / 1e6:,.0f} Mbit/s")
+    own_speed = _link_speed(exam.local_address)
+    known_speeds = [speed for speed in (own_speed, exam.camera_link_speed) if speed]
+    if exam.payload_bytes and exam.frame_rate and known_speeds:
+        _look_at_bandwidth(exam, min(known_speeds))
+    elif known_speeds:
+        exam.add("ok", f"the link has {min(known_speeds) / 1e6:,.0f} Mbit/s")
     exam.check = "buffer"
-    most = _most_buffer()
-    if most is not None and most < SMALL_BUFFER_BYTES:
+    max_buffer = _max_receive_buffer()
+    if max_buffer is not None and max_buffer < SMALL_BUFFER_BYTES:
         exam.add(
             "hint",
-            f"a program may have {most:,} bytes of receive buffer, which a busy machine fills "
-            "before it reads: then packets are lost",
+            f"a program may have {max_buffer:,} bytes of receive buffer, which a busy machine "
+            "fills before it reads: then packets are lost",
             "sysctl net.core.rmem_max=8388608",
-            details={"rmem_max": most},
+            details={"rmem_max": max_buffer},
         )
 
 
 def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
-    packet = min(exam.path_mtu, JUMBO_MTU)
-    share = 1 + PACKET_OVERHEAD_BYTES / max(1, packet - 36)
-    needed = exam.payload * 8 * (exam.rate or 0.0) * share
+    packet_bytes = min(exam.path_mtu, JUMBO_MTU)
+    overhead_factor = 1 + PACKET_OVERHEAD_BYTES / max(1, packet_bytes - 36)
+    needed = exam.payload_bytes * 8 * (exam.frame_rate or 0.0) * overhead_factor
     text = (
-        f"{exam.payload:,} bytes a picture, {exam.rate:.4g} a second: {needed / 1e6:,.0f} Mbit/s "
-        f"of a link of {link / 1e6:,.0f}"
+        f"{exam.payload_bytes:,} bytes a picture, {exam.frame_rate:.4g} a second: "
+        f"{needed / 1e6:,.0f} Mbit/s of a link of {link / 1e6:,.0f}"
     )
     details = {"needed": needed, "link": link}
     if needed > MAX_LINK_LOAD * link:
-        most = MAX_LINK_LOAD * link / (exam.payload * 8 * share)
+        max_rate = MAX_LINK_LOAD * link / (exam.payload_bytes * 8 * overhead_factor)
         exam.add(
             "error",
             f"{text}: it does not fit",
-            f"Ask for less: ?fps={most:.3g} or lower, a smaller ?size=, or a format of fewer bits. "
-            "See whether the cable or a switch made the link slow. Several cameras on one link "
-            "share it.",
+            f"Ask for less: ?fps={max_rate:.3g} or lower, a smaller ?size=, or a format of fewer "
+            "bits. See whether the cable or a switch made the link slow. Several cameras on one "
+            "link share it.",
             Exit.REFUSED,
             details=details,
         )
@@ -378,25 +386,25 @@ def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
         exam.add("ok", text, details=details)
 
 
-def _link_speed(local: str) -> float:
-    """Return the speed of the interface with an address, bits per second; 0: not known."""
+def _link_speed(local_address: str) -> float:
+    """Return the speed of the interface with an address, bits per second; 0 if it is not known."""
     if sys.platform != "linux":
         return SPEED_UNKNOWN
     import fcntl
 
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         for _, name in socket.if_nameindex():
             with contextlib.suppress(OSError, ValueError):
                 request = struct.pack("256s", name.encode()[:15])
-                answer = fcntl.ioctl(asking.fileno(), _SIOCGIFADDR, request)
-                if socket.inet_ntoa(answer[20:24]) == local:
+                answer = fcntl.ioctl(sock.fileno(), _SIOCGIFADDR, request)
+                if socket.inet_ntoa(answer[20:24]) == local_address:
                     megabits = int(Path(f"/sys/class/net/{name}/speed").read_text())
                     return max(0, megabits) * 1e6
     return SPEED_UNKNOWN
 
 
-def _most_buffer() -> int | None:
-    """Return the largest receive buffer that a program gets, bytes; None: not known."""
+def _max_receive_buffer() -> int | None:
+    """Return the largest receive buffer that a program gets, in bytes; None if it is not known."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text())
     except (OSError, ValueError):
@@ -407,8 +415,8 @@ def _most_buffer() -> int | None:
 
 
 @dataclass(slots=True)
-class _StreamSeen:
-    """Frames and packets of the stream that arrived.
+class _StreamObservation:
+    """The frames and packets of a stream that arrived while it was watched.
 
     Attributes:
         frames: number of frames that came.
@@ -423,27 +431,32 @@ class _StreamSeen:
     seconds: float
 
 
-async def _stream(exam: _GigEExamination) -> None:
-    """Make the camera stream by the URL's options, and count frames and packets."""
+async def _check_stream(exam: _GigEExamination) -> None:
+    """Check ``stream``: let the camera stream by the URL's options; count frames and packets."""
     try:
-        seen = await _watch(exam)
+        stream = await _observe_stream(exam)
     except FrameTimeoutError as exc:
-        raise exam.fail(str(exc), "", Exit.RAN_OUT) from exc
+        raise exam.fail(str(exc), "", Exit.TIMED_OUT) from exc
     except FrameFormatError as exc:
         raise exam.fail(f"the stream: {exc}", "", Exit.REFUSED) from exc
-    _look_at_packets(exam, seen)
+    _look_at_packets(exam, stream)
     exam.check = "stream"
-    if not seen.frames:
-        await _explain_silence(exam, seen)
+    if not stream.frames:
+        await _explain_silence(exam, stream)
         return
-    counts = seen.counts
-    lost, again = (0, 0) if counts is None else (counts.lost, counts.requested)
-    details = {"frames": seen.frames, "lost": lost, "requested": again, "seconds": seen.seconds}
-    text = f"{seen.frames} pictures in {seen.seconds:.1f} s"
-    if lost or again:
+    counts = stream.counts
+    lost, requested = (0, 0) if counts is None else (counts.lost, counts.requested)
+    details = {
+        "frames": stream.frames,
+        "lost": lost,
+        "requested": requested,
+        "seconds": stream.seconds,
+    }
+    text = f"{stream.frames} pictures in {stream.seconds:.1f} s"
+    if lost or requested:
         exam.add(
             "warning" if lost else "hint",
-            f"{text}; {lost} more lost for missing packets, {again} packets asked for again",
+            f"{text}; {lost} more lost for missing packets, {requested} packets asked for again",
             "Make room for the packets: large ones (an MTU of 9000 on each side and switch), "
             "net.core.rmem_max=8388608 against a machine that reads late, "
             "?feature.GevSCPD=1000 (a pause between packets) or fewer pictures against a link that "
@@ -452,24 +465,25 @@ async def _stream(exam: _GigEExamination) -> None:
         )
     else:
         exam.add("ok", f"{text}, none lost, no packet asked for again", details=details)
-    longest = 1 / exam.rate if exam.rate else 0.0
-    if longest > exam.timeout:
+    picture_interval = 1 / exam.frame_rate if exam.frame_rate else 0.0
+    if picture_interval > exam.timeout:
         exam.add(
             "warning",
-            f"a picture comes each {longest:.3g} s, and a source waits {exam.timeout:g} s for one",
-            f"Wait longer: open(url, timeout={2 * longest:.3g}, stall=None).",
+            f"a picture comes each {picture_interval:.3g} s, and a source waits "
+            f"{exam.timeout:g} s for one",
+            f"Wait longer: open(url, timeout={2 * picture_interval:.3g}, stall=None).",
         )
 
 
-async def _watch(exam: _GigEExamination) -> _StreamSeen:
+async def _observe_stream(exam: _GigEExamination) -> _StreamObservation:
     frames = 0
     source = open_frames(exam.address.url, timeout=None, stall=None)
     async with source:
         driver = cast("GigEDriver", source.driver)
         rates = source.format.rates
-        exam.rate = rates[0] if rates else exam.rate
+        exam.frame_rate = rates[0] if rates else exam.frame_rate
         loop = asyncio.get_running_loop()
-        began = loop.time()
+        start = loop.time()
         async with source.reader() as reader:
             try:
                 async with asyncio.timeout(exam.seconds):
@@ -481,9 +495,9 @@ async def _watch(exam: _GigEExamination) -> _StreamSeen:
                 pass
             else:
                 raise FrameSourceError("it ended by itself", source=exam.label)
-            counts, seconds = driver.counts, loop.time() - began
-            size = await _packet_size(exam)
-    return _StreamSeen(frames, counts, size, seconds)
+            counts, seconds = driver.counts, loop.time() - start
+            packet_size = await _packet_size(exam)
+    return _StreamObservation(frames, counts, packet_size, seconds)
 
 
 async def _packet_size(exam: _GigEExamination) -> int:
@@ -495,10 +509,10 @@ async def _packet_size(exam: _GigEExamination) -> int:
         control.close()
 
 
-def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
-    exam.check, size = "packet size", seen.packet_size
+def _look_at_packets(exam: _GigEExamination, stream: _StreamObservation) -> None:
+    exam.check, size = "packet size", stream.packet_size
     details = {"packet_size": size, "mtu": exam.path_mtu}
-    if size > exam.path_mtu and seen.frames:
+    if size > exam.path_mtu and stream.frames:
         exam.add(
             "warning",
             f"packets of {size} bytes come in pieces, since this machine's side takes "
@@ -536,10 +550,10 @@ def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
         exam.add("ok", f"packets have {size} bytes, the MTU is {exam.path_mtu}", details=details)
 
 
-async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
+async def _explain_silence(exam: _GigEExamination, stream: _StreamObservation) -> None:
     """Report why no picture came."""
-    waiting = await _waiting_triggers(exam)
-    counts = seen.counts
+    triggers = await _waiting_triggers(exam)
+    counts = stream.counts
     if counts is not None and (counts.lost or counts.requested or counts.malformed):
         exam.add(
             "error",
@@ -547,56 +561,57 @@ async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
             f"{counts.requested} packets asked for again, {counts.malformed} malformed",
             "The link or a switch drops many of them: see the findings above on packet size and "
             "bandwidth, and try ?size=320x240&fps=1.",
-            Exit.RAN_OUT,
+            Exit.TIMED_OUT,
             details={"lost": counts.lost, "requested": counts.requested},
         )
-    elif waiting:
+    elif triggers:
         exam.check = "trigger"
         exam.add(
             "error",
-            f"TriggerMode is On ({waiting}), and no trigger came in {seen.seconds:.1f} s: the "
+            f"TriggerMode is On ({triggers}), and no trigger came in {stream.seconds:.1f} s: the "
             "camera waits",
             "Trigger it, or have it run by itself: ?feature.TriggerMode=Off. Of a line see to its "
             "wiring, TriggerActivation and the level that the input wants.",
-            Exit.RAN_OUT,
-            details={"trigger": waiting},
+            Exit.TIMED_OUT,
+            details={"trigger": triggers},
         )
-    elif exam.rate and 1 / exam.rate > seen.seconds:
+    elif exam.frame_rate and 1 / exam.frame_rate > stream.seconds:
         exam.add(
             "warning",
-            f"no picture came in {seen.seconds:.1f} s; one is due each {1 / exam.rate:.3g} s",
-            f"Watch for longer: --seconds {3 / exam.rate:.3g}.",
+            f"no picture came in {stream.seconds:.1f} s; one is due each "
+            f"{1 / exam.frame_rate:.3g} s",
+            f"Watch for longer: --seconds {3 / exam.frame_rate:.3g}.",
         )
-    elif seen.packet_size <= exam.path_mtu:
+    elif stream.packet_size <= exam.path_mtu:
         exam.add(
             "error",
             f"the camera obeys and streams, and no packet of the stream came in "
-            f"{seen.seconds:.1f} s: something on the way drops UDP that this machine did not ask "
+            f"{stream.seconds:.1f} s: something on the way drops UDP that this machine did not ask "
             "for",
             f"Let UDP from {exam.host} through the firewall of this machine, to any port "
             "(nft, ufw, firewalld, a virtual machine's NAT, a container without --network host). "
-            f"{FRAMES_NOT_SHOWN}",
-            Exit.RAN_OUT,
+            f"{MEASURE_HINT}",
+            Exit.TIMED_OUT,
         )
 
 
 async def _waiting_triggers(exam: _GigEExamination) -> str:
-    """Return the triggers that are on, and their sources; "" without any."""
+    """Return the triggers that are on, with their sources; "" if none is on."""
     triggers: list[str] = []
     try:
-        async with _session(exam) as features:
-            selectors, before = [""], ""
+        async with _FeatureSession(exam) as features:
+            selectors, original_selector = [""], ""
             if "TriggerSelector" in features:
                 selectors = list(await features.entries("TriggerSelector"))
-                before = await _text(features, "TriggerSelector")
+                original_selector = await _read_text(features, "TriggerSelector")
             for selector in selectors:
                 if selector:
                     await features.set("TriggerSelector", selector)
-                if await _text(features, "TriggerMode") == "On":
-                    source = await _text(features, "TriggerSource") or "unknown source"
+                if await _read_text(features, "TriggerMode") == "On":
+                    source = await _read_text(features, "TriggerSource") or "unknown source"
                     triggers.append(f"{selector} by {source}" if selector else f"by {source}")
             if selectors != [""]:
-                await features.set("TriggerSelector", before)
+                await features.set("TriggerSelector", original_selector)
     except FrameSourceError:
         pass
     return ", ".join(triggers)

@@ -1,4 +1,4 @@
-"""Open a port and read the bytes that come unasked; never send anything."""
+"""Open a port and read the bytes that it sends unasked; send nothing."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
     from smartcam.doctor._networks import HostAddress
 
-MAX_SAID_BYTES = 512
+MAX_UNASKED_BYTES = 512
 """Largest number of bytes that are read from a port."""
 
 Outcome = Literal["open", "refused", "no answer", "unreachable", "failed"]
 
-_OUTCOMES: dict[int, Outcome] = {
+_OUTCOMES_BY_ERROR: dict[int, Outcome] = {
     errno.ECONNREFUSED: "refused",
     errno.ECONNRESET: "refused",
     errno.ETIMEDOUT: "no answer",
@@ -26,28 +26,28 @@ _OUTCOMES: dict[int, Outcome] = {
     errno.EHOSTDOWN: "unreachable",
     errno.ENETDOWN: "unreachable",
 }
-"""Outcomes of an opening by its error; other errors are failures of this machine."""
+"""Outcomes of an opening, by error number; other errors are failures of this machine."""
 
-SCARCE = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
-"""Errors of a machine that has no socket left."""
+NO_SOCKET_ERRORS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+"""Error numbers that mean that this machine has no socket left."""
 
 
-class Opened(NamedTuple):
+class OpenedPort(NamedTuple):
     """The outcome of opening a port.
 
     Attributes:
         outcome: outcome of the opening.
         seconds: time until the connection was open.
         received: bytes that came unasked.
-        ended: whether the other end closed the connection.
-        why: reason of a failure.
+        is_closed: whether the other end has closed the connection.
+        failure: reason of a failure of this machine.
     """
 
     outcome: Outcome
     seconds: float = 0.0
     received: bytes = b""
-    ended: bool = False
-    why: str = ""
+    is_closed: bool = False
+    failure: str = ""
 
 
 async def open_port(
@@ -56,54 +56,56 @@ async def open_port(
     port: int,
     *,
     timeout: float,
-    enough: Callable[[bytes], bool],
-) -> Opened:
-    """Open a port, read the bytes that come unasked until they are ``enough``, and close it.
+    is_enough: Callable[[bytes], bool],
+) -> OpenedPort:
+    """Open a port, read the bytes that it sends unasked until ``is_enough``, and close it.
 
     Args:
-        sock: socket of the address' family; it is closed in the end.
+        sock: socket of the address's family; it is closed in the end.
         address: address of the host.
         port: number of the port.
-        timeout: seconds until it is open, and as many again to read.
-        enough: function that is called with all bytes that came; True ends reading.
+        timeout: seconds to open the port, and as many again to read.
+        is_enough: function that is called with all bytes that came; True ends reading.
 
     Cancellation: the connection is closed.
     """
     loop = asyncio.get_running_loop()
-    begun = loop.time()
+    start = loop.time()
     with sock:
         sock.setblocking(False)
         try:
             async with asyncio.timeout(timeout):
                 await loop.sock_connect(sock, address.sockaddr(port)[1])
-            if is_own(sock):
-                return Opened("refused")
+            if is_connected_to_itself(sock):
+                return OpenedPort("refused")
         except TimeoutError:
-            return Opened("no answer")
+            return OpenedPort("no answer")
         except OSError as exc:
-            outcome = _OUTCOMES.get(exc.errno or 0, "failed")
-            return Opened(outcome, why=(exc.strerror or str(exc)) if outcome == "failed" else "")
-        seconds = loop.time() - begun
-        received, ended = b"", False
+            outcome = _OUTCOMES_BY_ERROR.get(exc.errno or 0, "failed")
+            return OpenedPort(
+                outcome, failure=(exc.strerror or str(exc)) if outcome == "failed" else ""
+            )
+        seconds = loop.time() - start
+        received, is_closed = b"", False
         try:
             async with asyncio.timeout(timeout):
-                while len(received) < MAX_SAID_BYTES and not enough(received):
-                    data = await loop.sock_recv(sock, MAX_SAID_BYTES - len(received))
+                while len(received) < MAX_UNASKED_BYTES and not is_enough(received):
+                    data = await loop.sock_recv(sock, MAX_UNASKED_BYTES - len(received))
                     if not data:
-                        ended = True
+                        is_closed = True
                         break
                     received += data
         except TimeoutError:
             pass
         except OSError:
-            ended = True  # the other end has reset the connection
-        return Opened("open", seconds, received, ended)
+            is_closed = True  # the other end has reset the connection
+        return OpenedPort("open", seconds, received, is_closed)
 
 
-def is_own(sock: socket.socket) -> bool:
+def is_connected_to_itself(sock: socket.socket) -> bool:
     """Return True if a socket is connected to itself.
 
-    The system may choose for our end the very port that is to be opened, if that is a free port of
-    this machine: then the socket connects to itself.
+    If the port to open is a free port of this machine, the system may choose the same port for the
+    near end; the socket then connects to itself.
     """
     return bool(sock.getsockname() == sock.getpeername())

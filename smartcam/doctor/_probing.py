@@ -1,4 +1,4 @@
-"""Find out the protocol, transport and dialect of an address, each try on a new link.
+"""Find out the protocol, transport and dialect of an address; each try has a new link.
 
 Every try is a :class:`Trial` with all sent and received bytes, as hex and, if possible, decoded. If
 a camera closes the link without a byte, the try is repeated without the Disconnect before Connect
@@ -67,7 +67,7 @@ class Trial(Try):
         frames: frames on the wire, in order; direction ``!`` for bytes that make no frame.
         omitted: number of entries beyond ``frames``.
         answer: answer of the camera; None if none answered.
-        other: whether the protocol differs from the one of the given address.
+        other: whether the protocol differs from that of the given address.
     """
 
     address: Address
@@ -77,7 +77,7 @@ class Trial(Try):
     other: bool = False
 
     def __str__(self) -> str:
-        """Text of one line for an error."""
+        """Return the try in one line, for an error."""
         text = super(Trial, self).__str__()
         return (
             f"{self.address.protocol} at port {self.address.port}: {text}" if self.other else text
@@ -92,7 +92,7 @@ class Trial(Try):
 
 
 class Way(NamedTuple):
-    """One way to speak to an address."""
+    """One way to speak to an address: a protocol, a transport, and its first message."""
 
     address: Address  # address with the scheme of the transport
     transport: Transport  # transport that carries the protocol
@@ -106,37 +106,40 @@ def ways(address: Address) -> list[Way]:
     its protocol fails to load.
     """
     protocol, parameters = load_protocol(address.protocol), dict(address.parameters)
-    made: list[Way] = []
+    found: list[Way] = []
     for scheme in sorted(protocol.schemes, key=lambda scheme: scheme != address.scheme):
         transport = protocol.schemes[scheme]
         groups = protocol.tries(transport, parameters=parameters)
         if address.dialect is not None:
             pinned = protocol.tries(transport, address.dialect, address.quirks, parameters)
-            others = [tuple(d for d in group if d.name != address.dialect) for group in groups]
+            others = [
+                tuple(dialect for dialect in group if dialect.name != address.dialect)
+                for group in groups
+            ]
             groups = pinned + [group for group in others if group]
-        at = address._replace(scheme=scheme)
-        made += [Way(at, transport, group) for group in groups]
-    return made
+        scheme_address = address._replace(scheme=scheme)
+        found += [Way(scheme_address, transport, group) for group in groups]
+    return found
 
 
 def other_ways(address: Address) -> list[Way]:
     """Return every way to speak to an address's host in the other registered protocols.
 
-    They use the address's port. If that is the default of the address's protocol, each protocol
-    uses its own default.
+    They use the address's port; if that is the default port of its protocol, each protocol uses
+    its own default port.
     """
     own_protocol = load_protocol(address.protocol)
-    made: list[Way] = []
+    found: list[Way] = []
     for protocol in known_protocols():
         if protocol.name == own_protocol.name:
             continue
         port = protocol.default_port if address.port == own_protocol.default_port else address.port
         scheme = next(iter(protocol.schemes))
         try:
-            made += ways(Address(protocol.name, scheme, address.host, port))
+            found += ways(Address(protocol.name, scheme, address.host, port))
         except ConfigurationError:  # the protocol needs more than the URL has, such as a login
             continue
-    return made
+    return found
 
 
 async def trials(
@@ -158,46 +161,50 @@ async def trials(
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
-    made = ways(address)
+    all_ways = ways(address)
     if every_protocol:
-        first = made[0].transport
-        made = sorted([*made, *other_ways(address)], key=lambda way: way.transport is not first)
-    left = collections.deque((way, True) for way in made)
-    while left:
-        way, disconnect_first = left.popleft()
-        share = max(0.0, deadline - loop.time()) / (len(left) + 1)
-        trial = await _try(way, share, trace, disconnect_first=disconnect_first)
+        first_transport = all_ways[0].transport
+        all_ways = sorted(
+            [*all_ways, *other_ways(address)], key=lambda way: way.transport is not first_transport
+        )
+    remaining = collections.deque((way, True) for way in all_ways)
+    while remaining:
+        way, disconnect_first = remaining.popleft()
+        share = max(0.0, deadline - loop.time()) / (len(remaining) + 1)
+        trial = await _try_way(way, share, trace, disconnect_first=disconnect_first)
         trial.other = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
-            left.appendleft((way, False))  # the camera may have closed because of the Disconnect
-        _put_greeted_first(left, trial)
+            # the camera may have closed because of the Disconnect
+            remaining.appendleft((way, False))
+        _put_greeted_first(remaining, trial)
         yield trial
         if trial.answer is not None and not go_on:
             return
 
 
-def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) -> None:
-    """Move the ways of a protocol whose greeting was received to the front."""
-    greeted = _greeted(trial, {way.address.protocol for way, _ in left})
-    if greeted is not None:
-        place = (greeted, trial.address.port)
-        order = sorted(
-            left, key=lambda pair: (pair[0].address.protocol, pair[0].address.port) != place
+def _put_greeted_first(remaining: collections.deque[tuple[Way, bool]], trial: Trial) -> None:
+    """If a try has received a protocol's greeting, move the ways of that protocol to the front."""
+    protocol = _greeted_protocol(trial, {way.address.protocol for way, _ in remaining})
+    if protocol is not None:
+        protocol_and_port = (protocol, trial.address.port)
+        reordered = sorted(
+            remaining,
+            key=lambda pair: (pair[0].address.protocol, pair[0].address.port) != protocol_and_port,
         )
-        left.clear()
-        left.extend(order)
+        remaining.clear()
+        remaining.extend(reordered)
 
 
-def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
-    """Return the protocol whose greeting a try has received, None without one."""
+def _greeted_protocol(trial: Trial, names: Iterable[str]) -> str | None:
+    """Return the protocol whose greeting a try has received; None if it has received none."""
     if trial.answer is not None or trial.transport != Transport.TCP.value:
         return None
     unread = next((entry.hex for entry in trial.frames if entry.direction == "!"), "")
-    start = bytes.fromhex(unread).lstrip()
-    return next((name for name in names if _greets(load_protocol(name), start)), None)
+    beginning = bytes.fromhex(unread).lstrip()
+    return next((name for name in names if _is_greeting_of(load_protocol(name), beginning)), None)
 
 
-def _greets(protocol: Protocol, received: bytes) -> bool:
+def _is_greeting_of(protocol: Protocol, received: bytes) -> bool:
     return bool(protocol.greeting) and received.startswith(protocol.greeting or b"")
 
 
@@ -219,23 +226,23 @@ async def locate(host: str, *, timeout: float) -> str:
             if trial.answer is not None:
                 return trial.answer.url
             failed.append(trial)
-    raise no_session(host, address, failed) from by_telling(failed)[0].error
+    raise no_session(host, address, failed) from most_informative_first(failed)[0].error
 
 
 def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
     """Return the error for failed tries, with the most informative one and the cure."""
-    ranked = by_telling(failed)
-    where = ranked[0].address
-    why = explain(ranked[:1], where, load_protocol(where.protocol))
+    ranked = most_informative_first(failed)
+    address_tried = ranked[0].address
+    explanation = explain(ranked[:1], address_tried, load_protocol(address_tried.protocol))
     return ConnectFailedError(
-        f"no session with {masked(host)}: {why}",
+        f"no session with {masked(host)}: {explanation}",
         host=address.host,
         port=address.port,
         attempts=tuple(map(str, ranked)),
     )
 
 
-def by_telling(failed: Iterable[Trial]) -> list[Trial]:
+def most_informative_first(failed: Iterable[Trial]) -> list[Trial]:
     """Return failed tries, the most informative first.
 
     The order: a refusal, bytes of a frame that is no message, other bytes, silence, no link.
@@ -250,9 +257,9 @@ def by_telling(failed: Iterable[Trial]) -> list[Trial]:
     return sorted(failed, key=rank)
 
 
-async def _try(
+async def _try_way(
     way: Way,
-    share: float,
+    time_limit: float,
     trace: Callable[[TraceEntry], None] | None,
     *,
     disconnect_first: bool,
@@ -260,7 +267,7 @@ async def _try(
     address, transport, dialects = way
     trial = Trial(names_of(dialects), transport.value, address=address)
 
-    def take(frames: Sequence[RawFrame]) -> None:
+    def record_frames(frames: Sequence[RawFrame]) -> None:
         for frame in frames:
             entry = frame.entry()
             trial.keep(entry)
@@ -268,7 +275,7 @@ async def _try(
                 trace(entry)
 
     try:
-        async with asyncio.timeout(share):
+        async with asyncio.timeout(time_limit):
             session = await attempt(
                 address,
                 dialects,
@@ -276,19 +283,19 @@ async def _try(
                 progress=trial,
                 name=f"{address.host}:{address.port}",
                 max_length=DEFAULT_MAX_LENGTH,
-                trace=take,
+                trace=record_frames,
                 disconnect_first=disconnect_first,
             )
     except (OSError, UnicodeError, SmartCamError) as exc:  # TimeoutError is an OSError
-        trial.end(exc, share)
+        trial.end(exc, time_limit)
     else:
         trial.outcome = "session"
-        trial.answer = _answer(session)
+        trial.answer = _camera_answer(session)
         await session.link.close(CLOSE_TIMEOUT)
     return trial
 
 
-def _answer(session: Session) -> CameraAnswer:
+def _camera_answer(session: Session) -> CameraAnswer:
     status, application = None, None
     for event in (event for chunk in session.early for event in chunk.events):
         if isinstance(event, StatusReport) and status is None:

@@ -7,7 +7,7 @@ import re
 import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.doctor._context import called
+from smartcam.doctor._context import application_text
 from smartcam.doctor._findings import Exit
 from smartcam.exceptions import hex_excerpt
 from smartcam.interpreters._inside import LocalizationsInterpreter
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40
-"""Largest number of rows of a dump: a screen."""
+"""Largest number of rows of a dump: what fits on a screen."""
 
 
 # ---------------------------------------------------------------------- the layout
 
 
 class DumpRow(NamedTuple):
-    """One field of a container by the layout, with the bytes at its place.
+    """One field of the layout, with a container's bytes at its place.
 
     Attributes:
         offset: place of the field's first byte, from the start of the container's data.
         field: name and type of the field.
-        hex: the bytes at its place, at most 32.
-        value: meaning of the bytes; or the number that is missing or left over.
+        hex: the bytes at its place, as hex, at most 32.
+        value: value of the bytes, or a text about missing or extra bytes.
     """
 
     offset: int
@@ -46,28 +46,30 @@ class DumpRow(NamedTuple):
     value: Any
 
 
-def aligned(
-    layout: Layout, data: bytes, order: ByteOrder = "little", *, around: int = 0
+def dump_container(
+    layout: Layout, data: bytes, order: ByteOrder = "little", *, shown_offset: int = 0
 ) -> list[DumpRow]:
-    """Return a container's bytes beside a layout's fields, even if they do not fit.
+    """Return a layout's fields, each with a container's bytes, even if they do not fit.
 
-    ``data``: bytes after the application id. ``order``: byte order of numbers. ``around``:
+    ``data``: bytes after the application id. ``order``: byte order of numbers. ``shown_offset``:
     an offset that must be among the rows: repeated records long before it are left out.
     """
     rows: list[DumpRow] = []
     end = 0
-    for offset, name, field in _places(layout, len(data), around):
+    for offset, name, field in _field_places(layout, len(data), shown_offset):
         if len(rows) >= MAX_ROWS:
             rows.append(DumpRow(offset, "...", "", ""))
             return rows
         end = offset + field.size
-        raw = data[offset:end]
+        field_bytes = data[offset:end]
         label = f"{name}: {str(field).partition(': ')[2]}"
-        missing = field.size - len(raw)
+        missing = field.size - len(field_bytes)
         value = (
-            f"{missing} of {field.size} bytes are missing" if missing else _value(field, raw, order)
+            f"{missing} of {field.size} bytes are missing"
+            if missing
+            else _decode_value(field, field_bytes, order)
         )
-        rows.append(DumpRow(offset, label, raw[:32].hex(" "), value))
+        rows.append(DumpRow(offset, label, field_bytes[:32].hex(" "), value))
     if len(data) > end:
         rows.append(
             DumpRow(
@@ -80,7 +82,7 @@ def aligned(
     return rows
 
 
-def _places(layout: Layout, size: int, around: int) -> Iterator[tuple[int, str, Field]]:
+def _field_places(layout: Layout, size: int, shown_offset: int) -> Iterator[tuple[int, str, Field]]:
     """Yield offset, name and field of all fields of the layout in ``size`` bytes."""
     offset = 0
     for field in layout.head:
@@ -89,15 +91,15 @@ def _places(layout: Layout, size: int, around: int) -> Iterator[tuple[int, str, 
     record, repeat = layout.size, layout.repeat
     records_fit = max(0, math.ceil((size - offset) / record))
     count = 1 if repeat is None else repeat if isinstance(repeat, int) else records_fit
-    first = min(max(0, (around - offset) // record - 1), max(0, count - 1))
+    first = min(max(0, (shown_offset - offset) // record - 1), max(0, count - 1))
     for number in range(first, count):
-        begin = offset + number * record
+        field_offset = offset + number * record
         for field in layout.fields:
-            yield begin, field.name if repeat is None else f"[{number}].{field.name}", field
-            begin += field.size
+            yield field_offset, field.name if repeat is None else f"[{number}].{field.name}", field
+            field_offset += field.size
 
 
-def _value(field: Field, raw: bytes, order: ByteOrder) -> Any:
+def _decode_value(field: Field, raw: bytes, order: ByteOrder) -> Any:
     if field.type == "string":
         return raw.partition(b"\0")[0].decode(errors="replace")
     return struct.unpack((">" if order == "big" else "<") + field.wire.code, raw)[0]
@@ -107,16 +109,16 @@ def _size_text(layout: Layout) -> str:
     head, repeat = layout.head_size, layout.repeat
     if repeat is None:
         return f"{layout.size} bytes"
-    front = f"{head} bytes and " if head else ""
+    head_text = f"{head} bytes and " if head else ""
     if isinstance(repeat, int):
         return f"{head + repeat * layout.size} bytes"
-    return f"{front}whole records of {layout.size} bytes"
+    return f"{head_text}whole records of {layout.size} bytes"
 
 
 async def look_at_results(exam: Examination) -> None:
     """Check ``layout`` and ``values``: compare the results with ``--interpret-as``."""
-    containers, interpreter = list(exam.witness.containers), exam.options.interpreter
-    unreadable = exam.witness.unreadable
+    containers, interpreter = list(exam.witness.last_results), exam.options.interpreter
+    unreadable = exam.witness.read_error
     if unreadable is not None:
         exam.fail(
             f"a result came that cannot be read: {unreadable}",
@@ -133,7 +135,7 @@ async def look_at_results(exam: Examination) -> None:
         sizes = sorted({len(result.raw) for result in containers})
         exam.report(
             "ok",
-            f"{len(containers)} results looked at, of {_listed(sizes)} bytes: "
+            f"{len(containers)} results looked at, of {_sizes_text(sizes)} bytes: "
             f"{hex_excerpt(containers[0].raw)}; --interpret-as compares them with a layout",
             sizes=sizes,
             first=containers[0].raw,
@@ -157,7 +159,7 @@ def _compare(exam: Examination, interpreter: Interpreter, containers: list[Resul
         _look_at_values(exam, interpreter.layout, readings, integers=integers)
 
 
-def _listed(sizes: Sequence[int]) -> str:
+def _sizes_text(sizes: Sequence[int]) -> str:
     shown = ", ".join(map(str, sizes[:8]))
     return shown + (" ..." if len(sizes) > 8 else "")
 
@@ -176,10 +178,10 @@ def _report_misfit(
         "received": len(raw),
         "raw": raw,
     }
-    text = f"a result of {called(result.application)} does not fit the layout: {error}"
+    text = f"a result of {application_text(result.application)} does not fit the layout: {error}"
     if layout is not None:
         details["expected"] = _size_text(layout)
-        details["dump"] = aligned(layout, raw, reading.byte_order, around=error.offset)
+        details["dump"] = dump_container(layout, raw, reading.byte_order, shown_offset=error.offset)
         text += f". The layout has {_size_text(layout)}, {len(raw)} came"
     exam.fail(
         text,
@@ -193,83 +195,83 @@ def _report_misfit(
 # ---------------------------------------------------------------------- the values
 
 
-class _Plausible(NamedTuple):
-    """The plausible values of a field without a unit."""
+class _PlausibilityLimit(NamedTuple):
+    """The largest plausible value of a kind of field without a unit."""
 
     quantity: str  # quantity that such fields measure
-    names: re.Pattern[str]  # pattern of the names of such fields
-    most: float  # the largest magnitude that is plausible, SI
-    text: str  # description of a larger value
-    unit: str  # unit to write after the type then
+    name_pattern: re.Pattern[str]  # pattern of the names of such fields
+    largest: float  # largest plausible magnitude, SI
+    meaning: str  # what a larger value probably is
+    suggested_unit: str  # unit to write in the layout for it
     reason: str  # reason of the limit
 
 
-def _named(words: str) -> re.Pattern[str]:
-    """Return a pattern of words in a field's name, parted by underscores or digits."""
+def _name_pattern(words: str) -> re.Pattern[str]:
+    """Return a pattern that finds words in a field's name; underscores or digits separate words."""
     return re.compile(rf"(?:^|[_\d])(?:{words})(?:$|[_\d])", re.IGNORECASE)
 
 
-PLAUSIBLE: tuple[_Plausible, ...] = (
-    _Plausible(
+PLAUSIBILITY_LIMITS: tuple[_PlausibilityLimit, ...] = (
+    _PlausibilityLimit(
         "angle",
-        _named("theta|phi|psi|angle|rotation|orientation|roll|pitch|yaw"),
+        _name_pattern("theta|phi|psi|angle|rotation|orientation|roll|pitch|yaw"),
         2 * math.pi + 1e-6,
         "degrees",
         "deg",
         "cameras give angles of half a turn to either side, or of one turn",
     ),
-    _Plausible(
+    _PlausibilityLimit(
         "length",
-        _named("x|y|z|width|height|length|distance|diameter|radius"),
+        _name_pattern("x|y|z|width|height|length|distance|diameter|radius"),
         5.0,
         "millimetres (or pixels)",
         "mm",
         "a camera's field of view is below two metres, a robot's reach below five",
     ),
-    _Plausible(
+    _PlausibilityLimit(
         "ratio",
-        _named("quality|score"),
+        _name_pattern("quality|score"),
         1.0 + 1e-6,
         "percent",
         "percent",
         "they go from 0 to 1",
     ),
 )
-"""Limits above which a value is implausible; the first row with the field's name counts."""
+"""Limits above which a value is implausible; the first one that fits the field's name applies."""
 
 
-class _Converted(NamedTuple):
-    """The signs of a field with a unit whose values were in SI already."""
+class _ConversionLimit(NamedTuple):
+    """The largest value of a field with a unit that may have been SI before the conversion."""
 
-    most: float  # largest magnitude, SI, that looks so
-    text: str  # text that the camera may send instead
+    largest: float  # largest such magnitude, SI
+    meaning: str  # unit that the camera may send instead
     reason: str  # reason of the limit
 
 
-CONVERTED: dict[str, _Converted] = {
-    "mm": _Converted(
+CONVERSION_LIMITS: dict[str, _ConversionLimit] = {
+    "mm": _ConversionLimit(
         2e-3, "metres", "a camera whose field of view is two metres sends up to 2 for it in metres"
     ),
-    "deg": _Converted(
+    "deg": _ConversionLimit(
         2 * math.pi * math.pi / 180 + 1e-6, "radians", "a turn is 6.28 in radians, 360 in degrees"
     ),
 }
-"""Limits, by unit, below which all values look like SI that was converted again. Parts
-that all lie within two millimetres, or are turned by less than six degrees, look the same: so the
-hint only asks."""
+"""Limits, by unit: if all values are smaller, the camera may have sent SI. Parts that lie within
+two millimetres, or are turned by less than six degrees, look the same; so the finding is only a
+hint."""
 
-PLAUSIBLE_REALS = (1e-20, 1e20)
-"""Reals outside of these limits, except zero, are probably bytes of other types."""
+PLAUSIBLE_REAL_RANGE = (1e-20, 1e20)
+"""Range of plausible reals; others, except zero, are probably bytes of other types."""
 
 
 def _look_at_values(
     exam: Examination, layout: Layout, readings: list[Reading], *, integers: bool
 ) -> None:
-    """Give a hint for each field whose values are not plausible in its unit, or without one."""
+    """Report each field whose values are not plausible in its unit or, without one, in SI."""
     largest: dict[str, float] = {}  # largest magnitude by field
     # converted values, by unit
-    converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERTED}
-    nonsense: dict[str, float] = {}
+    converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERSION_LIMITS}
+    absurd_values: dict[str, float] = {}
     fields = [f for f in layout.fields if f.wire.is_number and (integers or not f.wire.is_integer)]
     for reading in readings:
         for record in layout.parse_records(reading.data, reading.byte_order):
@@ -278,17 +280,19 @@ def _look_at_values(
                 if (
                     value
                     and not field.wire.is_integer
-                    and not PLAUSIBLE_REALS[0] < value < PLAUSIBLE_REALS[1]
+                    and not PLAUSIBLE_REAL_RANGE[0] < value < PLAUSIBLE_REAL_RANGE[1]
                 ):
-                    nonsense.setdefault(field.name, value)
+                    absurd_values.setdefault(field.name, value)
                 elif field.unit is None:
                     largest[field.name] = max(value, largest.get(field.name, 0.0))
-                elif field.unit in CONVERTED and not field.wire.is_integer:
-                    of_unit = converted[field.unit]
-                    of_unit[field.name] = max(value, of_unit.get(field.name, 0.0))
+                elif field.unit in CONVERSION_LIMITS and not field.wire.is_integer:
+                    magnitudes_of_unit = converted[field.unit]
+                    magnitudes_of_unit[field.name] = max(
+                        value, magnitudes_of_unit.get(field.name, 0.0)
+                    )
     for unit, magnitudes in converted.items():
-        _ask_for_si(exam, unit, magnitudes)
-    for name, value in nonsense.items():
+        _hint_at_si_values(exam, unit, magnitudes)
+    for name, value in absurd_values.items():
         exam.report(
             "hint",
             f"{name} has values such as {value:g}, which nothing measures",
@@ -299,39 +303,39 @@ def _look_at_values(
             value=value,
         )
     for name, value in largest.items():
-        rule = next((rule for rule in PLAUSIBLE if rule.names.search(name)), None)
-        if rule is not None and value > rule.most:
-            kind = next(field for field in fields if field.name == name)
+        rule = next((rule for rule in PLAUSIBILITY_LIMITS if rule.name_pattern.search(name)), None)
+        if rule is not None and value > rule.largest:
+            field = next(field for field in fields if field.name == name)
             exam.report(
                 "hint",
-                f"{name} goes up to {value:g}: as {_SI[rule.quantity]} that is not plausible, it "
-                f"looks like {rule.text}",
-                f"Write {name}: {kind.type_text} {rule.unit} in the layout, and the value comes "
-                "in SI.",
+                f"{name} goes up to {value:g}: as {_SI_UNIT_TEXTS[rule.quantity]} that is not "
+                f"plausible, it looks like {rule.meaning}",
+                f"Write {name}: {field.type_text} {rule.suggested_unit} in the layout, and the "
+                "value comes in SI.",
                 check="values",
                 field=name,
                 value=value,
-                most=rule.most,
+                most=rule.largest,
             )
 
 
-def _ask_for_si(exam: Examination, unit: str, values: Mapping[str, float]) -> None:
-    """Give a hint if the values of all fields with a unit look as if they had been SI already."""
-    rule, most = CONVERTED[unit], max(values.values(), default=0.0)
-    if not 0.0 < most <= rule.most:
+def _hint_at_si_values(exam: Examination, unit: str, magnitudes: Mapping[str, float]) -> None:
+    """Report if the values of all fields with a unit look as if the camera had sent SI."""
+    rule, largest = CONVERSION_LIMITS[unit], max(magnitudes.values(), default=0.0)
+    if not 0.0 < largest <= rule.largest:
         return
-    made, names = UNITS[unit], ", ".join(values)
-    symbol = SI_SYMBOLS[made.quantity]
+    unit_definition, names = UNITS[unit], ", ".join(magnitudes)
+    symbol = SI_SYMBOLS[unit_definition.quantity]
+    sent = largest * unit_definition.divide / unit_definition.multiply
     exam.report(
         "hint",
-        f"{names}: no more than {most * made.divide / made.multiply:.4g} {unit}, which looks like "
-        f"{rule.text}: {rule.reason}",
-        f"If the camera sends {rule.text}, write {symbol} instead of {unit} in the layout.",
+        f"{names}: no more than {sent:.4g} {unit}, which looks like {rule.meaning}: {rule.reason}",
+        f"If the camera sends {rule.meaning}, write {symbol} instead of {unit} in the layout.",
         check="values",
         field=names,
-        value=most,
-        most=rule.most,
+        value=largest,
+        most=rule.largest,
     )
 
 
-_SI = {"angle": "radians", "length": "metres", "ratio": "a ratio from 0 to 1"}
+_SI_UNIT_TEXTS = {"angle": "radians", "length": "metres", "ratio": "a ratio from 0 to 1"}

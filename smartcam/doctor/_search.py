@@ -1,4 +1,4 @@
-"""Find cameras: search networks for addresses that listen on the ports of cameras.
+"""Find cameras: search networks for hosts that listen on the ports of cameras.
 
 A search opens ports and sends nothing; it reads bytes that a port sends by itself. If the caller
 allows it, the search also speaks to the found cameras, like ``smartcam probe``.
@@ -23,14 +23,14 @@ from smartcam._arguments import (
 )
 from smartcam.doctor._found import (
     check_consent,
-    found_port,
+    choose_ports,
+    describe_port,
     is_decided,
-    ports_of,
-    serves_one,
+    may_serve_one_client,
     tcp_protocols,
 )
-from smartcam.doctor._networks import AddressSet, Span, address_of, read_span
-from smartcam.doctor._opening import SCARCE, open_port
+from smartcam.doctor._networks import AddressSet, Span, parse_host_address, read_span
+from smartcam.doctor._opening import NO_SOCKET_ERRORS, open_port
 from smartcam.doctor._probing import trials
 from smartcam.exceptions import ConfigurationError
 from smartcam.settings import parse_address
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from smartcam.doctor._found import FoundPort
     from smartcam.doctor._networks import HostAddress
 
-DEFAULT_ADDRESSES = 65_536
+DEFAULT_MAX_ADDRESSES = 65_536
 """Largest number of addresses of one search by default."""
 
 MAX_ADDRESSES = 1 << 24
@@ -57,10 +57,10 @@ MAX_OPENINGS_PER_SECOND = 10_000.0
 """Largest number of connections opened in a second."""
 
 MAX_SECONDS = 60.0
-"""Largest number of seconds for one opening."""
+"""Largest number of seconds for opening one port."""
 
 ASK_TIMEOUT = 10.0
-"""Seconds for questions to one camera in all protocols together."""
+"""Seconds to ask one camera in all possible protocols together."""
 
 MAX_ASKED_AT_ONCE = 16
 """Number of cameras that are asked at the same time."""
@@ -68,8 +68,8 @@ MAX_ASKED_AT_ONCE = 16
 NAME_TIMEOUT = 5.0
 """Seconds for looking up a host's name."""
 
-SCARCE_PAUSE = 0.05
-"""Seconds until the next try if the system has no socket left."""
+SOCKET_RETRY_DELAY = 0.05
+"""Seconds until the next attempt if the system has no socket left."""
 
 
 async def find(
@@ -82,7 +82,7 @@ async def find(
     rate: float = 100.0,
     at_once: int = 64,
     timeout: float = 1.0,
-    max_addresses: int = DEFAULT_ADDRESSES,
+    max_addresses: int = DEFAULT_MAX_ADDRESSES,
 ) -> list[FoundPort]:
     """Return the open ports of networks where cameras may listen, sorted by address.
 
@@ -128,14 +128,14 @@ async def find(
 
 
 class CameraSearch:
-    """A search, whose results remain after its end or failure. Arguments as in :func:`find`.
+    """A search. Its results remain after its end, even if it failed. Arguments as in :func:`find`.
 
     Attributes:
         opened: number of ports that were tried.
         total: number of ports to try, once names are looked up.
-        counts: numbers of tries by outcome.
-        why: the first failure of this machine.
-        left: addresses that were left out, by the texts that name them.
+        counts: number of tried ports by outcome.
+        why: reason of the first failure of this machine.
+        left: addresses that were left out, each with the text that named it.
         begun: whether the first port was tried.
     """
 
@@ -151,7 +151,7 @@ class CameraSearch:
         rate: float = 100.0,
         at_once: int = 64,
         timeout: float = 1.0,
-        max_addresses: int = DEFAULT_ADDRESSES,
+        max_addresses: int = DEFAULT_MAX_ADDRESSES,
     ) -> None:
         rate = check_number(rate, "rate", 0, MAX_OPENINGS_PER_SECOND, "find", above=True)
         at_once = check_integer(at_once, "at_once", 1, MAX_OPEN_CONNECTIONS, "find")
@@ -170,18 +170,18 @@ class CameraSearch:
             for text in check_all(leave, "leave", "texts of addresses", "find")
         ]
         self._networks = [(text, read_span(text)) for text in networks]
-        self._leave = [(text, read_span(text, whole=True)) for text in leave]
-        self._ports = ports_of(ports, protocols)
+        self._excluded = [(text, read_span(text, include_ends=True)) for text in leave]
+        self._ports = choose_ports(ports, protocols)
         if ask and not may_disturb:
             check_consent(self._ports)
-        self._ask = ask
+        self._wants_answers = ask
         self._interval = 1.0 / rate
         self._at_once = at_once
         self._timeout = timeout
         self._max_addresses = max_addresses
-        _check_size(self._networks, max_addresses)
+        _check_network_sizes(self._networks, max_addresses)
         self._ports_found: dict[tuple[HostAddress, int], FoundPort] = {}
-        self._busy = 0
+        self._open_count = 0
         self.opened = 0
         self.total = 0
         self.counts: collections.Counter[str] = collections.Counter()
@@ -192,11 +192,11 @@ class CameraSearch:
     @property
     def exclusive(self) -> list[str]:
         """Names of protocols of found cameras that were not asked, since they serve one client."""
-        if self._ask:
+        if self._wants_answers:
             return []
         names = {name for port in self._ports_found.values() for name in port.protocols}
         known = tcp_protocols()
-        return sorted(name for name in names if serves_one(known[name]))
+        return sorted(name for name in names if may_serve_one_client(known[name]))
 
     def results(self) -> list[FoundPort]:
         """Return the ports found so far, sorted by address."""
@@ -211,80 +211,86 @@ class CameraSearch:
 
         Cancellation: every connection is closed; the results stay.
         """
-        addresses = AddressSet([span for each in self._networks for span in await _spans(*each)])
-        leave = [(text, each) for text, span in self._leave for each in await _spans(text, span)]
+        addresses = AddressSet(
+            [span for text, parsed in self._networks for span in await _resolve_spans(text, parsed)]
+        )
+        excluded = [
+            (text, span)
+            for text, parsed in self._excluded
+            for span in await _resolve_spans(text, parsed)
+        ]
         _check_count(len(addresses), self._max_addresses)
-        for text, span in leave:
+        for text, span in excluded:
             if span.size == 1 and span.first in addresses:
                 self.left[str(span.first)] = text
-        addresses = addresses.without(AddressSet(span for _, span in leave))
+        addresses = addresses.without(AddressSet(span for _, span in excluded))
         self.total = len(addresses) * len(self._ports)
         self.begun = True
         loop = asyncio.get_running_loop()
-        places, due = asyncio.Semaphore(self._at_once), loop.time()
+        free_connections, next_opening = asyncio.Semaphore(self._at_once), loop.time()
         try:
             async with asyncio.TaskGroup() as group:
                 for address in addresses:
                     for port in self._ports:
-                        await places.acquire()
-                        await asyncio.sleep(max(0.0, due - loop.time()))
-                        due = max(due, loop.time()) + self._interval
+                        await free_connections.acquire()
+                        await asyncio.sleep(max(0.0, next_opening - loop.time()))
+                        next_opening = max(next_opening, loop.time()) + self._interval
                         task = group.create_task(
-                            self._try(address, port), name=f"smartcam.find[{address}:{port}]"
+                            self._try_port(address, port), name=f"smartcam.find[{address}:{port}]"
                         )
-                        task.add_done_callback(lambda _: places.release())
-        except ExceptionGroup as several:
-            ours, others = several.split(ConfigurationError)
-            if ours is None or others is not None:
+                        task.add_done_callback(lambda _: free_connections.release())
+        except ExceptionGroup as error_group:
+            configuration_errors, other_errors = error_group.split(ConfigurationError)
+            if configuration_errors is None or other_errors is not None:
                 raise
-            raise ours.exceptions[0] from None
-        if self._ask:
+            raise configuration_errors.exceptions[0] from None
+        if self._wants_answers:
             await self._ask_all()
 
-    async def _try(self, address: HostAddress, port: int) -> None:
+    async def _try_port(self, address: HostAddress, port: int) -> None:
         protocols = self._ports[port]
-        sock = await self._socket(address)
-        self._busy += 1
+        sock = await self._new_socket(address)
+        self._open_count += 1
         try:
             opened = await open_port(
                 sock,
                 address,
                 port,
                 timeout=self._timeout,
-                enough=lambda received: is_decided(received, protocols),
+                is_enough=lambda received: is_decided(received, protocols),
             )
         finally:
-            self._busy -= 1
+            self._open_count -= 1
         self.opened += 1
         self.counts[opened.outcome] += 1
-        self.why = self.why or opened.why
+        self.why = self.why or opened.failure
         if opened.outcome == "open":
-            self._ports_found[address, port] = found_port(str(address), port, opened, protocols)
+            self._ports_found[address, port] = describe_port(str(address), port, opened, protocols)
 
-    async def _socket(self, address: HostAddress) -> socket.socket:
-        """Return a socket; wait until the system has a free one."""
+    async def _new_socket(self, address: HostAddress) -> socket.socket:
+        """Return a new socket; wait until the system has one left."""
         loop = asyncio.get_running_loop()
-        until = loop.time() + 4 * self._timeout
+        deadline = loop.time() + 4 * self._timeout
         while True:
             try:
                 return socket.socket(address.sockaddr(0)[0], socket.SOCK_STREAM)
             except OSError as exc:
-                if exc.errno not in SCARCE:
+                if exc.errno not in NO_SOCKET_ERRORS:
                     raise ConfigurationError(f"find: {address}: {exc.strerror}") from exc
-                if not self._busy or loop.time() > until:
+                if not self._open_count or loop.time() > deadline:
                     raise ConfigurationError(
                         f"find: this process has no socket left ({exc.strerror}), with "
-                        f"{self._busy} of the search's own open: close others, or allow more "
+                        f"{self._open_count} of the search's own open: close others, or allow more "
                         "(ulimit -n)"
                     ) from exc
-            await asyncio.sleep(SCARCE_PAUSE)
+            await asyncio.sleep(SOCKET_RETRY_DELAY)
 
     async def _ask_all(self) -> None:
-        places = asyncio.Semaphore(MAX_ASKED_AT_ONCE)
+        free_requests = asyncio.Semaphore(MAX_ASKED_AT_ONCE)
 
         async def ask(key: tuple[HostAddress, int]) -> None:
-            async with places:
-                self._ports_found[key] = await asked(self._ports_found[key])
+            async with free_requests:
+                self._ports_found[key] = await ask_port(self._ports_found[key])
 
         async with asyncio.TaskGroup() as group:
             for key, port in sorted(self._ports_found.items()):
@@ -295,8 +301,8 @@ class CameraSearch:
 # ---------------------------------------------------------------------- addresses
 
 
-async def _spans(text: str, span: Span | None) -> list[Span]:
-    """Return a text's addresses; a name is looked up."""
+async def _resolve_spans(text: str, span: Span | None) -> list[Span]:
+    """Return the addresses that a text means: ``span``, or if it is None, those of the name."""
     if span is not None:
         return [span]
     loop = asyncio.get_running_loop()
@@ -304,31 +310,32 @@ async def _spans(text: str, span: Span | None) -> list[Span]:
         async with asyncio.timeout(NAME_TIMEOUT):
             resolved = await loop.getaddrinfo(text.strip(), None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
-        why = (exc.strerror if isinstance(exc, OSError) else str(exc)) or (
+        reason = (exc.strerror if isinstance(exc, OSError) else str(exc)) or (
             f"no name server answers within {NAME_TIMEOUT:g} s"
         )
-        raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
-    addresses = {address_of(str(entry[4][0])) for entry in resolved}
+        raise ConfigurationError(f"find: the name {text!r} does not resolve: {reason}") from exc
+    addresses = {parse_host_address(str(entry[4][0])) for entry in resolved}
     return [Span(address, address) for address in sorted(addresses)]
 
 
-def _check_size(networks: Iterable[tuple[str, Span | None]], most: int) -> None:
-    _check_count(len(AddressSet(span for _, span in networks if span is not None)), most)
+def _check_network_sizes(networks: Iterable[tuple[str, Span | None]], max_count: int) -> None:
+    _check_count(len(AddressSet(span for _, span in networks if span is not None)), max_count)
 
 
-def _check_count(count: int, most: int) -> None:
-    if count > most:
+def _check_count(count: int, max_count: int) -> None:
+    if count > max_count:
         raise ConfigurationError(
-            f"find: {count:,} addresses are more than {most:,}: name smaller networks, or allow "
-            f"them by max_addresses={count} (--max-addresses {count}), {MAX_ADDRESSES:,} at most"
+            f"find: {count:,} addresses are more than {max_count:,}: name smaller networks, or "
+            f"allow them by max_addresses={count} (--max-addresses {count}), {MAX_ADDRESSES:,} at "
+            "most"
         )
 
 
 # ---------------------------------------------------------------------- asking
 
 
-async def asked(port: FoundPort) -> FoundPort:
-    """Ask a found camera in each possible protocol, and return the outcome."""
+async def ask_port(port: FoundPort) -> FoundPort:
+    """Ask a found camera in each possible protocol; return the port with the answer or refusal."""
     failed: list[str] = []
     for url in port.urls:
         async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:

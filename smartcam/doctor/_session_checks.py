@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._client._inside import reason_for, remarks, words
 from smartcam.doctor._findings import Exit
-from smartcam.doctor._probing import by_telling, trials
+from smartcam.doctor._probing import most_informative_first, trials
 from smartcam.doctor._timing import figures
 from smartcam.exceptions import (
     ConnectFailedError,
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from smartcam.exceptions import SmartCamError
 
 SESSION_COUNT = 5
-"""Number of sessions made one after the other, for the spread of the connect time."""
+"""Number of sessions made one after the other, to measure the connect time."""
 
-CONNECTS_WITHIN = 3.0
-"""Seconds after which no further session is begun; on a slow link one or two suffice."""
+MAX_CONNECTING_SECONDS = 3.0
+"""Seconds after which no further session is made; on a slow link one or two are enough."""
 
 CONNECTION_TIMEOUT = 1.0
-"""Seconds for a bare TCP connection, which tells an absent camera from one that closed the link."""
+"""Seconds to open a bare TCP connection, which shows whether the camera is still there."""
 
 CONNECTION_DELAY = 0.25
-"""Seconds to wait before the bare connection: a camera that shuts down closes its port later."""
+"""Seconds to wait before the bare connection: a camera that shuts down closes its port late."""
 
-TAKEN_WITHIN = 10.0
-"""Seconds after Connect in which a lost session was probably taken, by the client's own rule (see
-:mod:`smartcam._client.supervisor`)."""
+MAX_TAKEN_SESSION_AGE = 10.0
+"""Largest age in seconds at which a lost session was probably taken by another client; the client
+uses the same rule (see :mod:`smartcam._client.supervisor`)."""
 
 
 # ---------------------------------------------------------------------- the name
@@ -50,21 +50,21 @@ async def resolve(exam: Examination) -> None:
     """Check ``name``: the addresses that the host resolves to."""
     host, port = exam.address.host, exam.address.port
     loop = asyncio.get_running_loop()
-    limit = exam.options.step(10.0)
+    limit = exam.options.step_timeout(10.0)
     try:
         async with asyncio.timeout(limit):
             resolved = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as exc:
-        why = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
-        why = why or f"no name server answers within {limit:g} s"
+        reason = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
+        reason = reason or f"no name server answers within {limit:g} s"
         exam.fail(
-            f"the name {host!r} does not resolve: {why}",
+            f"the name {host!r} does not resolve: {reason}",
             "Look for a slip in the name, or give the camera's IP address instead of a name. "
             "Names need a DNS server, or an entry in this machine's hosts file.",
             host=host,
         )
         return
-    addresses = sorted({str(info[4][0]) for info in resolved})
+    addresses = sorted({str(entry[4][0]) for entry in resolved})
     if addresses != [host]:
         text = f"{host} is {', '.join(addresses)}"
         exam.report("ok", text, host=host, addresses=addresses)
@@ -74,27 +74,27 @@ async def resolve(exam: Examination) -> None:
 
 
 async def connect(exam: Examination) -> None:
-    """Check ``session``: make a session, then more for the spread of the connect time."""
+    """Check ``session``: make a session, then more to measure the connect time."""
     loop = asyncio.get_running_loop()
-    pinned = exam.address.dialect is not None
-    begin = loop.time()
+    is_pinned = exam.address.dialect is not None
+    start = loop.time()
     try:
         camera = await exam.make_camera().open()
     except ConnectFailedError as exc:
-        answered = await _diagnose(exam, exc)
+        answered = await _diagnose_failure(exam, exc)
         if answered is None:
             return
-        camera, times, begin = answered, list[float](), loop.time()
+        camera, times, start = answered, list[float](), loop.time()
     else:
-        times = [loop.time() - begin]
+        times = [loop.time() - start]
     exam.pin(camera.url)
-    first = times[0] if times and not pinned else None
+    first = times[0] if times and not is_pinned else None
     try:
-        while len(times) < SESSION_COUNT and loop.time() - begin < CONNECTS_WITHIN:
+        while len(times) < SESSION_COUNT and loop.time() - start < MAX_CONNECTING_SECONDS:
             await camera.close()
-            one_begin = loop.time()
+            connect_start = loop.time()
             camera = await exam.make_camera().open()
-            times.append(loop.time() - one_begin)
+            times.append(loop.time() - connect_start)
     except ConnectFailedError as exc:
         exam.fail(
             f"a session was made, and another one right after it was not: {exc}",
@@ -131,7 +131,7 @@ def _report_session(
 # ---------------------------------------------------------------------- no session
 
 
-async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | None:
+async def _diagnose_failure(exam: Examination, failure: ConnectFailedError) -> Camera | None:
     """Report why there is no session; return a camera if another way leads to one."""
     given, tries = exam.address, await _try_all(exam)
     answer = tries[-1].answer
@@ -157,8 +157,8 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
 
 
 async def _try_all(exam: Examination) -> list[Trial]:
-    """Return every try, up to the first that is answered."""
-    timeout = exam.options.step(10.0)
+    """Return every try up to the first one with an answer."""
+    timeout = exam.options.step_timeout(10.0)
     tries = trials(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
     async with contextlib.aclosing(tries):
         return [trial async for trial in tries]
@@ -166,42 +166,42 @@ async def _try_all(exam: Examination) -> list[Trial]:
 
 def _report_no_session(exam: Examination, tries: list[Trial], answer: CameraAnswer | None) -> None:
     address = tries[0].address
-    reason, trial = _reason(tries, pinned=address.dialect is not None)
-    filled = words(trial, address, load_protocol(address.protocol))
+    reason, trial = _find_reason(tries, pinned=address.dialect is not None)
+    texts = words(trial, address, load_protocol(address.protocol))
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
-        others = [other for other in by_telling(tries) if other is not trial]
-        also = f" Also tried: {_folded(others)}." if others else ""
-        cure = reason.cure.format(**filled) + also
+        others = [other for other in most_informative_first(tries) if other is not trial]
+        others_text = f" Also tried: {_tries_text(others)}." if others else ""
+        cure = reason.cure.format(**texts) + others_text
     exam.fail(
-        reason.text.format(**filled),
+        reason.text.format(**texts),
         cure,
         tries=[*map(str, tries)],
-        frames=[tuple(each.frames) for each in tries],
+        frames=[tuple(one_try.frames) for one_try in tries],
         answers_at=answer.url if answer is not None else None,
     )
 
 
-def _reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
+def _find_reason(tries: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     """Return the reason why the URL gives no session, and the try that shows it."""
     first = tries[0]
-    alike = [
+    similar_tries = [
         trial
         for trial in tries
         if trial.transport == first.transport
         and not trial.other
         and (trial.dialect == first.dialect or not pinned)
     ]
-    return reason_for(alike)
+    return reason_for(similar_tries)
 
 
-def _folded(tries: list[Trial]) -> str:
-    """Return tries in one line, with equal outcomes of a transport's dialects together."""
+def _tries_text(tries: list[Trial]) -> str:
+    """Return tries in one line; dialects with equal transport and outcome are listed together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for trial in tries:
-        at = f" at port {trial.address.port}" if trial.other else ""
-        key = (f"{trial.transport.upper()}{at}", trial.step, trial.outcome)
+        port_text = f" at port {trial.address.port}" if trial.other else ""
+        key = (f"{trial.transport.upper()}{port_text}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)
     return "; ".join(
         f"{', '.join(dialects)} over {transport}: {step}: {outcome}"
@@ -215,34 +215,34 @@ def _folded(tries: list[Trial]) -> str:
 async def explain_loss(exam: Examination, error: SmartCamError) -> None:
     """Report why a session is over, without taking the camera.
 
-    A client can detect that its session was taken (ConnectionTakenError) only by taking the camera
-    back once. This function only opens a bare TCP connection, to see whether the camera still
-    listens. A Connect takes over a session, a connection does not (inferred).
+    A client would have to take the camera back once to know that its session was taken
+    (ConnectionTakenError). This function only opens a bare TCP connection, to see whether the
+    camera still listens. A connection alone takes no session, only Connect does (inferred).
     """
     age = asyncio.get_running_loop().time() - exam.connected_at
     cause = error.__cause__
     details: dict[str, Any] = {"after": age, "error": str(error)}
     exam.check = "lost"
-    closed = isinstance(cause, OSError) and not isinstance(cause, TimeoutError)
+    is_closed = isinstance(cause, OSError) and not isinstance(cause, TimeoutError)
     schemes = load_protocol(exam.address.protocol).schemes
-    udp = schemes[exam.address.scheme] is Transport.UDP
+    is_udp = schemes[exam.address.scheme] is Transport.UDP
     if isinstance(cause, ProtocolError):
         exam.fail(
             f"the camera sent something that is no message, and the session was given up: {cause}",
             "Another dialect? A device in between? smartcam probe and --trace show the bytes.",
             **details,
         )
-    elif closed and not udp and await _knock(exam):
-        soon = ", soon after its Connect" if age < TAKEN_WITHIN else ""
+    elif is_closed and not is_udp and await _accepts_connection(exam):
+        soon_text = ", soon after its Connect" if age < MAX_TAKEN_SESSION_AGE else ""
         exam.fail(
-            f"the camera ended the session after {age:.1f} s{soon}, and still takes connections: "
-            "another client has most probably taken it",
+            f"the camera ended the session after {age:.1f} s{soon_text}, and still takes "
+            "connections: another client has most probably taken it",
             "Find the other one: a copy of your program, a PLC, the maker's software, a forgotten "
             "smartcam watch. A camera serves one client, and the newcomer wins.",
             check="taken",
             **details,
         )
-    elif closed:
+    elif is_closed:
         exam.fail(
             f"the session broke after {age:.1f} s, and the camera takes no connection now: {error}",
             "It restarts, or lost its power or its network. Look at its lamps and its cable, and "
@@ -250,16 +250,19 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
             **details,
         )
     else:
-        taken = " Over UDP a client from which another took the camera is told nothing."
+        udp_text = " Over UDP a client from which another took the camera is told nothing."
         exam.fail(
             f"the camera fell silent after {age:.1f} s: {error}",
-            "Look at cable, switch and power, and for another client." + (taken if udp else ""),
-            exit_code=Exit.RAN_OUT if isinstance(error, ResponseTimeoutError) else Exit.NO_SESSION,
+            "Look at cable, switch and power, and for another client."
+            + (udp_text if is_udp else ""),
+            exit_code=Exit.TIMED_OUT
+            if isinstance(error, ResponseTimeoutError)
+            else Exit.NO_SESSION,
             **details,
         )
 
 
-async def _knock(exam: Examination) -> bool:
+async def _accepts_connection(exam: Examination) -> bool:
     """Return True if the camera's port accepts a TCP connection."""
     await asyncio.sleep(CONNECTION_DELAY)
     try:

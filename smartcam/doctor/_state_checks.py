@@ -9,7 +9,7 @@ from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.doctor._context import Diagnosis, called
+from smartcam.doctor._context import Diagnosis, application_text
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._timing import Figures, figures
 from smartcam.exceptions import InterpretationError, ResponseTimeoutError
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 QUERY_COUNT = 30
 """Number of requests for the round-trip time: enough for a median, and fast."""
 
-QUERIES_WITHIN = 3.0
+MAX_QUERYING_SECONDS = 3.0
 """Seconds after which no further request is sent: on a slow link fewer must suffice."""
 
 SLOW_ROUND_TRIP_TIME = 0.05
@@ -31,14 +31,14 @@ SLOW_ROUND_TRIP_TIME = 0.05
 MAX_WATCHED_STATUSES = 1000
 """Largest number of statuses kept while watching; the last ones stay."""
 
-CLOCK_MAY_DIFFER = timedelta(minutes=1)
+MAX_CLOCK_DIFFERENCE = timedelta(minutes=1)
 """Time by which a camera's clock may be off: a day or two of drift since it was set."""
 
 
 # ---------------------------------------------------------------------- status
 
 
-class _Complaint(NamedTuple):
+class _StatusFault(NamedTuple):
     """A status bit that reports trouble."""
 
     bit: Status
@@ -48,8 +48,8 @@ class _Complaint(NamedTuple):
     exit_code: Exit = Exit.DONE
 
 
-_CONDITIONS = (
-    _Complaint(
+_STATUS_FAULTS = (
+    _StatusFault(
         Status.SYSTEM_ERROR,
         "error",
         "the camera reports a System Error: it does not work until it is restarted",
@@ -57,13 +57,13 @@ _CONDITIONS = (
         "maker's support are next.",
         Exit.REFUSED,
     ),
-    _Complaint(
+    _StatusFault(
         Status.OVERHEAT,
         "warning",
         "the camera is too hot; inspections may get worse",
         "Cool it: a mount that takes the heat away, more air, less light time, fewer images.",
     ),
-    _Complaint(
+    _StatusFault(
         Status.INPUT_CONTAINER,
         "warning",
         "input data and inspections are out of step: more containers than inspections (one was "
@@ -71,13 +71,13 @@ _CONDITIONS = (
         "Send one container for each trigger: camera.trigger(input=...) does. Loading the "
         "application again empties the camera's queue.",
     ),
-    _Complaint(
+    _StatusFault(
         Status.OVERTRIGGERED,
         "hint",
         "the camera has just dropped a trigger: it came while it could not take it",
         "Trigger more slowly, or from one place only: a sensor or a program.",
     ),
-    _Complaint(
+    _StatusFault(
         Status.SIMULATION_MODE,
         "hint",
         "the camera takes its images from files, not from its sensor",
@@ -85,22 +85,20 @@ _CONDITIONS = (
     ),
 )
 
-_STICKY = " The bit stays set until the errors are reset: await camera.reset_errors()."
+_STICKY_BIT_CURE = " The bit stays set until the errors are reset: await camera.reset_errors()."
 
 
 async def look_at_status(exam: Examination) -> None:
     """Check ``status``: the bits that report trouble."""
     camera = exam.connected_camera
-    capable = camera.capabilities
-    status = await camera.query_status() if capable.get_status else camera.status
-    wrong = [condition for condition in _CONDITIONS if condition.bit in status]
-    for condition in wrong:
-        sticky = condition.bit is Status.OVERTRIGGERED and capable.reset_errors
-        cure = condition.cure + (_STICKY if sticky else "")
-        exam.report(
-            condition.severity, condition.text, cure, exit_code=condition.exit_code, status=status
-        )
-    if not wrong:
+    capabilities = camera.capabilities
+    status = await camera.query_status() if capabilities.get_status else camera.status
+    faults = [fault for fault in _STATUS_FAULTS if fault.bit in status]
+    for fault in faults:
+        is_sticky = fault.bit is Status.OVERTRIGGERED and capabilities.reset_errors
+        cure = fault.cure + (_STICKY_BIT_CURE if is_sticky else "")
+        exam.report(fault.severity, fault.text, cure, exit_code=fault.exit_code, status=status)
+    if not faults:
         exam.report("ok", f"no fault is reported: {status}", status=status)
 
 
@@ -110,18 +108,18 @@ async def look_at_status(exam: Examination) -> None:
 async def measure_round_trip(exam: Examination) -> None:
     """Check ``round trip``: the time from a Query to its answer."""
     camera, loop = exam.connected_camera, asyncio.get_running_loop()
-    begin, times = loop.time(), list[float]()
-    while len(times) < QUERY_COUNT and loop.time() - begin < QUERIES_WITHIN:
+    start, times = loop.time(), list[float]()
+    while len(times) < QUERY_COUNT and loop.time() - start < MAX_QUERYING_SECONDS:
         sent_at = loop.time()
         await camera.query_application()
         times.append(loop.time() - sent_at)
     measured = figures(times)
-    slow = measured.median > SLOW_ROUND_TRIP_TIME
+    is_slow = measured.median > SLOW_ROUND_TRIP_TIME
     text = f"{measured.times} requests: {measured}"
     exam.report(
-        "hint" if slow else "ok",
-        f"{text}; that is slow for a local network" if slow else text,
-        "Look at what is between: Wi-Fi, VPN, a busy switch, a busy machine." if slow else "",
+        "hint" if is_slow else "ok",
+        f"{text}; that is slow for a local network" if is_slow else text,
+        "Look at what is between: Wi-Fi, VPN, a busy switch, a busy machine." if is_slow else "",
         round_trip=measured._asdict(),
     )
 
@@ -129,27 +127,27 @@ async def measure_round_trip(exam: Examination) -> None:
 # ---------------------------------------------------------------------- run state
 
 
-_RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
+_DIAGNOSES: tuple[Diagnosis[list[Status]], ...] = (
     Diagnosis(
-        lambda seen: _is_stopped(seen[-1]),
+        lambda statuses: _is_stopped(statuses[-1]),
         "{application} is stopped, so no result comes",
         "Start it: smartcam start '{url}', or await camera.start(), or name the application "
         "(smartcam trigger --application, connect(application=...)), which starts it.",
         Exit.REFUSED,
     ),
     Diagnosis(
-        lambda seen: all(Status.BUSY in status for status in seen),
+        lambda statuses: all(Status.BUSY in status for status in statuses),
         "the camera was BUSY for all of the {seconds:g} s",
         "It loads an application, or somebody works on its pages. If it stays so for minutes, "
         "restart it.",
-        Exit.RAN_OUT,
+        Exit.TIMED_OUT,
     ),
     Diagnosis(
-        lambda seen: True,
+        lambda statuses: True,
         "{application} runs, does not wait for a trigger, and sent nothing in {seconds:g} s",
         'It runs free without a "send results" tool, or an inspection takes longer than that: '
         "watch longer (--seconds), or look at the application on the camera.",
-        Exit.RAN_OUT,
+        Exit.TIMED_OUT,
     ),
 )
 """Diagnoses of a camera that sends no result while it is watched; the first that fits holds."""
@@ -164,79 +162,83 @@ async def watch(exam: Examination) -> None:
     application, status = camera.active_application, camera.status
     if Status.SYSTEM_ERROR in status:
         return  # this was reported already, and explains the rest
-    settled = _is_stopped(status) or (_waits(status) and exam.wants_trigger)
-    seen = [status] if settled else await _watch(exam, seconds)
+    is_decided = _is_stopped(status) or (_waits_for_trigger(status) and exam.wants_trigger)
+    statuses = [status] if is_decided else await _watch_status(exam, seconds)
     details: dict[str, Any] = {"application": application, "status": camera.status}
-    stopped = _is_stopped(seen[-1])  # the camera may have stopped since
-    if any(_waits(status) for status in seen) and not stopped:
+    is_stopped = _is_stopped(statuses[-1])  # the camera may have stopped since
+    if any(_waits_for_trigger(status) for status in statuses) and not is_stopped:
         exam.may_trigger = True
-        text = f"{called(application)} runs and waits for triggers"
-        text += f"; {witness.results} results came in {seconds:g} s" if witness.results else ""
-        exam.report("ok", text, **details, **_rate(witness))
-    elif witness.results and not stopped:
+        text = f"{application_text(application)} runs and waits for triggers"
+        text += (
+            f"; {witness.result_count} results came in {seconds:g} s"
+            if witness.result_count
+            else ""
+        )
+        exam.report("ok", text, **details, **_rate_details(witness))
+    elif witness.result_count and not is_stopped:
         _report_free_run(exam, details)
     else:
-        state = next(state for state in _RUN_STATES if state.fits(seen))
+        diagnosis = next(diagnosis for diagnosis in _DIAGNOSES if diagnosis.fits(statuses))
         exam.fail(
-            state.text.format(application=called(application), seconds=seconds),
-            state.cure.format(url=camera.url),
-            exit_code=state.exit_code,
+            diagnosis.text.format(application=application_text(application), seconds=seconds),
+            diagnosis.cure.format(url=camera.url),
+            exit_code=diagnosis.exit_code,
             **details,
         )
 
 
 def _report_free_run(exam: Examination, details: dict[str, Any]) -> None:
-    witness, rate = exam.witness, _rate(exam.witness)
-    text = (
-        f"{called(exam.connected_camera.active_application)} runs free: {witness.results} results "
-    )
-    text += f"in {exam.options.seconds:g} s"
+    witness, rate = exam.witness, _rate_details(exam.witness)
+    application = application_text(exam.connected_camera.active_application)
+    text = f"{application} runs free: {witness.result_count} results in {exam.options.seconds:g} s"
     if rate:
-        text += f", {rate['results_per_second']:.1f} a second; intervals: {_intervals(witness)}"
-    wanted = exam.wants_trigger
+        text += (
+            f", {rate['results_per_second']:.1f} a second; intervals: {_interval_figures(witness)}"
+        )
+    wants_trigger = exam.wants_trigger
     exam.report(
-        "error" if wanted else "ok",
-        text + ("; a trigger to it would get no result" if wanted else ""),
+        "error" if wants_trigger else "ok",
+        text + ("; a trigger to it would get no result" if wants_trigger else ""),
         "Take its results with camera.results() or smartcam watch; or have the application "
         "triggered, on the camera."
-        if wanted
+        if wants_trigger
         else "",
-        exit_code=Exit.RAN_OUT if wanted else Exit.DONE,
+        exit_code=Exit.TIMED_OUT if wants_trigger else Exit.DONE,
         **details,
         **rate,
     )
 
 
-async def _watch(exam: Examination, seconds: float) -> list[Status]:
+async def _watch_status(exam: Examination, seconds: float) -> list[Status]:
     """Return every status within some seconds, the present one first."""
-    seen: deque[Status] = deque(maxlen=MAX_WATCHED_STATUSES)
+    statuses: deque[Status] = deque(maxlen=MAX_WATCHED_STATUSES)
 
-    def note(status: Status) -> bool:
-        seen.append(status)
+    def keep(status: Status) -> bool:
+        statuses.append(status)
         return False
 
     exam.witness.forget_arrivals()
     # open while watching, since results are made only if there is a subscriber
     async with exam.connected_camera.results(max_queue=1):
         with contextlib.suppress(ResponseTimeoutError):
-            await exam.connected_camera.wait_status(note, timeout=seconds)
-    return list(seen)
+            await exam.connected_camera.wait_status(keep, timeout=seconds)
+    return list(statuses)
 
 
-def _intervals(witness: Witness) -> Figures:
-    return figures([after - before for before, after in pairwise(witness.arrivals)])
+def _interval_figures(witness: Witness) -> Figures:
+    return figures([after - before for before, after in pairwise(witness.arrival_times)])
 
 
-def _rate(witness: Witness) -> dict[str, Any]:
+def _rate_details(witness: Witness) -> dict[str, Any]:
     """Return rate and spread of unasked results; nothing for a single one."""
-    arrivals = witness.arrivals
-    if len(arrivals) < 2:
+    arrival_times = witness.arrival_times
+    if len(arrival_times) < 2:
         return {}
-    span = arrivals[-1] - arrivals[0]
+    span = arrival_times[-1] - arrival_times[0]
     return {
-        "results": witness.results,
-        "results_per_second": (len(arrivals) - 1) / span if span else 0.0,
-        "interval": _intervals(witness)._asdict(),
+        "results": witness.result_count,
+        "results_per_second": (len(arrival_times) - 1) / span if span else 0.0,
+        "interval": _interval_figures(witness)._asdict(),
     }
 
 
@@ -244,7 +246,7 @@ def _is_stopped(status: Status) -> bool:
     return not status & (Status.RUNNING | Status.BUSY | Status.WAITING_FOR_TRIGGER)
 
 
-def _waits(status: Status) -> bool:
+def _waits_for_trigger(status: Status) -> bool:
     return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
 
 
@@ -263,7 +265,7 @@ async def look_at_clock(exam: Examination) -> None:
         exam.report("ok", f"{camera.capabilities.dialect} has no message for a clock")
         return
     try:
-        shown = await camera.get_clock()
+        camera_time = await camera.get_clock()
     except InterpretationError as exc:
         exam.report("warning", f"the camera's clock is no date: {exc.got}", _SET_CLOCK)
         return
@@ -276,28 +278,28 @@ async def look_at_clock(exam: Examination) -> None:
         return
     now = datetime.now(UTC)
     local = now.astimezone().replace(tzinfo=None)
-    clocks = {"local time": shown - local, "UTC": shown - now.replace(tzinfo=None)}
+    clocks = {"local time": camera_time - local, "UTC": camera_time - now.replace(tzinfo=None)}
     zone, difference = min(clocks.items(), key=lambda item: abs(item[1]))
-    text = f"the camera's clock shows {shown:%Y-%m-%d %H:%M:%S}"
+    text = f"the camera's clock shows {camera_time:%Y-%m-%d %H:%M:%S}"
     details: dict[str, Any] = {
-        "clock": shown,
+        "clock": camera_time,
         "seconds_off": difference.total_seconds(),
         "compared_with": zone,
     }
-    if abs(difference) <= CLOCK_MAY_DIFFER:
+    if abs(difference) <= MAX_CLOCK_DIFFERENCE:
         exam.report("ok", f"{text}, which is this machine's {zone}", **details)
         return
-    behind = "behind" if difference < timedelta(0) else "ahead of"
+    direction = "behind" if difference < timedelta(0) else "ahead of"
     exam.report(
         "warning",
-        f"{text}, {_rounded(abs(difference))} {behind} this machine's "
+        f"{text}, {_duration_text(abs(difference))} {direction} this machine's "
         f"{zone}; it carries no time zone, and a restart of the camera loses it",
         _SET_CLOCK,
         **details,
     )
 
 
-def _rounded(difference: timedelta) -> str:
+def _duration_text(difference: timedelta) -> str:
     """Return a time in whole seconds, or in whole days if it is more than a week."""
     if difference > timedelta(days=7):
         return f"{difference.days} days"

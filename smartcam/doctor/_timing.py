@@ -1,4 +1,4 @@
-"""Times in figures: minimum, median, 99th percentile and jitter."""
+"""Figures of a series of times: minimum, median, 99th percentile and jitter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Figures(NamedTuple):
         times: number of times in the series.
         min: shortest time.
         median: median of the times.
-        p99: the 99th percentile by nearest rank: the longest of 100 or fewer.
+        p99: the 99th percentile by nearest rank, which is the longest of up to 100 times.
         jitter: mean of the absolute differences of successive times; 0 for a single one.
     """
 

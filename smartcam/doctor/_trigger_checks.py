@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from smartcam.doctor._context import called
+from smartcam.doctor._context import application_text
 from smartcam.doctor._findings import Exit
 from smartcam.doctor._timing import figures
 from smartcam.exceptions import (
@@ -24,40 +24,40 @@ if TYPE_CHECKING:
 async def look_at_application(exam: Examination) -> None:
     """Check ``application``: whether the expected one is active; load it for triggers only.
 
-    The protocol cannot ask whether an application exists without loading it.
+    The protocol cannot ask whether an application exists, only load it.
     """
     camera, wanted = exam.connected_camera, exam.options.application
     active = await camera.query_application()
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     if wanted is None or (wanted == active and not exam.wants_trigger):
-        exam.report("ok", f"{called(active)} is active", **details)
+        exam.report("ok", f"{application_text(active)} is active", **details)
     elif wanted == 0:
         exam.wants_trigger = False  # triggers would run another application
         exam.fail(
-            f"no application has the id 0; {called(active)} is active",
+            f"no application has the id 0; {application_text(active)} is active",
             "Name another id: the camera's pages show them.",
             exit_code=Exit.REFUSED,
             **details,
         )
     elif exam.wants_trigger:
-        await _borrow(exam, active, wanted)
+        await _load_for_triggers(exam, active, wanted)
     else:
         exam.report(
             "warning",
-            f"{called(active)} is active, not {wanted}; whether the camera has {wanted} cannot "
-            "be known without loading it",
+            f"{application_text(active)} is active, not {wanted}; whether the camera has {wanted} "
+            "cannot be known without loading it",
             f"smartcam switch '{camera.url}' {wanted} loads it. With --trigger the doctor loads "
             "it, and the one before again afterwards.",
             **details,
         )
 
 
-async def _borrow(exam: Examination, active: int, wanted: int) -> None:
+async def _load_for_triggers(exam: Examination, active: int, wanted: int) -> None:
     camera = exam.connected_camera
     details: dict[str, Any] = {"active": active, "wanted": wanted}
     exam.wants_trigger = False  # until the wanted application is loaded
     try:
-        await exam.borrowed.enter_async_context(camera.application(wanted))
+        await exam.application_cleanup.enter_async_context(camera.application(wanted))
     except CommandRejectedError as exc:
         exam.fail(
             f"the camera has no application {wanted}: {exc}",
@@ -71,10 +71,10 @@ async def _borrow(exam: Examination, active: int, wanted: int) -> None:
     exam.report("ok", text, **details)
 
 
-async def give_back(exam: Examination) -> None:
+async def restore_application(exam: Examination) -> None:
     """Restore the application and the run state from before the triggers."""
     try:
-        await exam.borrowed.aclose()
+        await exam.application_cleanup.aclose()
     except LinkError:
         raise
     except SmartCamError as exc:
@@ -88,19 +88,19 @@ async def give_back(exam: Examination) -> None:
 # ---------------------------------------------------------------------- triggers
 
 
-async def trigger(exam: Examination) -> None:
-    """Check ``trigger``: send some, one by one, up to the first without a result."""
+async def send_triggers(exam: Examination) -> None:
+    """Check ``trigger``: send triggers one by one until one has no result."""
     if not (exam.wants_trigger and exam.may_trigger):
         return
     camera, loop, options = exam.connected_camera, asyncio.get_running_loop(), exam.options
     times: list[float] = []
-    begin = ended = loop.time()
+    start = end = loop.time()
     async with camera.results(max_queue=1):
         for _ in range(options.count):
             exam.witness.statuses.clear()
             sent_at = loop.time()
             try:
-                result = await camera.trigger(timeout=options.step(5.0))
+                result = await camera.trigger(timeout=options.step_timeout(5.0))
             except LinkError:
                 raise
             except InterpretationError:
@@ -108,60 +108,61 @@ async def trigger(exam: Examination) -> None:
             except SmartCamError as exc:
                 _report_failure(exam, exc, len(times))
                 break
-            ended = loop.time()
-            times.append(ended - sent_at if result.latency is None else result.latency)
+            end = loop.time()
+            times.append(end - sent_at if result.latency is None else result.latency)
     if not times:
         return
     measured = figures(times)
-    rate = len(times) / max(ended - begin, sum(times))
+    rate = len(times) / max(end - start, sum(times))
     text = f"{measured.times} triggers to their results: {measured}; {rate:.1f} results a second"
     exam.report("ok", text, trigger_time=measured._asdict(), results_per_second=rate)
-    extra = camera.statistics().extra_results
-    if extra:
+    extra_count = camera.statistics().extra_results
+    if extra_count:
         exam.report(
             "hint",
-            f"{extra} results more than triggers came: the application sends several for each",
+            f"{extra_count} results more than triggers came: the application sends several for "
+            "each",
             "Tell the client how many: camera.trigger(results_per_trigger=...).",
-            extra_results=extra,
+            extra_results=extra_count,
         )
 
 
-def _report_failure(exam: Examination, error: SmartCamError, done: int) -> None:
-    which = f"trigger {done + 1}"
+def _report_failure(exam: Examination, error: SmartCamError, result_count: int) -> None:
+    trigger_text = f"trigger {result_count + 1}"
     if not isinstance(error, TriggerTimeoutError):
         exam.fail(
-            f"{which} gave no result: {error}",
+            f"{trigger_text} gave no result: {error}",
             "docs/troubleshooting.md explains this error.",
             exit_code=Exit.REFUSED,
             error=type(error).__name__,
         )
         return
-    story = [Status.WAITING_FOR_TRIGGER in status for status in exam.witness.statuses]
-    fell = False in story
-    rose = fell and True in story[story.index(False) :]
-    patience = exam.options.step(5.0)
+    was_waiting = [Status.WAITING_FOR_TRIGGER in status for status in exam.witness.statuses]
+    fell = False in was_waiting
+    rose = fell and True in was_waiting[was_waiting.index(False) :]
+    timeout = exam.options.step_timeout(5.0)
     if rose:
         text = (
-            f"{which} was inspected and nothing was sent: Waiting for Trigger fell and rose again, "
-            f"and no result came within {patience:g} s"
+            f"{trigger_text} was inspected and nothing was sent: Waiting for Trigger fell and rose "
+            f"again, and no result came within {timeout:g} s"
         )
         cure = (
             'The application has no "send results" tool, or sends to another interface: add one '
             "for the process interface, on the camera."
         )
     elif fell:
-        text = f"the inspection of {which} was not done within {patience:g} s"
+        text = f"the inspection of {trigger_text} was not done within {timeout:g} s"
         cure = "Give it more time: --timeout, or trigger(timeout=...)."
     elif not exam.connected_camera.capabilities.status_by_itself:
-        text = f"{which} was taken, and no result came within {patience:g} s"
+        text = f"{trigger_text} was taken, and no result came within {timeout:g} s"
         cure = (
             'Does the application send results to the process interface ("send results", '
             '"Outputs")? Does an inspection take longer than that (--timeout)?'
         )
     else:
-        text = f"{which} was not taken: the camera went on waiting for a trigger"
+        text = f"{trigger_text} was not taken: the camera went on waiting for a trigger"
         cure = (
             "It is set to another trigger source (a sensor, an encoder): look at the application's "
             "camera settings. Over UDP the trigger may have been lost."
         )
-    exam.fail(text, cure, exit_code=Exit.RAN_OUT, error=type(error).__name__, inspected=rose)
+    exam.fail(text, cure, exit_code=Exit.TIMED_OUT, error=type(error).__name__, inspected=rose)

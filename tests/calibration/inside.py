@@ -7,18 +7,18 @@ from smartcam.calibration._detection.charucos import charuco_board
 from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_corners
 from smartcam.calibration._detection.grid_growing import (
     MAX_SEEDS_TRIED,
-    _Grown,
-    alike_areas,
-    lattices,
+    _GridGrower,
+    area_test,
+    grow_grids,
 )
-from smartcam.calibration._detection.image import grey_image, scaled
+from smartcam.calibration._detection.image import grey_image, resize_image
 from smartcam.calibration._detection.markers import (
     MAX_OUTLINES,
     MAX_OUTLINES_OF_ALL_WINDOWS,
     WINDOWS_PX,
     Markers,
     _outlines,
-    agreeing,
+    compare_with_board,
     marker_finder,
 )
 from smartcam.calibration._files import store
@@ -33,8 +33,8 @@ from smartcam.calibration._files.store import (
 from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
     check_motion,
-    second_turn,
-    second_turns,
+    left_out_second_axis_turns,
+    second_axis_turn,
     solve_linear,
 )
 from smartcam.calibration._hand_eye.equations import (
@@ -46,10 +46,10 @@ from smartcam.calibration._hand_eye.equations import (
     Setup,
     Solution,
     adjust,
-    bends,
+    bend_heights,
+    leave_each_out,
     predicted_views,
-    sums,
-    without_each,
+    view_products,
 )
 from smartcam.calibration._homography import apply_homography, element_derivatives, fit_homography
 from smartcam.calibration._lens.bundle import (
@@ -65,7 +65,12 @@ from smartcam.calibration._lens.bundle import adjust as bundle_adjust
 from smartcam.calibration._lens.coverage import Coverage, coverage
 from smartcam.calibration._lens.intrinsics import ViewFit
 from smartcam.calibration._lens.poses import half_turned
-from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.calibration._lens.projection import (
+    excess_variance,
+    linearize,
+    pose_changes,
+    whitening,
+)
 from smartcam.calibration._lens.sheet_shape import adjust_shape, choose_shape, moved_to_nominal
 from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration._plane.fitting import (
@@ -89,7 +94,7 @@ from smartcam.calibration._printing.page import (
 from smartcam.calibration._printing.page_layout import BORDER_MM, RULER_MM
 from smartcam.calibration._printing.sheets import Rays, Sheet, page_size
 from smartcam.calibration._solvers import CameraPosition2D, Poses, RealWorldPosition, Solver
-from smartcam.calibration._stereo.checks import check_apart, check_fit, remark_sides
+from smartcam.calibration._stereo.checks import check_cameras_apart, check_fit, side_remarks
 from smartcam.calibration.formats._cameras import (
     FORMS,
     CameraForm,

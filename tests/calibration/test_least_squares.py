@@ -10,7 +10,7 @@ from smartcam._extras import load
 from smartcam.calibration import fit_plane
 from smartcam.calibration._least_squares import (
     MAX_UNKNOWNS_BY_SVD,
-    Normal,
+    NormalEquations,
     inverse_scaled,
     minimize,
     solve_scaled,
@@ -32,11 +32,11 @@ for number in range(3):
     DENSE[10 * number : 10 * number + 10, 4 + 2 * number : 6 + 2 * number] = OWN[number]
 
 
-def normal(residuals: np.ndarray) -> Normal:
+def normal(residuals: np.ndarray) -> NormalEquations:
     parts = SHARED.reshape(3, 10, 4)
     off = residuals.reshape(3, 10, 1)
     turned = OWN.swapaxes(1, 2)
-    return Normal(
+    return NormalEquations(
         float((residuals**2).sum()),
         SHARED.T @ SHARED,
         SHARED.T @ residuals,
@@ -66,11 +66,11 @@ def test_covariance_is_the_blocks_of_the_whole_inverse() -> None:
 def test_minimize_takes_back_a_step_without_gain(*, fails: bool) -> None:
     """The cost x^2 + 1000 (y - x^2)^2 has a bent valley; beyond a wall there is no cost."""
 
-    def evaluate(at: np.ndarray) -> Normal:
+    def evaluate(at: np.ndarray) -> NormalEquations:
         x, y = at
         residuals = np.array([-x, np.sqrt(1000.0) * (x * x - y)])
         jacobian = np.array([[1.0, 0.0], [-2 * np.sqrt(1000.0) * x, np.sqrt(1000.0)]])
-        return Normal.nothing(2, 1, 0)._replace(
+        return NormalEquations.zeros(2, 1, 0)._replace(
             cost=float((residuals**2).sum()),
             shared=jacobian.T @ jacobian,
             shared_right=jacobian.T @ residuals,
@@ -82,14 +82,14 @@ def test_minimize_takes_back_a_step_without_gain(*, fails: bool) -> None:
         there: np.ndarray = at + shared
         return there
 
-    found, last = minimize(np.array([3.0, 5.0]), evaluate, moved, gain=1e-12)
+    found, last = minimize(np.array([3.0, 5.0]), evaluate, moved, min_gain=1e-12)
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
     assert last.cost < 1e-12
 
 
 def test_minimize_without_a_finite_cost_returns_the_start() -> None:
-    nothing = Normal.nothing(2, 1, 6)._replace(cost=np.inf)
-    found, last = minimize(7, lambda _: nothing, lambda at, _shared, _own: at, gain=1e-9)
+    nothing = NormalEquations.zeros(2, 1, 6)._replace(cost=np.inf)
+    found, last = minimize(7, lambda _: nothing, lambda at, _shared, _own: at, min_gain=1e-9)
     assert (found, last.cost) == (7, np.inf)
     assert np.isnan(last.covariance()[0]).all()
 
@@ -186,7 +186,7 @@ def test_a_copy_in_a_fork_begins_anew() -> None:
         one.forked()
         with one:
             assert set(threads()) == {1}
-    assert not one._inside  # a thread that was inside before the fork has no effect in the child
+    assert not one._depths  # a thread that was inside before the fork has no effect in the child
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -176,11 +176,11 @@ def test_render_dots_have_their_areas_and_centroids(*, asymmetric: bool) -> None
         origin_diameter=0.006,
     )  # fmt: skip
     image = render(grid, UNIT, upright(15.3, 38.6), blur=0.5, black=0, white=200)
-    ink = 1 - image.astype(float) / 200
+    pattern_shapes = 1 - image.astype(float) / 200
     for point, diameter in zip(grid.points, [6] + [4] * 11, strict=True):
         u, v = 15.3 + 1e3 * point[0], 38.6 - 1e3 * point[1]
         y, x = np.mgrid[:50, :60]
-        near = ink * (np.hypot(x - u, y - v) < 3.6 + (diameter - 4) / 2)
+        near = pattern_shapes * (np.hypot(x - u, y - v) < 3.6 + (diameter - 4) / 2)
         if not asymmetric or diameter == 4:
             assert near.sum() == pytest.approx(np.pi * diameter**2 / 4, rel=0.05)
             assert (near * x).sum() / near.sum() == pytest.approx(u, abs=0.05)

@@ -1,4 +1,4 @@
-"""Helpers of the doctor's tests: a whole examination, and picking its findings."""
+"""Helpers of the doctor's tests: run an examination, and pick findings."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ if TYPE_CHECKING:
     from tests.doctor.inside import Exit, Severity
 
 STEP = 1.0
-"""Seconds of a step that is not meant to run out."""
+"""Timeout of a step that is not expected to time out, in seconds."""
 
 SHORT = 0.2
-"""Seconds of one that is; all ways to speak to an address share it."""
+"""Timeout of a step that is expected to time out; all ways to speak to an address share it."""
 
 WATCH = 0.05
-"""Seconds that a camera is watched."""
+"""Seconds for which a camera is watched."""
 
 
 def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ask as often on a slow machine, without a remark on it."""
-    monkeypatch.setattr(_state_checks, "QUERIES_WITHIN", PATIENCE)
+    """Allow a slow machine all requests, and no hint about slow requests."""
+    monkeypatch.setattr(_state_checks, "MAX_QUERYING_SECONDS", PATIENCE)
     monkeypatch.setattr(_state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE)
 
 
 async def examined(url: str, **options: Any) -> list[Finding]:
-    """Return everything that an examination finds."""
+    """Return the findings of an examination."""
     options = {"timeout": STEP, "seconds": WATCH, **options}
     async with aclosing(examine(url, **options)) as findings:
         return [finding async for finding in findings]
 
 
-def of(findings: list[Finding], check: str) -> Finding:
+def finding_of(findings: list[Finding], check: str) -> Finding:
     """Return the one finding of a check."""
     (found,) = [finding for finding in findings if finding.check == check]
     return found

@@ -1,4 +1,4 @@
-"""A network of this machine's own addresses for searches: cameras, and what else may listen."""
+"""Servers on loopback addresses for the tests of searches: cameras and others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._inside import ClientLink
 
 NETWORK = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250 + 1}."
-"""Of this process alone, so that tests side by side do not meet."""
+"""First three numbers of addresses that only this process uses, for tests in parallel."""
 
 
 def free_port() -> int:
@@ -32,14 +32,14 @@ def free_port() -> int:
 
 
 class Listening:
-    """A server that says ``greeting`` and is silent from then on, or hangs up.
+    """A server that sends ``greeting``, and then is silent or closes the connection.
 
-    ``slowly``: seconds between two letters of it.
+    ``slowly``: seconds between two bytes of the greeting.
 
     Attributes:
-        received: all that clients have sent.
-        opened: connections so far.
-        ended: those that clients have ended.
+        received: bytes from all clients.
+        opened: number of connections so far.
+        ended: number of connections that clients have closed.
     """
 
     def __init__(self, greeting: bytes, *, hangs_up: bool, slowly: float) -> None:
@@ -53,8 +53,8 @@ class Listening:
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.opened += 1
         with contextlib.suppress(ConnectionError):
-            for nth in range(len(self._greeting) if self._slowly else 0):
-                writer.write(self._greeting[nth : nth + 1])
+            for index in range(len(self._greeting) if self._slowly else 0):
+                writer.write(self._greeting[index : index + 1])
                 await asyncio.sleep(self._slowly)
             if not self._slowly:
                 writer.write(self._greeting)
@@ -70,10 +70,10 @@ class Listening:
 async def listening(
     host: str, port: int, greeting: bytes = b"", *, hangs_up: bool = False, slowly: float = 0.0
 ) -> AsyncIterator[Listening]:
-    """Run a server of its kind at an address."""
-    made = Listening(greeting, hangs_up=hangs_up, slowly=slowly)
-    async with await asyncio.start_server(made.serve, host, port):
-        yield made
+    """Run a :class:`Listening` server at an address."""
+    server = Listening(greeting, hangs_up=hangs_up, slowly=slowly)
+    async with await asyncio.start_server(server.serve, host, port):
+        yield server
 
 
 @contextlib.contextmanager
@@ -89,7 +89,7 @@ def filtered(host: str, port: int) -> Iterator[None]:
 
 
 class TakenAtOnce(EmulatedCamera):
-    """The other reading of what no document says: a connection alone takes the session."""
+    """A camera whose session a bare connection takes; no document says whether cameras do that."""
 
     def arrived(self, link: ClientLink) -> None:
         super().arrived(link)
@@ -99,7 +99,7 @@ class TakenAtOnce(EmulatedCamera):
 
 
 class RefusesAtOnce(EmulatedCamera):
-    """A third one: while there is a session, newcomers are sent away as they come."""
+    """A camera that closes every new connection at once while it has a session."""
 
     def arrived(self, link: ClientLink) -> None:
         super().arrived(link)

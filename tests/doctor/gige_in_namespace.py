@@ -1,4 +1,4 @@
-"""Examines Aravis' fake camera in a situation; run in a network namespace by test_gige.py.
+"""Examine Aravis's fake camera in a situation; test_gige.py runs this in a network namespace.
 
 ``python -m tests.doctor.gige_in_namespace SITUATION`` prints the findings as JSON.
 """

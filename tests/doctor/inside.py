@@ -1,4 +1,4 @@
-"""Private names of the room that its kits or several of its tests use."""
+"""Private names of smartcam.doctor that the helpers or several tests use."""
 
 from __future__ import annotations
 

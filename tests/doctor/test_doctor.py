@@ -1,4 +1,4 @@
-"""The doctor in a session: status, application, run state, triggers, clock; and what it leaves."""
+"""Test the doctor in a session: its checks, and how it leaves the camera."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from smartcam.emulator._inside import BaseFault
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from tests.doctor.doctorkit import WATCH, errors, examined, of, severities
+from tests.doctor.doctorkit import WATCH, errors, examined, finding_of, severities
 from tests.doctor.inside import Exit
 from tests.handmade import until
 
-QUICK = [
+APPLICATIONS = [
     Application(id=2, layout="n: int32", constant={"n": 1}, load_time=0, processing_time=0.001),
     Application(id=4, load_time=0, processing_time=0.001),
     Application(
@@ -33,17 +33,17 @@ QUICK = [
     Application(id=6, rate=100, load_time=0, processing_time=0),
     Application(id=10, load_time=0, processing_time=0),
 ]
-"""2 waits for triggers, 4 has no "send results" tool, 5 runs free, 6 does so and sends nothing, 10
-neither sends nor takes any time."""
+"""Applications: 2 waits for triggers; 4 has no "send results" tool; 5 runs free; 6 runs free and
+sends nothing; 10 sends nothing and takes no time."""
 
 
 def camera(active: int = 2, **options: Any) -> EmulatedCamera:
     options.setdefault("running", True)
-    return EmulatedCamera(QUICK, active=active, **options)
+    return EmulatedCamera(APPLICATIONS, active=active, **options)
 
 
-def sent(emulator: EmulatedCamera) -> set[type[m.Message]]:
-    """Return the messages of clients."""
+def sent_message_types(emulator: EmulatedCamera) -> set[type[m.Message]]:
+    """Return the types of the messages from clients."""
     return {type(e.message) for e in emulator.log if e.direction == "in" and e.message is not None}
 
 
@@ -70,7 +70,7 @@ async def test_healthy_camera_has_nothing_wrong() -> None:
 
 async def test_round_trip_has_figures_of_thirty_requests() -> None:
     async with camera() as emulator:
-        found = of(await examined(emulator.url), "round trip")
+        found = finding_of(await examined(emulator.url), "round trip")
     times = found.details["round_trip"]
     assert times["times"] == 30
     assert 0 < times["min"] <= times["median"] <= times["p99"] < 1.0
@@ -87,7 +87,7 @@ ASKING = {m.Connect, m.Disconnect, m.Query, m.GetClock, m.GetStatus}
 async def test_without_trigger_it_only_asks(dialect: str, transport: Any, active: int) -> None:
     async with camera(active, dialect=dialect, transport=transport) as emulator:
         await examined(emulator.url, application=2, interpret_as="n: int32", count=3)
-        assert sent(emulator) <= ASKING
+        assert sent_message_types(emulator) <= ASKING
         assert emulator.device.active_application == active
         assert emulator.device.running
 
@@ -95,14 +95,14 @@ async def test_without_trigger_it_only_asks(dialect: str, transport: Any, active
 async def test_without_trigger_a_stopped_camera_stays_stopped() -> None:
     async with camera(running=False) as emulator:
         await examined(emulator.url, application=5)
-        assert sent(emulator) <= ASKING
+        assert sent_message_types(emulator) <= ASKING
         assert (emulator.device.active_application, emulator.device.running) == (2, False)
 
 
 async def test_with_trigger_without_application_it_only_triggers() -> None:
     async with camera() as emulator:
         await examined(emulator.url, trigger=True, count=2)
-        assert sent(emulator) == {*ASKING - {m.GetStatus}, m.Trigger}
+        assert sent_message_types(emulator) == {*ASKING - {m.GetStatus}, m.Trigger}
 
 
 @pytest.mark.parametrize("running", [True, False])
@@ -111,7 +111,7 @@ async def test_with_trigger_and_application_everything_goes_back(running: bool) 
         findings = await examined(emulator.url, trigger=True, application=2, count=2)
         state = (emulator.device.active_application, emulator.device.running)
     assert errors(findings) == []
-    assert of(findings, "trigger").details["trigger_time"]["times"] == 2
+    assert finding_of(findings, "trigger").details["trigger_time"]["times"] == 2
     assert state == (5, running)
 
 
@@ -134,7 +134,7 @@ async def test_cancelled_while_watching_says_disconnect() -> None:
 
 async def test_cancelled_while_triggering_goes_back() -> None:
     slow = Application(id=8, layout="n: int32", constant={"n": 1}, processing_time=60, load_time=0)
-    async with EmulatedCamera([*QUICK, slow], active=2, running=True) as emulator:
+    async with EmulatedCamera([*APPLICATIONS, slow], active=2, running=True) as emulator:
         task = asyncio.create_task(examined(emulator.url, application=8, trigger=True, timeout=30))
         await emulator.wait_received(m.Trigger)
         task.cancel()
@@ -185,7 +185,7 @@ async def test_condition_of_the_camera_is_reported(
 ) -> None:
     async with camera(faults=[faults.Condition(condition=condition)]) as emulator:
         findings = await examined(emulator.url)
-    found = of(findings, "status")
+    found = finding_of(findings, "status")
     assert (found.severity, found.exit_code) == (severity, code)
     assert text in found.text
     assert summary(findings).exit_code == code
@@ -208,7 +208,7 @@ async def test_bit_of_the_status_is_reported(word: int, severity: str, text: str
     )
     async with camera(faults=[status]) as emulator:
         findings = await examined(emulator.url)
-    found = of(findings, "status")
+    found = finding_of(findings, "status")
     assert found.severity == severity
     assert text in found.text
     assert errors(findings) == []
@@ -219,14 +219,14 @@ async def test_bit_of_the_status_is_reported(word: int, severity: str, text: str
 
 async def test_application_that_is_active_is_reported() -> None:
     async with camera() as emulator:
-        found = of(await examined(emulator.url, application=2), "application")
+        found = finding_of(await examined(emulator.url, application=2), "application")
     assert (found.severity, found.text) == ("ok", "application 2 is active")
 
 
 async def test_application_that_is_not_active_is_a_warning_without_triggers() -> None:
     async with camera() as emulator:
         findings = await examined(emulator.url, application=77)
-    found = of(findings, "application")
+    found = finding_of(findings, "application")
     assert found.severity == "warning"
     assert "application 2 is active, not 77" in found.text
     assert "cannot be known without loading it" in found.text
@@ -236,10 +236,10 @@ async def test_application_that_is_not_active_is_a_warning_without_triggers() ->
 async def test_application_that_is_not_there_is_an_error_with_triggers() -> None:
     async with camera() as emulator:
         findings = await examined(emulator.url, application=77, trigger=True)
-        assert m.Trigger not in sent(emulator)
+        assert m.Trigger not in sent_message_types(emulator)
         assert (emulator.device.active_application, emulator.device.running) == (2, True)
     assert errors(findings) == [("application", Exit.REFUSED)]
-    found = of(findings, "application")
+    found = finding_of(findings, "application")
     assert found.text.startswith("the camera has no application 77: ")
     assert found.details == {"active": 2, "wanted": 77}
 
@@ -248,17 +248,17 @@ async def test_application_that_is_not_there_is_an_error_with_triggers() -> None
 async def test_application_zero_is_an_error(trigger: bool) -> None:
     async with camera() as emulator:
         findings = await examined(emulator.url, application=0, trigger=trigger, count=1)
-        assert m.Trigger not in sent(emulator)
+        assert m.Trigger not in sent_message_types(emulator)
     assert errors(findings) == [("application", Exit.REFUSED)]
-    assert "no application has the id 0" in of(findings, "application").text
+    assert "no application has the id 0" in finding_of(findings, "application").text
 
 
 async def test_application_that_does_not_get_ready_is_an_error_and_not_triggered() -> None:
     async with camera(faults=[faults.BusyForEver()]) as emulator:
         findings = await examined(emulator.url, application=5, trigger=True, timeout=0.2)
-        assert m.Trigger not in sent(emulator)
-    assert errors(findings) == [("application", Exit.RAN_OUT), ("run state", Exit.RAN_OUT)]
-    assert "did not get ready in time" in of(findings, "application").text
+        assert m.Trigger not in sent_message_types(emulator)
+    assert errors(findings) == [("application", Exit.TIMED_OUT), ("run state", Exit.TIMED_OUT)]
+    assert "did not get ready in time" in finding_of(findings, "application").text
 
 
 async def test_application_that_cannot_go_back_is_a_warning() -> None:
@@ -276,9 +276,9 @@ async def test_application_that_cannot_go_back_is_a_warning() -> None:
 async def test_stopped_camera_is_an_error_that_says_how_to_start() -> None:
     async with camera(running=False) as emulator:
         findings = await examined(emulator.url, trigger=True)
-        assert m.Trigger not in sent(emulator)
+        assert m.Trigger not in sent_message_types(emulator)
     assert errors(findings) == [("run state", Exit.REFUSED)]
-    found = of(findings, "run state")
+    found = finding_of(findings, "run state")
     assert found.text == "application 2 is stopped, so no result comes"
     assert f"smartcam start '{emulator.url}'" in found.cure
 
@@ -294,13 +294,15 @@ async def test_camera_that_is_stopped_while_watched_is_an_error() -> None:
 async def test_camera_busy_for_long_is_an_error() -> None:
     async with camera(faults=[faults.BusyForEver()]) as emulator:
         findings = await examined(emulator.url, trigger=True)
-    assert errors(findings) == [("run state", Exit.RAN_OUT)]
-    assert of(findings, "run state").text == f"the camera was BUSY for all of the {WATCH:g} s"
+    assert errors(findings) == [("run state", Exit.TIMED_OUT)]
+    assert (
+        finding_of(findings, "run state").text == f"the camera was BUSY for all of the {WATCH:g} s"
+    )
 
 
 async def test_waiting_camera_is_reported() -> None:
     async with camera() as emulator:
-        found = of(await examined(emulator.url), "run state")
+        found = finding_of(await examined(emulator.url), "run state")
     assert (found.severity, found.text) == ("ok", "application 2 runs and waits for triggers")
 
 
@@ -311,7 +313,7 @@ async def test_waiting_camera_that_a_sensor_triggers_has_a_rate() -> None:
         for _ in range(3):
             emulator.device.trigger()
             await until(lambda: emulator.device.status & Status.WAITING_FOR_TRIGGER)
-    found = of(watching.result(), "run state")
+    found = finding_of(watching.result(), "run state")
     assert "waits for triggers; " in found.text
     assert found.details["results"] >= 1
 
@@ -319,27 +321,27 @@ async def test_waiting_camera_that_a_sensor_triggers_has_a_rate() -> None:
 async def test_free_running_camera_is_reported_with_its_rate() -> None:
     async with camera(5) as emulator:
         findings = await examined(emulator.url, seconds=0.3)
-    found = of(findings, "run state")
+    found = finding_of(findings, "run state")
     assert found.severity == "ok"
     assert "application 5 runs free: " in found.text
     assert 50 < found.details["results_per_second"] < 200
     assert found.details["interval"]["times"] == found.details["results"] - 1
-    assert of(findings, "layout").details["sizes"] == [4]
+    assert finding_of(findings, "layout").details["sizes"] == [4]
 
 
 async def test_free_running_camera_is_an_error_where_it_should_be_triggered() -> None:
     async with camera(5) as emulator:
         findings = await examined(emulator.url, trigger=True)
-        assert m.Trigger not in sent(emulator)
-    assert errors(findings) == [("run state", Exit.RAN_OUT)]
-    assert "a trigger to it would get no result" in of(findings, "run state").text
+        assert m.Trigger not in sent_message_types(emulator)
+    assert errors(findings) == [("run state", Exit.TIMED_OUT)]
+    assert "a trigger to it would get no result" in finding_of(findings, "run state").text
 
 
 async def test_free_running_camera_that_sends_nothing_is_an_error() -> None:
     async with camera(6) as emulator:
         findings = await examined(emulator.url)
-    assert errors(findings) == [("run state", Exit.RAN_OUT)]
-    found = of(findings, "run state")
+    assert errors(findings) == [("run state", Exit.TIMED_OUT)]
+    found = finding_of(findings, "run state")
     assert "does not wait for a trigger, and sent nothing" in found.text
     assert '"send results" tool' in found.cure
 
@@ -350,7 +352,7 @@ async def test_free_running_camera_that_sends_nothing_is_an_error() -> None:
 async def test_triggers_have_figures_and_a_rate() -> None:
     async with camera() as emulator:
         findings = await examined(emulator.url, trigger=True, count=5)
-    found = of(findings, "trigger")
+    found = finding_of(findings, "trigger")
     times = found.details["trigger_time"]
     assert times["times"] == 5
     assert 0.001 <= times["min"] <= times["median"] <= times["p99"]
@@ -361,8 +363,8 @@ async def test_application_without_send_results_is_reported() -> None:
     async with camera(4) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
         assert [e.message for e in emulator.log].count(m.Trigger()) == 1
-    assert errors(findings) == [("trigger", Exit.RAN_OUT)]
-    found = of(findings, "trigger")
+    assert errors(findings) == [("trigger", Exit.TIMED_OUT)]
+    found = finding_of(findings, "trigger")
     assert "trigger 1 was inspected and nothing was sent" in found.text
     assert 'no "send results" tool' in found.cure
     assert found.details["inspected"] is True
@@ -371,14 +373,17 @@ async def test_application_without_send_results_is_reported() -> None:
 async def test_inspection_that_takes_too_long_is_reported() -> None:
     async with camera(faults=[faults.LateResult(on="Trigger", seconds=60)]) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
-    assert errors(findings) == [("trigger", Exit.RAN_OUT)]
-    assert of(findings, "trigger").text == "the inspection of trigger 1 was not done within 0.2 s"
+    assert errors(findings) == [("trigger", Exit.TIMED_OUT)]
+    assert (
+        finding_of(findings, "trigger").text
+        == "the inspection of trigger 1 was not done within 0.2 s"
+    )
 
 
 async def test_trigger_that_is_not_taken_is_reported() -> None:
     async with camera(faults=[faults.Drop(on="Trigger", times=None)]) as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
-    found = of(findings, "trigger")
+    found = finding_of(findings, "trigger")
     assert found.text == "trigger 1 was not taken: the camera went on waiting for a trigger"
     assert "another trigger source" in found.cure
 
@@ -386,8 +391,8 @@ async def test_trigger_that_is_not_taken_is_reported() -> None:
 async def test_trigger_without_result_where_the_status_is_asked_for_is_reported() -> None:
     async with camera(10, dialect="bid") as emulator:
         findings = await examined(emulator.url, trigger=True, timeout=0.2)
-    assert errors(findings) == [("trigger", Exit.RAN_OUT)]
-    found = of(findings, "trigger")
+    assert errors(findings) == [("trigger", Exit.TIMED_OUT)]
+    found = finding_of(findings, "trigger")
     assert found.text == "trigger 1 was taken, and no result came within 0.2 s"
     assert '"Outputs"' in found.cure
 
@@ -404,7 +409,7 @@ async def test_trigger_that_fails_is_reported_with_its_error(fault: BaseFault, e
     async with EmulatedCamera([slow], running=True, faults=[fault]) as emulator:
         findings = await examined(emulator.url, trigger=True)
     assert errors(findings) == [("trigger", Exit.REFUSED)]
-    found = of(findings, "trigger")
+    found = finding_of(findings, "trigger")
     assert found.text.startswith("trigger 1 gave no result: ")
     assert found.details["error"] == error
 
@@ -413,9 +418,9 @@ async def test_layout_with_a_sequence_number_sets_none() -> None:
     async with camera() as emulator:
         layout = "n: int32 @sequence"
         findings = await examined(emulator.url, trigger=True, count=2, interpret_as=layout)
-        assert m.SetSequenceNumber not in sent(emulator)
+        assert m.SetSequenceNumber not in sent_message_types(emulator)
     assert errors(findings) == []
-    assert of(findings, "layout").text == "2 results fit the layout 'n: int32 @sequence'"
+    assert finding_of(findings, "layout").text == "2 results fit the layout 'n: int32 @sequence'"
 
 
 async def test_second_trigger_that_fails_keeps_the_figures_of_the_first() -> None:
@@ -442,7 +447,7 @@ async def test_clock_that_is_off_is_a_warning(minutes: int) -> None:
     async with camera() as emulator:
         now = datetime.now(UTC).replace(tzinfo=None)
         await set_clock(emulator, now + timedelta(minutes=minutes))
-        found = of(await examined(emulator.url), "clock")
+        found = finding_of(await examined(emulator.url), "clock")
     assert (found.severity, found.exit_code) == ("warning", Exit.DONE)
     assert "no time zone, and a restart of the camera loses it" in found.text
     assert "set_clock" in found.cure
@@ -453,7 +458,7 @@ async def test_clock_that_is_off_is_a_warning(minutes: int) -> None:
 async def test_clock_that_shows_utc_is_well() -> None:
     async with camera() as emulator:
         await set_clock(emulator, datetime.now(UTC).replace(tzinfo=None))
-        found = of(await examined(emulator.url), "clock")
+        found = finding_of(await examined(emulator.url), "clock")
     assert found.severity == "ok"
     assert abs(found.details["seconds_off"]) < 60
 
@@ -473,7 +478,7 @@ async def test_clock_that_is_no_date_is_a_warning() -> None:
     }  # fmt: skip
     wrong = faults.Insert(on="ClockAnswer", message="ClockAnswer", fields=fields, where="instead")
     async with camera(faults=[wrong]) as emulator:
-        found = of(await examined(emulator.url), "clock")
+        found = finding_of(await examined(emulator.url), "clock")
     assert found.severity == "warning"
     assert found.text == "the camera's clock is no date: (2026, 13, 1, 0, 0, 0)"
 
@@ -487,8 +492,8 @@ async def test_check_that_never_ends_is_ended(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(doctor, "_CHECKS", (name, session, never))
     async with camera() as emulator:
         findings = await examined(emulator.url)
-    assert errors(findings) == [("never", Exit.RAN_OUT)]
-    assert of(findings, "never").text == "this check did not end within 0.05 s"
+    assert errors(findings) == [("never", Exit.TIMED_OUT)]
+    assert finding_of(findings, "never").text == "this check did not end within 0.05 s"
 
 
 async def test_session_lost_if_nobody_waits_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -513,7 +518,7 @@ async def test_camera_with_a_login_is_examined_and_its_password_not_shown() -> N
         address = emulator.url.replace("://", "://me:secret@")
         findings = await examined(address)
     assert errors(findings) == []
-    assert of(findings, "clock").text == "native has no message for a clock"
+    assert finding_of(findings, "clock").text == "native has no message for a clock"
     assert "secret" not in repr(findings)
 
 
@@ -524,9 +529,9 @@ async def test_cells_of_a_spreadsheet_are_compared_with_the_layout() -> None:
         layout = "x: real32, name: string[3]"
         findings = await examined(address, trigger=True, count=2, interpret_as=layout)
         wrong = await examined(address, trigger=True, count=2, interpret_as="x: real32")
-    assert of(findings, "values").text.startswith("x goes up to 112.5")
+    assert finding_of(findings, "values").text.startswith("x goes up to 112.5")
     assert errors(wrong) == [("layout", Exit.UNREADABLE)]
-    assert "2 cells came, the layout has 1 fields" in of(wrong, "layout").text
+    assert "2 cells came, the layout has 1 fields" in finding_of(wrong, "layout").text
 
 
 # ---------------------------------------------------------------------- figures, summary
@@ -549,14 +554,14 @@ def test_summary_counts_and_has_the_code_of_the_first_of_the_worst() -> None:
         [
             finding("ok"),
             finding("hint"),
-            finding("error", Exit.RAN_OUT),
+            finding("error", Exit.TIMED_OUT),
             finding("warning"),
             finding("error", Exit.UNREADABLE),
             finding("hint"),
         ]
     )
     assert end.text == "2 errors, 1 warning, 2 hints"
-    assert (end.severity, end.exit_code) == ("error", Exit.RAN_OUT)
+    assert (end.severity, end.exit_code) == ("error", Exit.TIMED_OUT)
     assert end.details == {"ok": 1, "hint": 2, "warning": 1, "error": 2}
 
 

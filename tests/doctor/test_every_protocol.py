@@ -1,4 +1,4 @@
-"""Asking an address in every registered protocol: the tries, their order, and the report."""
+"""Test asking an address in every registered protocol: the tries, their order and the report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartcam.exceptions import ConnectFailedError
 from smartcam.protocols import Protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import parse_address
-from tests.doctor.doctorkit import errors, examined, of
+from tests.doctor.doctorkit import errors, examined, finding_of
 from tests.doctor.findkit import NETWORK, free_port
 from tests.handmade import HOST, refusing
 from tests.testing.acme_page import acme
@@ -115,5 +115,5 @@ async def test_doctor_names_the_address_in_the_protocol_that_is_spoken() -> None
     assert refused.severity == "error"
     assert url in refused.cure
     assert spoken.text.startswith("a camera answers by insight://, dialect native")
-    assert of(findings, "application").severity == "ok"
+    assert finding_of(findings, "application").severity == "ok"
     assert errors(findings)[0][0] == "session"

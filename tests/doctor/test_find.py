@@ -1,4 +1,4 @@
-"""Finding cameras: the ports that listen, a gentle search, and no harm to clients."""
+"""Test the search for cameras: which ports it finds, how fast, and that clients stay unharmed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import smartcam
 from smartcam import Backoff, ConfigurationError
 from smartcam.doctor import _search
 from smartcam.doctor._inside import CameraSearch, FoundPort
-from smartcam.doctor._opening import MAX_SAID_BYTES, Opened, is_own
+from smartcam.doctor._opening import MAX_UNASKED_BYTES, OpenedPort, is_connected_to_itself
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Protocol, Transport
 from smartcam.registry import PROTOCOLS
@@ -27,14 +27,14 @@ WELCOME = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 
 
 async def found_on(port: int, *networks: str, **options: Any) -> list[FoundPort]:
-    """Return the found port of this process' network, by the first two protocols."""
+    """Return the found ports of this process's network that the first two protocols use."""
     known = ("bvs", "insight")
     options = {"ports": [port], "protocols": known, "may_disturb": True, **options}
     return await smartcam.find(*(networks or (f"{NETWORK}0/28",)), **options)
 
 
-def told(found: list[FoundPort]) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Return by the address' last number: protocols, and what they are known by."""
+def by_last_number(found: list[FoundPort]) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return protocols and evidence by the last number of the address."""
     return {one.host.rpartition(".")[2]: (one.protocols, one.evidence) for one in found}
 
 
@@ -42,8 +42,8 @@ def told(found: list[FoundPort]) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 @contextlib.asynccontextmanager
-async def at_work(camera: Any, url: str) -> AsyncIterator[tuple[smartcam.Camera, list[int]]]:
-    """Run a client that triggers without a pause; yield it, and the numbers of the results."""
+async def working_client(camera: Any, url: str) -> AsyncIterator[tuple[smartcam.Camera, list[int]]]:
+    """Run a client that triggers without a pause; yield it and the numbers of its results."""
     results: list[int] = []
     async with smartcam.connect(url, reconnect=None) as client:
 
@@ -62,8 +62,8 @@ async def at_work(camera: Any, url: str) -> AsyncIterator[tuple[smartcam.Camera,
             assert task.cancelled(), task.exception()
 
 
-def heard_from(camera: EmulatedCamera | EmulatedInSight) -> set[str]:
-    """Return from whom a camera's account has bytes."""
+def peers_heard(camera: EmulatedCamera | EmulatedInSight) -> set[str]:
+    """Return the peers from which a camera has received bytes."""
     return {entry.peer for entry in camera.log if entry.direction == "in"}
 
 
@@ -76,7 +76,7 @@ async def test_clients_at_work_notice_nothing() -> None:
         for one in (*bvs, insight):
             await stack.enter_async_context(one)
             url = one.url + ("?cells=A1" if one is insight else "")
-            works.append((*await stack.enter_async_context(at_work(one, url)), one))
+            works.append((*await stack.enter_async_context(working_client(one, url)), one))
         silent = await stack.enter_async_context(listening(f"{NETWORK}4", port))
         await stack.enter_async_context(listening(f"{NETWORK}5", port, hangs_up=True))
         rubbish = await stack.enter_async_context(listening(f"{NETWORK}6", port, b"\xff\xfd\x18"))
@@ -87,7 +87,7 @@ async def test_clients_at_work_notice_nothing() -> None:
 
         found = await found_on(port)
 
-        assert told(found) == {
+        assert by_last_number(found) == {
             "1": (("bvs",), "silent"),
             "2": (("bvs",), "silent"),
             "3": (("insight",), "greeted"),
@@ -97,7 +97,7 @@ async def test_clients_at_work_notice_nothing() -> None:
             "7": ((), "other"),
         }
         assert [one.urls for one in found[2:3]] == [(f"insight://{NETWORK}3:{port}",)]
-        assert len(found[-1].received) == MAX_SAID_BYTES
+        assert len(found[-1].received) == MAX_UNASKED_BYTES
         for (client, results, one), had, session in zip(works, before, sessions, strict=True):
             assert len(results) > had > 0, "it has worked before and meanwhile"
             assert results == list(range(1, len(results) + 1)), "each trigger has had its result"
@@ -105,7 +105,7 @@ async def test_clients_at_work_notice_nothing() -> None:
             assert (seen.sessions, seen.triggered) == (1, seen.received)
             assert client.connected
             assert one.sessions == session
-            assert heard_from(one) == set(session)
+            assert peers_heard(one) == set(session)
         others = (silent, rubbish, endless)
         assert [(other.opened, other.received) for other in others] == [(1, b"")] * 3
         await until(lambda: all(other.ended == 1 for other in others))
@@ -120,9 +120,9 @@ async def test_session_stays_whatever_becomes_of_second_clients(quirks: dict[str
         EmulatedCamera(host=f"{NETWORK}1", port=port, quirks=quirks) as emulator,
         smartcam.connect(emulator.url, reconnect=None) as client,
     ):
-        assert told(await found_on(port)) == {"1": (("bvs",), "silent")}
+        assert by_last_number(await found_on(port)) == {"1": (("bvs",), "silent")}
         await client.query_application()
-        assert heard_from(emulator) == set(emulator.sessions)
+        assert peers_heard(emulator) == set(emulator.sessions)
 
 
 async def test_camera_of_one_client_is_not_asked_without_consent() -> None:
@@ -140,7 +140,9 @@ async def test_camera_of_one_client_is_not_asked_without_consent() -> None:
         assert emulator.sessions == session
         assert not emulator.visits
         # what "leave" is for: this reading of the documents, and what it costs
-        assert told(await found_on(port, may_disturb=False)) == {"1": (("bvs",), "silent")}
+        assert by_last_number(await found_on(port, may_disturb=False)) == {
+            "1": (("bvs",), "silent")
+        }
         await until(lambda: client.connected and emulator.sessions not in ([], session))
         assert client.statistics().reconnects == 1
 
@@ -151,7 +153,7 @@ async def test_camera_that_sends_newcomers_away_is_perhaps_one() -> None:
         RefusesAtOnce(host=f"{NETWORK}1", port=port) as emulator,
         smartcam.connect(emulator.url, reconnect=None) as client,
     ):
-        assert told(await found_on(port)) == {"1": (("bvs", "insight"), "ended")}
+        assert by_last_number(await found_on(port)) == {"1": (("bvs", "insight"), "ended")}
         await client.query_application()
 
 
@@ -211,7 +213,7 @@ async def test_plug_in_says_port_and_greeting(monkeypatch: pytest.MonkeyPatch) -
         listening(f"{NETWORK}3", port),
     ):
         found = await smartcam.find(f"{NETWORK}0/29", may_disturb=True)
-    assert told(found) == {
+    assert by_last_number(found) == {
         "1": (("polite",), "greeted"),
         "2": (("unsaid",), "said"),
         "3": (("unsaid",), "silent"),
@@ -242,26 +244,26 @@ async def test_asking_speaks_to_what_may_be_a_camera() -> None:
 # ---------------------------------------------------------------------- bounds
 
 
-def opened_at(monkeypatch: pytest.MonkeyPatch, lasts: float) -> tuple[list[float], list[int]]:
-    """Make openings last so long and touch nothing; yield times, and their number at once."""
+def fake_openings(monkeypatch: pytest.MonkeyPatch, lasts: float) -> tuple[list[float], list[int]]:
+    """Replace opening a port by waiting; return start times, and counts of openings at once."""
     times: list[float] = []
     at_once = [0, 0]
 
-    async def open_port(sock: socket.socket, *_: Any, **__: Any) -> Opened:
+    async def open_port(sock: socket.socket, *_: Any, **__: Any) -> OpenedPort:
         with sock:
             times.append(asyncio.get_running_loop().time())
             at_once[0] += 1
             at_once[1] = max(at_once)
             await asyncio.sleep(lasts)
             at_once[0] -= 1
-        return Opened("no answer")
+        return OpenedPort("no answer")
 
     monkeypatch.setattr(_search, "open_port", open_port)
     return times, at_once
 
 
 async def test_openings_have_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    times, _ = opened_at(monkeypatch, lasts=0.3)
+    times, _ = fake_openings(monkeypatch, lasts=0.3)
     search = CameraSearch(["10.0.0.0/24"], protocols=["insight"], ports=[24], rate=20, at_once=500)
     await search.run()
     assert len(times) == search.opened == search.total == 2 * 254
@@ -272,7 +274,7 @@ async def test_openings_have_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_connections_at_a_time_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    times, at_once = opened_at(monkeypatch, lasts=1.0)
+    times, at_once = fake_openings(monkeypatch, lasts=1.0)
     await smartcam.find("10.0.0.0/24", protocols=["insight"], rate=1000, at_once=10)
     assert at_once == [0, 10]
     assert times[-1] - times[0] == pytest.approx(25, rel=0.05)
@@ -328,7 +330,7 @@ def test_search_that_cannot_work_is_refused(options: dict[str, Any], said: str) 
 
 
 async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    times, _ = opened_at(monkeypatch, lasts=0.0)
+    times, _ = fake_openings(monkeypatch, lasts=0.0)
     networks, only = ("10.0.0.1-5", "10.0.0.4-6"), ["insight"]
     with pytest.raises(ConfigurationError, match="6 addresses are more than 3"):
         CameraSearch(networks, protocols=only, max_addresses=3)
@@ -337,7 +339,7 @@ async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) ->
 
 
 async def test_network_that_is_left_is_left_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    times, _ = opened_at(monkeypatch, lasts=0.0)
+    times, _ = fake_openings(monkeypatch, lasts=0.0)
     search = CameraSearch(
         ["10.0.0.0-20"], protocols=["insight"], leave=["10.0.0.0/28", "10.0.0.17"]
     )
@@ -368,7 +370,7 @@ async def test_name_means_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(loop, "getaddrinfo", look_up)
     async with listening(f"{NETWORK}1", port), listening(f"{NETWORK}2", port) as other:
-        assert [*told(await found_on(port, "cam.example"))] == ["1", "2"]
+        assert [*by_last_number(await found_on(port, "cam.example"))] == ["1", "2"]
         assert await found_on(port, leave=["cam.example"]) == []
         assert other.opened == 1
     for name, said in (("nobody.example", "no such name"), ("slow.example", "within 5 s")):
@@ -431,7 +433,7 @@ async def test_cancelled_search_closes_and_keeps_what_it_found() -> None:
             with pytest.raises(asyncio.CancelledError):
                 await task
         await until(lambda: silent.ended == silent.opened and later.ended == later.opened)
-        assert told(search.results()) == {"1": (("insight",), "greeted")}
+        assert by_last_number(search.results()) == {"1": (("insight",), "greeted")}
         assert search.opened < search.total
 
 
@@ -439,6 +441,6 @@ async def test_port_that_meets_itself_is_not_open() -> None:
     with socket.socket() as sock, socket.create_server((f"{NETWORK}1", 0)) as server:
         sock.bind((f"{NETWORK}1", free_port()))
         sock.connect(sock.getsockname())
-        assert is_own(sock)
+        assert is_connected_to_itself(sock)
         with socket.create_connection(server.getsockname()) as other:
-            assert not is_own(other)
+            assert not is_connected_to_itself(other)

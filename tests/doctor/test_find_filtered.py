@@ -1,4 +1,4 @@
-"""A search in a network that swallows, forbids and does not know: in a namespace of its own."""
+"""Test a search in a network namespace that drops, prohibits or has no way for packets."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from smartcam.emulator import EmulatedCamera
 pytestmark = pytest.mark.long
 
 DEVICE = "swallows"
+"""Name of a network device that drops all packets, like a firewall."""
 
-PORTS = 6
-"""Ports of the protocols that are known, which a search opens."""
-"""Takes packets and never delivers one, as a firewall that drops does."""
+PORT_COUNT = 6
+"""Number of ports of the known protocols, which a search opens."""
 
 SET_UP = (
     ("link", "set", "lo", "up"),
@@ -35,7 +35,7 @@ SET_UP = (
 
 
 async def _search() -> dict[str, object]:
-    """Search in the namespace; return what came of it."""
+    """Search in the namespace; return the results."""
     async with (
         EmulatedCamera(host="10.77.0.1", port=36701, active=21, running=True) as emulator,
         smartcam.connect(emulator.url, reconnect=None) as client,
@@ -46,13 +46,13 @@ async def _search() -> dict[str, object]:
         while not task.done():
             await client.trigger()
         await task
-        seen = client.statistics()
+        statistics = client.statistics()
         return {
             "found": [(one.host, one.protocols) for one in search.results()],
             "counts": search.counts,
             "why": search.why,
-            "lost": seen.received - seen.triggered,
-            "sessions": seen.sessions,
+            "lost": statistics.received - statistics.triggered,
+            "sessions": statistics.sessions,
         }
 
 
@@ -80,10 +80,10 @@ def test_search_ends_where_packets_are_dropped() -> None:
         # one of the ports is the camera's, where it is at home; nobody has the others
         "counts": {
             "open": 1,
-            "refused": PORTS - 1,
-            "no answer": PORTS * 13 + PORTS,
-            "unreachable": PORTS * 2 + PORTS,
-            "failed": PORTS * 3,
+            "refused": PORT_COUNT - 1,
+            "no answer": PORT_COUNT * 13 + PORT_COUNT,
+            "unreachable": PORT_COUNT * 2 + PORT_COUNT,
+            "failed": PORT_COUNT * 3,
         },
         "lost": 0,
         "sessions": 1,

@@ -1,6 +1,6 @@
-"""The doctor for GigE cameras: each situation that people ask about, and what it must say.
+"""Test the doctor for GigE cameras in each situation that people ask about.
 
-The situations are the most frequent threads of the trackers of pypylon and harvesters.
+The situations are the most frequent ones in the issues of pypylon and harvesters.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ T = TypeVar("T")
 PYPYLON = "https://github.com/basler/pypylon/issues/"
 HARVESTERS = "https://github.com/genicam/harvesters/issues/"
 
-THREADS: dict[str, tuple[str, ...]] = {
+ISSUES: dict[str, tuple[str, ...]] = {
     "the buffer was incompletely grabbed": (
         *(f"{PYPYLON}{number}" for number in (370, 446, 589, 597, 734)),
         f"{HARVESTERS}131",
@@ -60,20 +60,20 @@ THREADS: dict[str, tuple[str, ...]] = {
     "timeouts at a low frame rate": (f"{PYPYLON}857",),
     "several cameras, or a fast one, on a thin link": (f"{PYPYLON}589", f"{HARVESTERS}365"),
 }
-"""Threads of people who asked, by what they saw; each has a test below that is marked with it."""
+"""Issues by the situation that they describe; a test below is marked with each situation."""
 
 
-ANSWERED: set[str] = set()
+TESTED_SITUATIONS: set[str] = set()
 
 
-def asked(what: str) -> Callable[[T], T]:
-    """Note for a test which threads it answers."""
-    ANSWERED.add(what)
+def mark_situation(situation: str) -> Callable[[T], T]:
+    """Mark a test with the situation that it tests."""
+    TESTED_SITUATIONS.add(situation)
     return lambda test: test
 
 
-def word(name: str, address: int) -> str:
-    """Return a feature that is a word of memory."""
+def integer_feature(name: str, address: int) -> str:
+    """Return the description of an integer feature at an address of memory."""
     return (
         f'<Integer Name="{name}"><pValue>{name}Word</pValue></Integer>'
         f'<IntReg Name="{name}Word"><Address>{address:#x}</Address><Length>4</Length>'
@@ -81,8 +81,8 @@ def word(name: str, address: int) -> str:
     )
 
 
-def choice(name: str, address: int, *entries: str) -> str:
-    """Return a feature that is one of several words."""
+def enumeration_feature(name: str, address: int, *entries: str) -> str:
+    """Return the description of an enumeration at an address of memory."""
     told = "".join(
         f'<EnumEntry Name="{entry}"><Value>{number}</Value></EnumEntry>'
         for number, entry in enumerate(entries)
@@ -98,7 +98,7 @@ MODE, MODE_TRIGGER, TRIGGER_SOURCE, LINK_SPEED = 0x12000, 0x12004, 0x12008, 0x12
 
 
 def described(*features: str) -> bytes:
-    """Return a description with further features, if they are missing."""
+    """Return a camera description with further features, unless it has them."""
     missing = [one for one in features if one.split('"')[1] not in DESCRIPTION]
     return DESCRIPTION.replace(
         '<Port Name="Device"/>', f'{"".join(missing)}<Port Name="Device"/>'
@@ -106,8 +106,8 @@ def described(*features: str) -> bytes:
 
 
 TRIGGERED = described(
-    choice("TriggerMode", MODE_TRIGGER, "Off", "On"),
-    choice("TriggerSource", TRIGGER_SOURCE, "Software", "Line1"),
+    enumeration_feature("TriggerMode", MODE_TRIGGER, "Off", "On"),
+    enumeration_feature("TriggerSource", TRIGGER_SOURCE, "Software", "Line1"),
 )
 
 
@@ -116,7 +116,7 @@ async def examined(device: Camera, query: str = "", seconds: float = 0.6) -> lis
     return [finding async for finding in examine(url, seconds=seconds)]
 
 
-def of(findings: list[Finding], check: str) -> Finding:
+def finding_of(findings: list[Finding], check: str) -> Finding:
     """Return the last finding of a check."""
     return [one for one in findings if one.check == check][-1]
 
@@ -127,17 +127,17 @@ async def test_camera_that_is_well_is_told_so_and_given_back() -> None:
         assert device.owner is None
         assert not device.streaming
     assert [one.check for one in findings if one.severity not in ("ok", "hint")] == []
-    stream = of(findings, "stream")
+    stream = finding_of(findings, "stream")
     assert stream.details["lost"] == stream.details["requested"] == 0
     assert stream.details["frames"] > 5
-    assert of(findings, "packet size").details["packet_size"] == 1500
+    assert finding_of(findings, "packet size").details["packet_size"] == 1500
 
 
-@asked("the buffer was incompletely grabbed")
+@mark_situation("the buffer was incompletely grabbed")
 async def test_lost_packets_are_counted_and_the_cures_are_named() -> None:
     mischief = Mischief(drop=0.1, resend="ignore", seed=3)
     async with camera(mischief=mischief, test_packets=0) as device:
-        found = of(await examined(device, seconds=1.0), "stream")
+        found = finding_of(await examined(device, seconds=1.0), "stream")
     assert found.severity == "warning"
     assert found.details["lost"] > 0
     assert f"{found.details['lost']} more lost for missing packets" in found.text
@@ -147,12 +147,12 @@ async def test_lost_packets_are_counted_and_the_cures_are_named() -> None:
 
 async def test_packets_that_came_again_lose_no_picture() -> None:
     async with camera(mischief=Mischief(drop=0.03, seed=1), test_packets=0) as device:
-        found = of(await examined(device, seconds=1.0), "stream")
+        found = finding_of(await examined(device, seconds=1.0), "stream")
     assert found.severity in ("hint", "warning")  # one that is lost three times is lost
     assert found.details["requested"] > found.details["lost"]
 
 
-@asked("grabs time out, although the camera can be set")
+@mark_situation("grabs time out, although the camera can be set")
 async def test_stream_that_is_dropped_whole_is_a_firewall() -> None:
     async with camera(mischief=Mischief(drop=1.0), test_packets=0) as device:
         findings = await examined(device)
@@ -162,7 +162,7 @@ async def test_stream_that_is_dropped_whole_is_a_firewall() -> None:
     assert "firewall" in found.cure
 
 
-@asked("no trigger comes")
+@mark_situation("no trigger comes")
 async def test_camera_that_waits_for_a_trigger_says_which() -> None:
     silent = Mischief(drop=1.0)
     async with camera(description=TRIGGERED, mischief=silent, test_packets=0) as device:
@@ -176,7 +176,7 @@ async def test_camera_that_waits_for_a_trigger_says_which() -> None:
     assert "?feature.TriggerMode=Off" in found.cure
 
 
-@asked("controlled by another application")
+@mark_situation("controlled by another application")
 async def test_camera_of_another_application_says_whose_it_is_and_is_left_alone() -> None:
     async with camera() as device:
         device.take_away("192.168.3.4")
@@ -189,7 +189,7 @@ async def test_camera_of_another_application_says_whose_it_is_and_is_left_alone(
     assert device.sent == []
 
 
-@asked("no device is found")
+@mark_situation("no device is found")
 async def test_camera_that_no_search_finds_is_reported_with_what_there_is() -> None:
     findings = [one async for one in examine("gige://?serial=NOBODY", seconds=0.5)]
     (found,) = findings
@@ -198,7 +198,7 @@ async def test_camera_that_no_search_finds_is_reported_with_what_there_is() -> N
     assert "firewall" in found.cure
 
 
-@asked("no device is found")
+@mark_situation("no device is found")
 async def test_address_at_which_nobody_answers_is_told() -> None:
     async with camera(deaf=True) as device:
         found = (await examined(device))[-1]
@@ -215,20 +215,20 @@ async def test_host_that_is_no_camera_is_reported() -> None:
     assert f"nothing listens at UDP port {port}" in found.text
 
 
-@asked("one picture, and no more")
+@mark_situation("one picture, and no more")
 async def test_camera_that_is_set_to_a_single_picture_is_reported() -> None:
-    modes = choice("AcquisitionMode", MODE, "Continuous", "SingleFrame")
+    modes = enumeration_feature("AcquisitionMode", MODE, "Continuous", "SingleFrame")
     async with camera(description=described(modes)) as device:
         device.words[MODE] = 1
         findings = await examined(device)
         assert device.words[MODE] == 0
-    found = of(findings, "features")
+    found = finding_of(findings, "features")
     assert found.severity == "hint"
     assert "AcquisitionMode is SingleFrame" in found.text
-    assert of(findings, "stream").severity == "ok"
+    assert finding_of(findings, "stream").severity == "ok"
 
 
-@asked("timeouts at a low frame rate")
+@mark_situation("timeouts at a low frame rate")
 async def test_slow_camera_is_reported_by_how_much_the_wait_is_too_short() -> None:
     async with camera() as device:
         findings = await examined(device, "fps=0.125")
@@ -238,13 +238,13 @@ async def test_slow_camera_is_reported_by_how_much_the_wait_is_too_short() -> No
     assert "--seconds 24" in found.cure
 
 
-@asked("several cameras, or a fast one, on a thin link")
+@mark_situation("several cameras, or a fast one, on a thin link")
 async def test_stream_that_does_not_fit_the_link_is_reported_with_the_rate_that_fits() -> None:
-    speed = word("DeviceLinkSpeed", LINK_SPEED)
+    speed = integer_feature("DeviceLinkSpeed", LINK_SPEED)
     async with camera(description=described(speed), test_packets=0) as device:
         device.words[LINK_SPEED] = 100_000  # bytes a second; 64x48 at 100/s want 307,200
         findings = await examined(device)
-    found = of(findings, "link")
+    found = finding_of(findings, "link")
     assert (found.severity, found.exit_code) == ("error", 5)
     assert "it does not fit" in found.text
     most = float(found.cure.partition("fps=")[2].split()[0])
@@ -277,12 +277,12 @@ async def test_cancelled_examination_gives_the_camera_back() -> None:
 
 @pytest.fixture(scope="module")
 def namespace() -> list[str]:
-    """Return the command that runs another one in a network namespace of its own."""
+    """Return a command that runs another command in a network namespace."""
     return network_namespace("arv-fake-gv-camera-0.8", "aravis-tools")
 
 
-def there(namespace: list[str], situation: str) -> list[dict[str, Any]]:
-    """Return the findings about Aravis' fake camera in a situation, worst last."""
+def findings_in_namespace(namespace: list[str], situation: str) -> list[dict[str, Any]]:
+    """Return the findings about Aravis's fake camera in a situation."""
     done = subprocess.run(  # noqa: S603
         [*namespace, sys.executable, "-m", "tests.doctor.gige_in_namespace", situation],
         capture_output=True,
@@ -302,23 +302,23 @@ def last(findings: list[dict[str, Any]], check: str) -> dict[str, Any]:
 
 @pytest.mark.long
 def test_camera_of_others_is_examined(namespace: list[str]) -> None:
-    findings = there(namespace, "well")
+    findings = findings_in_namespace(namespace, "well")
     assert [one for one in findings if one["severity"] in ("warning", "error")] == []
     assert "no program controlled it" in last(findings, "control")["text"]
 
 
 @pytest.mark.long
-@asked("no trigger comes")
+@mark_situation("no trigger comes")
 def test_camera_of_others_waits_for_a_trigger(namespace: list[str]) -> None:
-    found = there(namespace, "trigger")[-1]
+    found = findings_in_namespace(namespace, "trigger")[-1]
     assert found["check"] == "trigger"
     assert "TriggerMode is On" in found["text"]
 
 
 @pytest.mark.long
-@asked("small pictures come, large ones do not")
+@mark_situation("small pictures come, large ones do not")
 def test_packets_above_the_mtu_are_reported(namespace: list[str]) -> None:
-    found = last(there(namespace, "mtu"), "packet size")
+    found = last(findings_in_namespace(namespace, "mtu"), "packet size")
     assert found["severity"] in ("warning", "error")
     assert "packets of 8000 bytes" in found["text"]
     assert "1500 (MTU)" in found["text"]
@@ -326,9 +326,9 @@ def test_packets_above_the_mtu_are_reported(namespace: list[str]) -> None:
 
 
 @pytest.mark.long
-@asked("another subnet")
+@mark_situation("another subnet")
 def test_camera_of_another_subnet_is_reported(namespace: list[str]) -> None:
-    findings = there(namespace, "subnet")
+    findings = findings_in_namespace(namespace, "subnet")
     found = last(findings, "subnet")
     assert found["severity"] == "warning"
     assert "198.51.100.7 is of another subnet than this machine" in found["text"]
@@ -338,14 +338,14 @@ def test_camera_of_another_subnet_is_reported(namespace: list[str]) -> None:
 
 
 @pytest.mark.long
-@asked("another subnet")
+@mark_situation("another subnet")
 def test_two_networks_alike_are_reported(namespace: list[str]) -> None:
-    found = last(there(namespace, "twice"), "subnet")
+    found = last(findings_in_namespace(namespace, "twice"), "subnet")
     assert found["severity"] == "warning"
     assert "is of 2 networks of this machine" in found["text"]
 
 
 def test_each_situation_has_a_test() -> None:
-    assert THREADS.keys() == ANSWERED
-    assert len(THREADS) >= 8
-    assert all(one.startswith("https://github.com/") for asked in THREADS.values() for one in asked)
+    assert ISSUES.keys() == TESTED_SITUATIONS
+    assert len(ISSUES) >= 8
+    assert all(one.startswith("https://github.com/") for urls in ISSUES.values() for one in urls)

@@ -1,4 +1,4 @@
-"""Texts that mean addresses, and sets of them."""
+"""Test texts that mean addresses, and sets of addresses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from smartcam.exceptions import ConfigurationError
 
 
 def texts(*given: str) -> list[str]:
-    """Return the addresses that texts mean, as people write them."""
+    """Return the addresses that texts mean, as text."""
     spans = [read_span(one) for one in given]
     return [str(one) for one in AddressSet([one for one in spans if one is not None])]
 
@@ -93,15 +93,15 @@ BASE = {4: int(ipaddress.ip_address("10.0.0.0")), 6: 0xFD << 120}
 
 
 def spans_of(places: list[tuple[int, int, int]]) -> tuple[list[Span], set[HostAddress]]:
-    """Return spans, and their addresses one by one."""
+    """Return spans, and the set of their addresses."""
     spans = [
-        Span(*(HostAddress(kind, BASE[kind] + one) for one in (first, first + more)))
-        for kind, first, more in places
+        Span(*(HostAddress(kind, BASE[kind] + one) for one in (first, first + extra)))
+        for kind, first, extra in places
     ]
     return spans, {
         HostAddress(kind, BASE[kind] + first + nth)
-        for kind, first, more in places
-        for nth in range(more + 1)
+        for kind, first, extra in places
+        for nth in range(extra + 1)
     }
 
 
@@ -109,7 +109,7 @@ def spans_of(places: list[tuple[int, int, int]]) -> tuple[list[Span], set[HostAd
 def test_set_has_each_address_once_and_in_order(
     places: list[tuple[int, int, int]], others: list[tuple[int, int, int]]
 ) -> None:
-    (spans, expected), (more_spans, away) = spans_of(places), spans_of(others)
+    (spans, expected), (more_spans, excluded) = spans_of(places), spans_of(others)
     found = AddressSet(spans)
     assert list(found) == sorted(expected)
     assert len(found) == len(expected)
@@ -118,5 +118,5 @@ def test_set_has_each_address_once_and_in_order(
             address = HostAddress(kind, BASE[kind] + number)
             assert (address in found) == (address in expected)
     left = found.without(AddressSet(more_spans))
-    assert list(left) == sorted(expected - away)
-    assert len(left) == len(expected - away)
+    assert list(left) == sorted(expected - excluded)
+    assert len(left) == len(expected - excluded)

@@ -1,4 +1,4 @@
-"""Asking an address for its language: the order, the record of a try, and no leftovers."""
+"""Test finding the dialect of an address: the order of tries, their records, and their end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.handmade import (
 )
 
 SHORT = 0.3
-"""Seconds for all tries where most of them are silence."""
+"""Seconds for all tries in tests where most tries get no answer."""
 
 
 async def tried(url: str, timeout: float = SHORT, **options: Any) -> list[Trial]:

@@ -1,4 +1,4 @@
-"""The doctor on what results hold: the layout, the bytes beside it, values that are no SI."""
+"""Test the doctor's checks of results: the layout, its dump, and values that are not SI."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from smartcam.doctor._inside import Finding
-from smartcam.doctor._result_checks import MAX_ROWS, PLAUSIBLE, DumpRow, aligned
+from smartcam.doctor._result_checks import MAX_ROWS, PLAUSIBILITY_LIMITS, DumpRow, dump_container
 from smartcam.emulator import Application, EmulatedCamera, faults
 from smartcam.layout import Layout
 from tests import ROOT
-from tests.doctor.doctorkit import errors, examined, of, severities
+from tests.doctor.doctorkit import errors, examined, finding_of, severities
 from tests.doctor.inside import Exit
 
 
@@ -31,7 +31,7 @@ async def read(layout: str, values: Any, interpret_as: str | None, **more: Any) 
 
 async def test_layout_that_fits_is_well() -> None:
     findings = await read("n: int32", {"n": 5}, "n: int32")
-    found = of(findings, "layout")
+    found = finding_of(findings, "layout")
     assert (found.severity, found.text) == ("ok", "2 results fit the layout 'n: int32'")
 
 
@@ -39,7 +39,7 @@ async def test_layout_that_differs_is_reported_with_sizes_and_bytes_beside_its_f
     text = "passed: bool, n: int32, x: real32 mm"
     findings = await read("n: int32, text: string[3]", {"n": 5, "text": "abc"}, text)
     assert errors(findings) == [("layout", Exit.UNREADABLE)]
-    found = of(findings, "layout")
+    found = finding_of(findings, "layout")
     assert "The layout has 9 bytes, 7 came" in found.text
     assert "field 'x' (real32 mm) at offset 5" in found.text
     assert (found.details["expected"], found.details["received"]) == ("9 bytes", 7)
@@ -60,14 +60,14 @@ async def test_layout_that_differs_is_reported_with_sizes_and_bytes_beside_its_f
 )
 async def test_size_that_a_layout_expects_is_reported(layout: str, expected: str) -> None:
     findings = await read("text: string[7]", {"text": "abc"}, layout)
-    found = of(findings, "layout")
+    found = finding_of(findings, "layout")
     assert (found.details["expected"], found.details["received"]) == (expected, 7)
 
 
 async def test_layout_of_the_right_size_with_a_wrong_type_is_reported() -> None:
     findings = await read("n: int32", {"n": 5}, "a: bool, b: string[3]")
     assert errors(findings) == [("layout", Exit.UNREADABLE)]
-    found = of(findings, "layout")
+    found = finding_of(findings, "layout")
     assert "expected 0x00 or 0xFF" in found.text
     assert found.details["offset"] == 0
 
@@ -87,7 +87,7 @@ async def test_layout_is_compared_in_the_cameras_byte_order() -> None:
         emulator.device.set_endian(1)
         findings = await examined(emulator.url, interpret_as="x: real32", seconds=0.1)
     assert severities(findings, "values") == []
-    assert of(findings, "layout").severity == "ok"
+    assert finding_of(findings, "layout").severity == "ok"
 
 
 async def test_byte_order_that_is_none_is_an_error() -> None:
@@ -104,40 +104,40 @@ async def test_byte_order_that_is_none_is_an_error() -> None:
     async with EmulatedCamera([application], running=True, faults=[status]) as emulator:
         findings = await examined(emulator.url, seconds=0.1)
     assert errors(findings) == [("layout", Exit.UNREADABLE)]
-    assert "endian field is 7" in of(findings, "layout").text
+    assert "endian field is 7" in finding_of(findings, "layout").text
 
 
 async def test_layout_without_a_result_is_a_hint() -> None:
     async with EmulatedCamera(active=21, running=True) as emulator:
-        found = of(await examined(emulator.url, interpret_as="n: int32"), "layout")
+        found = finding_of(await examined(emulator.url, interpret_as="n: int32"), "layout")
     assert found.severity == "hint"
     assert found.text == "no result came, so the layout was not compared with one"
 
 
 async def test_results_without_a_layout_are_shown_as_bytes() -> None:
-    found = of(await read("n: int32", {"n": 5}, None), "layout")
+    found = finding_of(await read("n: int32", {"n": 5}, None), "layout")
     assert found.text.startswith("2 results looked at, of 4 bytes: 05 00 00 00; ")
     assert found.details == {"sizes": [4], "first": bytes.fromhex("05000000")}
 
 
 async def test_interpreter_without_a_layout_reads_them() -> None:
-    found = of(await read("n: int32", {"n": 5}, "raw"), "layout")
+    found = finding_of(await read("n: int32", {"n": 5}, "raw"), "layout")
     assert found.text == "2 results were read"
 
 
 # ---------------------------------------------------------------------- bytes beside fields
 
 
-def test_aligned_names_what_is_too_many() -> None:
-    assert aligned(Layout("n: int16"), bytes.fromhex("0100 ff01")) == [
+def test_dump_container_names_what_is_too_many() -> None:
+    assert dump_container(Layout("n: int16"), bytes.fromhex("0100 ff01")) == [
         DumpRow(0, "n: int16", "01 00", 1),
         DumpRow(2, "(no field)", "ff 01", "2 bytes too many"),
     ]
 
 
-def test_aligned_numbers_records_after_the_head() -> None:
+def test_dump_container_numbers_records_after_the_head() -> None:
     layout = Layout("n: uint8, (x: uint8, name: string[2])*")
-    assert aligned(layout, b"\x02\x07ab\x08c") == [
+    assert dump_container(layout, b"\x02\x07ab\x08c") == [
         DumpRow(0, "n: uint8", "02", 2),
         DumpRow(1, "[0].x: uint8", "07", 7),
         DumpRow(2, "[0].name: string[2]", "61 62", "ab"),
@@ -146,33 +146,33 @@ def test_aligned_numbers_records_after_the_head() -> None:
     ]
 
 
-def test_aligned_fixed_number_of_records_that_are_missing() -> None:
-    rows = aligned(Layout("(x: uint16)[3]"), bytes(4))
+def test_dump_container_fixed_number_of_records_that_are_missing() -> None:
+    rows = dump_container(Layout("(x: uint16)[3]"), bytes(4))
     assert [row.value for row in rows] == [0, 0, "2 of 2 bytes are missing"]
 
 
-def test_aligned_big_endian() -> None:
-    assert aligned(Layout("n: int32"), bytes.fromhex("00000005"), "big")[0].value == 5
+def test_dump_container_big_endian() -> None:
+    assert dump_container(Layout("n: int32"), bytes.fromhex("00000005"), "big")[0].value == 5
 
 
-def test_aligned_long_container_shows_the_place_and_is_bounded() -> None:
+def test_dump_container_long_container_shows_the_place_and_is_bounded() -> None:
     layout, data = Layout("(x: uint8, y: uint8)*"), bytes(100_001)
-    begin = aligned(layout, data)
+    begin = dump_container(layout, data)
     assert len(begin) == MAX_ROWS + 1
     assert begin[-1].field == "..."
-    rows = aligned(layout, data, around=100_000)
+    rows = dump_container(layout, data, shown_offset=100_000)
     assert [row.offset for row in rows] == [99_998, 99_999, 100_000, 100_001]
     assert rows[-1].value == "1 of 1 bytes are missing"
 
 
-def test_aligned_long_field_shows_its_beginning() -> None:
-    (row,) = aligned(Layout("text: string[1000]"), b"a" * 1000)
+def test_dump_container_long_field_shows_its_beginning() -> None:
+    (row,) = dump_container(Layout("text: string[1000]"), b"a" * 1000)
     assert row.hex == " ".join(["61"] * 32)
 
 
-def test_aligned_empty_container_shows_what_was_expected() -> None:
-    assert [row.offset for row in aligned(Layout("(x: uint8)*"), b"")] == []
-    assert [row.offset for row in aligned(Layout("x: uint8, y: uint8"), b"")] == [0, 1]
+def test_dump_container_empty_container_shows_what_was_expected() -> None:
+    assert [row.offset for row in dump_container(Layout("(x: uint8)*"), b"")] == []
+    assert [row.offset for row in dump_container(Layout("x: uint8, y: uint8"), b"")] == [0, 1]
 
 
 # ---------------------------------------------------------------------- values
@@ -195,7 +195,7 @@ async def test_value_that_is_no_si_gets_a_hint(
     layout = f"{field}: real32"
     findings = await read(layout, {field: value}, layout)
     assert errors(findings) == []
-    found = of(findings, "values")
+    found = finding_of(findings, "values")
     assert found.severity == "hint"
     assert text in found.text
     assert f"Write {field}: real32 {unit} in the layout" in found.cure
@@ -245,17 +245,17 @@ async def test_localizations_in_whole_millimetres_get_hints() -> None:
 async def test_value_of_shifted_bytes_gets_a_hint() -> None:
     (tiny,) = struct.unpack("<f", struct.pack("<i", 7))
     findings = await read("n: int32", {"n": 7}, "x: real32")
-    found = of(findings, "values")
+    found = finding_of(findings, "values")
     assert found.details["value"] == tiny
     assert "which nothing measures" in found.text
     assert "all after it are shifted" in found.cure
 
 
 def test_limits_say_why() -> None:
-    assert [rule.quantity for rule in PLAUSIBLE] == ["angle", "length", "ratio"]
+    assert [rule.quantity for rule in PLAUSIBILITY_LIMITS] == ["angle", "length", "ratio"]
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-    assert [rule.reason for rule in PLAUSIBLE if f"| {rule.reason} |" not in page] == []
-    assert PLAUSIBLE[0].most == pytest.approx(2 * math.pi)
+    assert [rule.reason for rule in PLAUSIBILITY_LIMITS if f"| {rule.reason} |" not in page] == []
+    assert PLAUSIBILITY_LIMITS[0].largest == pytest.approx(2 * math.pi)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_limits_say_why() -> None:
 async def test_si_that_a_layout_takes_for_a_unit_is_reported(
     layout: str, values: Any, text: str
 ) -> None:
-    found = of(await read(layout, values, layout), "values")
+    found = finding_of(await read(layout, values, layout), "values")
     assert (found.severity, found.text.startswith(text)) == ("hint", True), found.text
     assert found.text.count("which looks like metres") + found.text.count("like radians") == 1
 

@@ -1,4 +1,4 @@
-"""The doctor on the way to a session, and when it is lost; each against a real peer."""
+"""Test the doctor's checks before a session, and of a lost session, against real peers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartcam.emulator import EmulatedCamera, faults
 from smartcam.emulator._inside import BaseFault
 from smartcam.testing import proxy as rules
 from smartcam.testing.proxy import LinkProxy
-from tests.doctor.doctorkit import SHORT, errors, examined, of, severities
+from tests.doctor.doctorkit import SHORT, errors, examined, finding_of, severities
 from tests.doctor.inside import Exit
 from tests.handmade import (
     CONNECT_ANSWER,
@@ -44,7 +44,7 @@ async def test_name_that_does_not_resolve_is_an_error(host: str) -> None:
     findings = await examined(f"bvs://{host}")
     assert [one.check for one in findings] == ["notice", "name"]
     assert errors(findings) == [("name", Exit.NO_SESSION)]
-    found = of(findings, "name")
+    found = finding_of(findings, "name")
     assert found.text.startswith(f"the name '{host}' does not resolve: ")
     assert "IP address" in found.cure
 
@@ -52,7 +52,7 @@ async def test_name_that_does_not_resolve_is_an_error(host: str) -> None:
 async def test_name_that_resolves_is_reported_with_its_addresses() -> None:
     with refusing(socket.SOCK_STREAM) as port:
         findings = await examined(f"bvs://localhost:{port}", timeout=SHORT)
-    found = of(findings, "name")
+    found = finding_of(findings, "name")
     assert found.severity == "ok"
     assert HOST in found.details["addresses"]
 
@@ -74,7 +74,7 @@ async def test_nothing_listens_is_reported_with_every_way_that_was_tried() -> No
     with refusing(socket.SOCK_STREAM) as port:
         findings = await examined(f"bvs://{HOST}:{port}", timeout=SHORT)
     assert errors(findings) == NO_SESSION
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert found.text == f"nothing listens at {HOST}:{port} (TCP): Connection refused"
     assert "36701" in found.cure
     own = [one for one in found.details["tries"] if " at port " not in one.partition(":")[0]]
@@ -92,20 +92,24 @@ async def test_nothing_listens_at_any_address_of_a_name_is_reported() -> None:
         ]
         with mock.patch.object(loop, "getaddrinfo", mock.AsyncMock(return_value=several)):
             findings = await examined(f"bvs://several:{port}", timeout=SHORT)
-    assert of(findings, "name").text == "several is 127.0.0.1, 127.0.0.2"
-    assert of(findings, "session").text.startswith(f"nothing listens at several:{port} (TCP): ")
+    assert finding_of(findings, "name").text == "several is 127.0.0.1, 127.0.0.2"
+    assert finding_of(findings, "session").text.startswith(
+        f"nothing listens at several:{port} (TCP): "
+    )
 
 
 async def test_nothing_listens_on_udp_is_reported() -> None:
     with refusing(socket.SOCK_DGRAM) as port:
         findings = await examined(f"bvs+udp://{HOST}:{port}", timeout=SHORT)
-    assert of(findings, "session").text.startswith(f"nothing listens at {HOST}:{port} (UDP)")
+    assert finding_of(findings, "session").text.startswith(
+        f"nothing listens at {HOST}:{port} (UDP)"
+    )
 
 
 @linux
 async def test_host_without_a_route_is_unreachable() -> None:
     findings = await examined("bvs://255.255.255.255", timeout=SHORT)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert found.text.startswith("there is no way to 255.255.255.255:36701 (TCP): ")
     assert "both must be in one network" in found.cure
 
@@ -123,7 +127,7 @@ async def test_connection_that_never_opens_is_reported() -> None:
         findings = await examined(f"bvs://{HOST}:{port}?dialect=handbook", timeout=SHORT)
         for filler in fillers:
             filler.close()
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert found.text.startswith(f"nobody answers at {HOST}:{port} (TCP), not even with a refusal")
     assert "firewall" in found.cure
 
@@ -132,7 +136,7 @@ async def test_silent_peer_is_reported_with_the_questions_to_ask() -> None:
     async with listening() as listener:
         findings = await examined(f"bvs://{HOST}:{listener.port}", timeout=SHORT)
     assert errors(findings) == NO_SESSION
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert "takes the connection and says nothing: waiting for the answer to Connect" in found.text
     for cause in ("set to TCP, not to UDP", "36701 by default", "another client or dialect"):
         assert cause in found.cure
@@ -143,7 +147,7 @@ async def test_silent_peer_is_reported_with_the_questions_to_ask() -> None:
 async def test_silent_udp_peer_is_reported() -> None:
     async with datagrams() as peer:
         findings = await examined(f"bvs+udp://{HOST}:{peer.port}", timeout=SHORT)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert "UDP does not tell whether anybody is there" in found.text
     assert "set to UDP, not to TCP" in found.cure
 
@@ -160,7 +164,7 @@ async def test_silent_tcp_camera_set_to_udp_is_found_and_examined() -> None:
         f"A camera answers at {emulator.url}: use this URL. What follows was seen there."
     )
     assert made.details["url"] == emulator.url
-    assert of(findings, "run state").severity == "ok"
+    assert finding_of(findings, "run state").severity == "ok"
 
 
 async def test_wrong_dialect_pinned_the_right_one_is_named() -> None:
@@ -187,7 +191,7 @@ async def test_camera_that_refuses_newcomers_hangs_up() -> None:
         smartcam.connect(emulator.url),
     ):
         findings = await examined(emulator.url, timeout=SHORT)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert "takes the connection and hangs up without a word" in found.text
     assert "serve another client and refuse newcomers" in found.cure
 
@@ -199,7 +203,7 @@ async def test_garbage_is_reported_with_its_bytes() -> None:
 
     async with scripted(web_server) as listener:
         findings = await examined(f"bvs://{HOST}:{listener.port}", timeout=2 * SHORT)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert "no camera's language: wrong magic number: 48 54 54 50" in found.text
     broken = [
         entry.hex for trial in found.details["frames"] for entry in trial if entry.direction == "!"
@@ -216,7 +220,7 @@ async def test_half_an_answer_is_reported() -> None:
     async with scripted(half) as listener:
         url = f"bvs://{HOST}:{listener.port}?dialect=handbook"
         findings = await examined(url, timeout=SHORT)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert "answers, and no session comes of it" in found.text
     assert "14 bytes, then silence" in found.text
 
@@ -246,14 +250,14 @@ async def test_session_that_cannot_be_made_again_is_an_error() -> None:
     async with EmulatedCamera(faults=[refuse]) as emulator:
         findings = await examined(emulator.url, timeout=SHORT)
     assert errors(findings) == NO_SESSION
-    assert "another one right after it was not" in of(findings, "session").text
+    assert "another one right after it was not" in finding_of(findings, "session").text
     assert findings[-1].check == "session"
 
 
 async def test_session_has_the_connect_time_with_its_spread() -> None:
     async with EmulatedCamera(running=True) as emulator:
         findings = await examined(emulator.url)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     times = found.details["connect_time"]
     assert list(times) == ["times", "min", "median", "p99", "jitter"]
     assert times["times"] == 5
@@ -264,7 +268,7 @@ async def test_session_has_the_connect_time_with_its_spread() -> None:
 async def test_session_without_a_pinned_dialect_tells_the_url_to_use() -> None:
     async with EmulatedCamera(running=True) as emulator:
         findings = await examined(emulator.url.partition("?")[0], timeout=3.0)
-    found = of(findings, "session")
+    found = finding_of(findings, "session")
     assert found.cure == f"Use {emulator.url} from now on: it says what was found out."
     assert "the first, which found the dialect, " in found.text
     assert found.details["connect_time"]["times"] >= 1
@@ -272,12 +276,12 @@ async def test_session_without_a_pinned_dialect_tells_the_url_to_use() -> None:
 
 # ---------------------------------------------------------------------- a session lost
 
-LATER = 8
-"""A Query of the round trip: five sessions have one each before it."""
+ROUND_TRIP_QUERY = 8
+"""Number of a Query of the round trip; five sessions have sent one each before it."""
 
 
-async def lost(*given: BaseFault, timeout: float = 1.0) -> tuple[str, str, Exit]:
-    """Return check, text and exit code of how an examination ended."""
+async def last_finding(*given: BaseFault, timeout: float = 1.0) -> tuple[str, str, Exit]:
+    """Return check, text and exit code of an examination's last finding."""
     async with EmulatedCamera(faults=given, running=True) as emulator:
         findings = await examined(emulator.url, timeout=timeout)
     last = findings[-1]
@@ -286,7 +290,7 @@ async def lost(*given: BaseFault, timeout: float = 1.0) -> tuple[str, str, Exit]
 
 
 async def test_session_taken_by_another_client_is_told() -> None:
-    check, text, code = await lost(faults.SecondClient(on="Query", nth=LATER))
+    check, text, code = await last_finding(faults.SecondClient(on="Query", nth=ROUND_TRIP_QUERY))
     assert (check, code) == ("taken", Exit.NO_SESSION)
     assert "soon after its Connect, and still takes connections: another client" in text
 
@@ -302,30 +306,34 @@ async def test_session_taken_while_watching_is_reported() -> None:
 
 
 async def test_camera_that_dies_in_the_middle_is_reported() -> None:
-    check, text, code = await lost(faults.PowerCycle(on="Query", nth=LATER))
+    check, text, code = await last_finding(faults.PowerCycle(on="Query", nth=ROUND_TRIP_QUERY))
     assert (check, code) == ("lost", Exit.NO_SESSION)
     assert "the session broke after" in text
     assert "the camera takes no connection now" in text
 
 
 async def test_garbage_in_the_session_is_reported() -> None:
-    garbage = faults.Insert(on="QueryAnswer", nth=LATER, data=b"garbage")
-    check, text, code = await lost(garbage)
+    garbage = faults.Insert(on="QueryAnswer", nth=ROUND_TRIP_QUERY, data=b"garbage")
+    check, text, code = await last_finding(garbage)
     assert (check, code) == ("lost", Exit.NO_SESSION)
     assert "sent something that is no message" in text
     assert "67 61 72 62" in text
 
 
 async def test_camera_that_falls_silent_is_reported() -> None:
-    check, text, code = await lost(faults.HalfOpen(on="Query", nth=LATER), timeout=0.1)
-    assert (check, code) == ("lost", Exit.RAN_OUT)
+    check, text, code = await last_finding(
+        faults.HalfOpen(on="Query", nth=ROUND_TRIP_QUERY), timeout=0.1
+    )
+    assert (check, code) == ("lost", Exit.TIMED_OUT)
     assert "the camera fell silent after" in text
     assert "no answer to Query (0x30)" in text
 
 
 async def test_camera_taken_over_udp_falls_silent_and_the_cure_says_why() -> None:
     async with EmulatedCamera(
-        faults=[faults.SecondClient(on="Query", nth=LATER)], transport="udp", running=True
+        faults=[faults.SecondClient(on="Query", nth=ROUND_TRIP_QUERY)],
+        transport="udp",
+        running=True,
     ) as emulator:
         findings = await examined(emulator.url, timeout=0.1)
     assert findings[-1].check == "lost"
@@ -342,7 +350,7 @@ async def test_slow_link_is_measured_and_gets_a_hint() -> None:
             findings = await examined(proxy.url(emulator.url), timeout=5.0)
     assert errors(findings) == []
     assert severities(findings, "round trip") == ["hint"]
-    found = of(findings, "round trip")
+    found = finding_of(findings, "round trip")
     assert found.details["round_trip"]["min"] >= 0.055
     assert "slow for a local network" in found.text
 

@@ -1,4 +1,4 @@
-"""Parsers of the room for :mod:`tests.budgets`, with the hardest inputs."""
+"""The parsers of smartcam.makes for :mod:`tests.budgets`, with their slowest inputs."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def _ifm_machine(pieces: list[bytes]) -> None:
 
 
 def _chunks(length: int) -> Make:
-    """Return a maker of an answer with images of so many bytes each."""
+    """Return a function that makes an answer with images of ``length`` bytes each."""
 
     def make(size: int) -> bytes:
-        one = ImageChunk(251, length, 1, 1, 0.0, bytes(length)).encoded
-        data = one * max(1, size // len(one))
+        chunk = ImageChunk(251, length, 1, 1, 0.0, bytes(length)).encoded
+        data = chunk * max(1, size // len(chunk))
         return b"%09d" % len(data) + data
 
     return make
 
 
 def _ifm_layout(element: str) -> Make:
-    """Return a maker of a layout of equal elements."""
+    """Return a function that makes a layout of equal elements."""
 
     def make(size: int) -> str:
         elements = element * max(1, size // len(element))

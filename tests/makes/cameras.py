@@ -1,4 +1,4 @@
-"""The cameras of each make that the suite runs against, and what they say."""
+"""Emulated cameras of each make for smartcam's suite of camera tests."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ class LiveIfm(LiveMake):
 
 
 def kind(name: str, make: Callable[[], LineCamera], query: str, **fields: Any) -> CameraKind:
-    live = LiveIfm if "ifm" in name else LiveMake
+    live_class = LiveIfm if "ifm" in name else LiveMake
 
     @contextlib.asynccontextmanager
-    async def put_up() -> AsyncIterator[LiveCamera]:
+    async def open_camera() -> AsyncIterator[LiveCamera]:
         async with make() as emulator:
-            yield live(emulator, query)
+            yield live_class(emulator, query)
 
-    return CameraKind(name=name, open=put_up, exclusive=False, silent_request=None, **fields)
+    return CameraKind(name=name, open=open_camera, exclusive=False, silent_request=None, **fields)
 
 
 def ifm(version: int) -> EmulatedIfm:

@@ -1,4 +1,4 @@
-"""No result counts for another application than its own, at any switch by any client."""
+"""Test that a result counts only for its own application, whenever a client switches."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from tests.makes.test_ifm import PATIENCE, Peer, by_hand
 
 @contextlib.asynccontextmanager
 async def switching(**options: Any) -> AsyncIterator[tuple[list[int], Peer, smartcam.Camera[Any]]]:
-    """Put up a device that names the applications of a list in turn, the last for ever."""
-    left = [1]
+    """Run a device that names the applications of a list in turn, then always the last."""
+    applications = [1]
 
-    class Says(dict[str, bytes]):
+    class ApplicationAnswers(dict[str, bytes]):
         def __getitem__(self, line: str) -> bytes:
             if line != "A?":
                 return super().__getitem__(line)
-            active = left.pop(0) if len(left) > 1 else left[0]
+            active = applications.pop(0) if len(applications) > 1 else applications[0]
             return b"003\t%02d\t01\t02\t03" % active
 
     async with by_hand(**options) as (peer, camera):
-        peer.says = Says(peer.says)
-        yield left, peer, camera
+        peer.says = ApplicationAnswers(peer.says)
+        yield applications, peer, camera
 
 
 @pytest.mark.parametrize("named", [None, 1])

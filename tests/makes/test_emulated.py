@@ -1,4 +1,4 @@
-"""The emulated cameras of the makes in tests of one's own: marks, faults, scenarios, replay."""
+"""Test the makes' emulated cameras with marks, faults, scenarios and replay."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ async def test_scenario_describes_a_camera_of_a_make(tmp_path: Path) -> None:
 async def test_recording_is_played_to_clients_that_ask_otherwise(make: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     async with MAKES[make]() as emulator:
-        with Recorder(path) as made:
-            async with smartcam.connect(emulator.url, name="left", observers=[made]) as camera:
+        with Recorder(path) as recorder:
+            async with smartcam.connect(emulator.url, name="left", observers=[recorder]) as camera:
                 recorded = [(await camera.trigger()).raw for _ in range(3)]
     async with replay(load_recording(path)) as played, smartcam.connect(played.url) as camera:
         await camera.query_application()  # which moves all the tickets
@@ -148,14 +148,14 @@ async def test_recorded_state_is_played_at_its_trigger_however_often_a_client_as
     path = tmp_path / "run.mcap"
     clock = ManualClock()
     async with MAKES["sr"](reading_time=0.3, clock=clock) as emulator:
-        with Recorder(path) as made:
-            async with smartcam.connect(emulator.url, name="left", observers=[made]) as camera:
+        with Recorder(path) as recorder:
+            async with smartcam.connect(emulator.url, name="left", observers=[recorder]) as camera:
                 triggered = asyncio.create_task(camera.trigger())
                 while Status.BUSY not in (last := await camera.query_status()):
                     assert not triggered.done()
                 clock.advance(0.3)
                 recorded = (await triggered).raw
-    assert Status.BUSY in last  # which nothing but the code follows
+    assert Status.BUSY in last  # only the code comes after it
     async with replay(load_recording(path)) as played, smartcam.connect(played.url) as camera:
         for _ in range(5):
             assert Status.BUSY not in await camera.query_status()

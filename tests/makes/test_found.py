@@ -1,4 +1,4 @@
-"""The makes are found, probed and examined as every camera is."""
+"""Test that cameras of the makes are found, probed and examined like every camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ifm: tickets, layouts that are sent to the device, images, errors, versions."""
+"""Test ifm's sensors: tickets, uploaded layouts, images, errors and versions."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ PART = {"n": 7, "x": 12.5, "passed": True, "name": "bolt", "ROIs": [{"q": 0.5}, 
 
 
 def v3(ticket: int | str, content: bytes) -> bytes:
-    """Return a frame of version 3, made here."""
+    """Return a frame of version 3."""
     body = f"{ticket}".encode() + content + b"\r\n"
     return f"{ticket}L{len(body):09}\r\n".encode() + body
 
 
 class Peer:
-    """A device by hand: one client, whose requests it sees and answers as the test says."""
+    """A device for one client; a test sees its requests and chooses the answers."""
 
     def __init__(self) -> None:
         self.requests: asyncio.Queue[tuple[int, str]] = asyncio.Queue()
@@ -401,6 +401,6 @@ def test_emulated_sensor_refuses_what_is_no_option() -> None:
         {"defaults": {"parts": []}},
         {"version": 5},
     ]
-    for wrong in mistakes:
+    for options in mistakes:
         with pytest.raises(ConfigurationError):
-            EmulatedIfm(**wrong)
+            EmulatedIfm(**options)

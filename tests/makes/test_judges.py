@@ -1,14 +1,14 @@
-"""ifm's own client ifm3dpy (PyPI) against the emulated sensor: its schema, triggers and frames.
+"""Test the emulated sensor with ifm's own client, ifm3dpy (PyPI): its schema, triggers and frames.
 
-It asks by XML-RPC what a device is before it speaks PCIC; that one question is answered here. It
-runs in a process of its own, since it waits without letting Python go on.
+The client asks by XML-RPC for the type of a device before it uses PCIC; a fixture answers that one
+request. The client has a process of its own, since it blocks Python while it waits.
 
-Its futures have a race of their own (``frame_grabber_impl.hpp`` of 1.6.16): its thread fulfils a
-promise first and puts a new one in its place afterwards. Whoever calls ``wait_for_frame()`` between
-the two gets the frame before once more, and ``sw_trigger()`` gives the next trigger's future, which
-nobody fulfils, if the answer is there before it returns. So the answer waits here until the client
-has its future, and the client asks for the next frame behind the callback for the last one, which
-its thread calls after it has renewed both promises.
+The client has a race (``frame_grabber_impl.hpp`` of 1.6.16): its thread fulfils a promise first,
+and replaces it afterwards. In between, ``wait_for_frame()`` returns the previous frame again. If
+the answer arrives before ``sw_trigger()`` returns, that returns the future of the next trigger,
+which nobody fulfils. Therefore the answer here waits until the client has its future, and the
+client asks for the next frame only after the callback for the last one, which its thread calls
+after it has replaced both promises.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CONFIDENCE = 300
 LEVELS = bytes(range(8))
 COUNT = 3
 TIME = 0.01
-"""Seconds of an evaluation, and until a trigger is answered, by the sensor's clock."""
+"""Seconds of an evaluation, and of the delay of an answer to a trigger, by the sensor's clock."""
 
 CLIENT = """
 import queue
@@ -62,7 +62,7 @@ assert grabber.stop().wait_for(10_000)[0]
 
 
 class _Anywhere(SimpleXMLRPCRequestHandler):
-    """Answers at every address, and logs nothing."""
+    """Answer requests for every path, and log nothing."""
 
     def is_rpc_path_valid(self) -> bool:
         return True
@@ -73,7 +73,7 @@ class _Anywhere(SimpleXMLRPCRequestHandler):
 
 @pytest.fixture
 def parameters() -> Iterator[int]:
-    """Answer the question for a device's type; give the port."""
+    """Serve the request for a device's type; yield the port."""
     server = SimpleXMLRPCServer(("127.0.0.1", 0), _Anywhere)
     server.register_function(lambda name: {"DeviceType": "1:2"}[name], "getParameter")
     thread = threading.Thread(target=server.serve_forever)

@@ -1,4 +1,4 @@
-"""Keyence: judgements, readings with a deadline, and what vention's client makes of them."""
+"""Test Keyence's cameras: judgements, readings with a deadline, and vention's client."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CODE = "read: bool, code: string[20]"
 async def sensor_by_hand(
     says: dict[str, list[str]], scheme: str
 ) -> AsyncIterator[tuple[list[str], smartcam.Camera[Any]]]:
-    """Serve one client with answers by line, the last of them for ever; "" is silence."""
+    """Serve one client with the answers to each line in turn, then always the last; "" is none."""
     heard: list[str] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

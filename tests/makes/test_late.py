@@ -1,7 +1,7 @@
-"""A result that comes late is never the next trigger's: a directed test for each make.
+"""Test for each make that a late result is never returned to the next trigger.
 
-The camera's clock stands still until the test moves it, so nothing here depends on how fast the
-machine is. What each make's rule rests on stands in ``docs/decisions/0036-makes.md``.
+The tests move the camera's clock by hand, so they do not depend on the speed of the machine. The
+reason for each make's rule is in ``docs/decisions/0036-makes.md``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.handmade import until
 from tests.makes.cameras import IV3_NUMBERS, NUMBERS
 
 PATIENCE = 10.0
-"""Seconds in which whatever a test waits for has come."""
+"""Largest number of seconds that a test waits for something."""
 
 INSPECTION = 1.0
 """Seconds of an inspection, by the camera's clock."""
@@ -41,7 +41,7 @@ def iv3(clock: ManualClock) -> EmulatedIv3:
 
 
 def sr(clock: ManualClock) -> EmulatedSr:
-    """Return a reader that tells what it has read long after the reading's end."""
+    """Return a reader that sends what it has read long after the reading's end."""
     codes = [str(one["n"]) for one in NUMBERS]
     options: dict[str, Any] = {"waits_for_end": True, "answer_time": INSPECTION}
     return EmulatedSr(codes=codes, reading_time=0.0, clock=clock, **options)
@@ -56,8 +56,8 @@ MAKES: dict[str, tuple[Callable[[ManualClock], LineCamera], str, str]] = {
 
 
 @contextlib.asynccontextmanager
-async def standing(make: str) -> AsyncIterator[tuple[LineCamera, ManualClock, Camera[Any]]]:
-    """Put up a camera whose clock stands still, and a client in front of it."""
+async def manual_camera(make: str) -> AsyncIterator[tuple[LineCamera, ManualClock, Camera[Any]]]:
+    """Run a camera with a manual clock, and a client of it."""
     put_up, query, layout = MAKES[make]
     clock = ManualClock()
     async with (
@@ -67,12 +67,12 @@ async def standing(make: str) -> AsyncIterator[tuple[LineCamera, ManualClock, Ca
         yield emulator, clock, camera
 
 
-def heard(emulator: LineCamera) -> int:
+def count_triggers(emulator: LineCamera) -> int:
     """Return the number of triggers that the camera has received."""
     return sum(isinstance(one.message, m.Trigger) for one in emulator.log)
 
 
-def balance(statistics: Statistics) -> None:
+def check_balance(statistics: Statistics) -> None:
     fates = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
     assert statistics.received == sum(getattr(statistics, one) for one in fates)
 
@@ -80,27 +80,27 @@ def balance(statistics: Statistics) -> None:
 @pytest.mark.parametrize("make", MAKES)
 @pytest.mark.asyncio
 async def test_late_result_is_never_the_next_triggers(make: str) -> None:
-    async with standing(make) as (emulator, clock, camera):
+    async with manual_camera(make) as (emulator, clock, camera):
         with pytest.raises(TriggerTimeoutError):
             await camera.trigger(timeout=0.05)
-        assert heard(emulator) == 1
+        assert count_triggers(emulator) == 1
         second = asyncio.create_task(camera.trigger(timeout=PATIENCE))
-        await asyncio.sleep(0.05)  # time enough to send it too early
+        await asyncio.sleep(0.05)  # long enough to send it too early
         while not second.done():
             clock.advance(INSPECTION / 10)
             await asyncio.sleep(0.002)
         result = await second
         assert int(result.value.n) == 1, "the result of the first trigger, which was given up"
         assert camera.statistics().triggered == 1
-        balance(camera.statistics())
+        check_balance(camera.statistics())
 
 
 @pytest.mark.parametrize("make", MAKES)
 @pytest.mark.asyncio
 async def test_cancelled_triggers_result_is_never_the_next_ones(make: str) -> None:
-    async with standing(make) as (emulator, clock, camera):
+    async with manual_camera(make) as (emulator, clock, camera):
         first = asyncio.create_task(camera.trigger(timeout=PATIENCE))
-        await until(lambda: heard(emulator) == 1)
+        await until(lambda: count_triggers(emulator) == 1)
         first.cancel()
         await asyncio.wait({first})
         second = asyncio.create_task(camera.trigger(timeout=PATIENCE))
@@ -109,13 +109,13 @@ async def test_cancelled_triggers_result_is_never_the_next_ones(make: str) -> No
             await asyncio.sleep(0.002)
         result = await second
         assert int(result.value.n) == 1
-        balance(camera.statistics())
+        check_balance(camera.statistics())
 
 
 @pytest.mark.parametrize("make", MAKES)
 @pytest.mark.asyncio
 async def test_late_result_goes_to_streams_and_is_counted_late(make: str) -> None:
-    async with standing(make) as (_, clock, camera), camera.results() as results:
+    async with manual_camera(make) as (_, clock, camera), camera.results() as results:
         with pytest.raises(TriggerTimeoutError):
             await camera.trigger(timeout=0.05)
         clock.advance(2 * INSPECTION)
@@ -123,4 +123,4 @@ async def test_late_result_goes_to_streams_and_is_counted_late(make: str) -> Non
             late = await anext(results)
         assert late.latency is None
         assert camera.statistics().late == 1
-        balance(camera.statistics())
+        check_balance(camera.statistics())

@@ -1,4 +1,4 @@
-"""smartcam's suite for cameras, with the emulated ones of the makes."""
+"""Run smartcam's suite for cameras with the makes' emulated cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TestIfm(CameraSuite):
     def test_trigger_while_somebody_elses_inspection_runs_waits_for_its_end(
         self, camera_kind: CameraKind
     ) -> None:
-        """Do the same as the suite's, whose camera shows in its status that it inspects."""
+        """Test the same as the suite; the suite's camera shows in its status that it inspects."""
 
         async def look() -> None:
             async with (
@@ -42,7 +42,7 @@ class TestIfm(CameraSuite):
     def test_trigger_dropped_while_ours_is_under_way_is_an_overtrigger(
         self, camera_kind: CameraKind
     ) -> None:
-        """Do the same as the suite's; with a ticket the result is the trigger's own."""
+        """Test the same as the suite; with a ticket the result is the trigger's own."""
 
         async def look() -> None:
             async with (

@@ -1,4 +1,4 @@
-"""Requests by hand: each is answered or refused by a typed error, and the session goes on."""
+"""Test a user's own requests: each has an answer or a typed error, and the session goes on."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ LINES: dict[str, tuple[Any, dict[str, Any]]] = {
         },
     ),
 }
-"""By the emulated camera: what each line is answered with, None for any bytes."""
+"""Lines by camera, each with the expected answer or error; None for any bytes."""
 
 CASES = [(name, line) for name, (_, lines) in LINES.items() for line in lines]
 

@@ -1,6 +1,6 @@
-"""Triggers that are given up and cancelled, and slow devices, by chance: no older result.
+"""Test that triggers which time out or are cancelled at random leave no result to a later trigger.
 
-Each value is the number of the run that it comes from, as the emulated camera counts them. A result
+Each value is the number of the run that it comes from, as counted by the emulated camera. A result
 is the trigger's own only if its run is the last one that began, since nobody else triggers.
 """
 
@@ -78,8 +78,11 @@ CAMERAS: dict[str, tuple[Any, str, str]] = {
 
 
 async def storm(camera: smartcam.Camera[Any], emulator: Any, chance: random.Random) -> int:
-    """Trigger by chance; return how many results came, each of the last run that began."""
-    came = 0
+    """Trigger with random timeouts and cancellations; return the number of results.
+
+    Each result has to be of the last run that began.
+    """
+    result_count = 0
     for _ in range(STEPS):
         timeout = chance.choice((0.01, 0.04, 0.06, 0.1, 0.3, 2.0))
         trigger = asyncio.create_task(camera.trigger(timeout=timeout))
@@ -91,12 +94,12 @@ async def storm(camera: smartcam.Camera[Any], emulator: Any, chance: random.Rand
         except (asyncio.CancelledError, TriggerTimeoutError):
             continue
         if result.raw != b"ERROR":
-            came += 1
+            result_count += 1
             assert int(result.value.n) == emulator.runs, "the result is of an earlier run"
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(chance.choice((0.0, 0.02))):
                 await asyncio.sleep(1.0)
-    return came
+    return result_count
 
 
 @pytest.mark.sampled(every=6)
@@ -109,13 +112,13 @@ async def test_no_trigger_gets_the_result_of_a_run_from_before_it(name: str, see
         make() as emulator,
         smartcam.connect(f"{emulator.url}?{query}", interpret_as=layout) as camera,
     ):
-        came = await storm(camera, emulator, random.Random(seed))  # noqa: S311
-        assert came >= 1
+        result_count = await storm(camera, emulator, random.Random(seed))  # noqa: S311
+        assert result_count >= 1
         account = camera.statistics()
         fates = ("triggered", "streamed", "late", "wrong_application", "uninterpretable")
         found = sum(getattr(account, one) for one in (*fates, "unclaimed"))
         assert account.received == found
-        assert account.triggered >= came
+        assert account.triggered >= result_count
 
 
 @pytest.mark.sampled(every=2)

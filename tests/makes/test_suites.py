@@ -1,4 +1,4 @@
-"""smartcam's suite for protocols, with bytes from the makes' documents."""
+"""Run smartcam's suite for protocols with bytes from the makes' documents."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from smartcam.protocols import messages as m
 from smartcam.testing import Conversation, Received, Sent, WireSuite
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
-APPS_7 = "003\t07\t01\t07\t12"
-WHO = "IFM ELECTRONIC\tO2D500\tname\tplace\t\t192.168.0.69\t255.255.255.0\t192.168.0.201"
+APPLICATION_7 = "003\t07\t01\t07\t12"
+IDENTITY = "IFM ELECTRONIC\tO2D500\tname\tplace\t\t192.168.0.69\t255.255.255.0\t192.168.0.201"
 
 
 def v3(ticket: int | str, content: str) -> bytes:
-    """Return a frame of version 3, made here."""
+    """Return a frame of version 3."""
     body = f"{ticket}{content}\r\n".encode("latin-1")
     return f"{ticket}L{len(body):09}\r\n".encode() + body
 
 
 def v4(content: str) -> bytes:
-    """Return a frame of version 4, made here."""
+    """Return a frame of version 4."""
     return f"L{len(content) + 2:09}\r\n{content}\r\n".encode()
 
 
 def result(application: int, data: bytes, mixed: str = "") -> m.ResultContainer:
-    """Return a result of an application, or one that may be of several."""
-    why = f"the application changed while the result was made: it may be of any of {mixed}"
-    return m.ResultContainer(application=application, data=data, fault=why if mixed else None)
+    """Return a result of an application, or one that may be of any of ``mixed``."""
+    fault = f"the application changed while the result was made: it may be of any of {mixed}"
+    return m.ResultContainer(application=application, data=data, fault=fault if mixed else None)
 
 
 def code(line: str) -> m.ResultContainer:
@@ -40,7 +40,7 @@ def code(line: str) -> m.ResultContainer:
 
 V3_SESSION = (
     Sent(m.Connect(), b"1000L000000008\r\n1000G?\r\n"),
-    Received(v3(1000, WHO), (), b"1001L000000008\r\n1001p7\r\n"),
+    Received(v3(1000, IDENTITY), (), b"1001L000000008\r\n1001p7\r\n"),
     Received(v3(1001, "*"), (m.ConnectAnswer(version=1),)),
 )
 
@@ -60,10 +60,11 @@ class TestPcicWire(WireSuite):
                 Sent(m.Trigger(), v3(1004, "A?") + v3(1005, "T?")),
                 Sent(m.Query(), v3(1006, "A?")),
                 Received(v3("0000", "star;old;stop"), ()),
-                Received(v3(1004, APPS_7), (), v3(1007, "A?")),
-                Received(v3(1006, APPS_7), ()),
+                Received(v3(1004, APPLICATION_7), (), v3(1007, "A?")),
+                Received(v3(1006, APPLICATION_7), ()),
                 Received(
-                    v3(1007, APPS_7), (result(7, b"star;old;stop"), m.QueryAnswer(application=7))
+                    v3(1007, APPLICATION_7),
+                    (result(7, b"star;old;stop"), m.QueryAnswer(application=7)),
                 ),
                 Received(
                     v3("0001", "110001006:Trigger overrun"),
@@ -73,7 +74,7 @@ class TestPcicWire(WireSuite):
                 Received(v3(1005, "star;\r\n\xff;stop"), (), v3(1008, "A?")),
                 Received(v3("0010", "000500002:{}"), ()),
                 Received(
-                    v3(1008, APPS_7),
+                    v3(1008, APPLICATION_7),
                     (
                         m.TriggerAnswer(),
                         result(7, b"star;\r\n\xff;stop"),
@@ -109,7 +110,7 @@ class TestPcicWire(WireSuite):
             steps=[
                 *V3_SESSION,
                 Sent(m.Trigger(), v3(1002, "A?") + v3(1003, "t")),
-                Received(v3(1002, APPS_7), ()),
+                Received(v3(1002, APPLICATION_7), ()),
                 Received(v3(1003, "*"), (m.TriggerAnswer(),)),
                 Received(
                     v3("0001", "110001006:Trigger overrun"),
@@ -121,7 +122,7 @@ class TestPcicWire(WireSuite):
                 ),
                 Received(v3("0000", "star;1;stop"), (), v3(1004, "A?")),
                 Received(v3("0000", "star;2;stop"), ()),
-                Received(v3(1004, APPS_7), (result(7, b"star;1;stop"),), v3(1005, "A?")),
+                Received(v3(1004, APPLICATION_7), (result(7, b"star;1;stop"),), v3(1005, "A?")),
                 Received(v3(1005, "003\t12\t01\t07\t12"), (result(12, b"star;2;stop", "7, 12"),)),
             ],
         ),
@@ -140,7 +141,7 @@ class TestPcicWire(WireSuite):
             dialect="v4",
             steps=[
                 Sent(m.Connect(), b"G?\r\n"),
-                Received(v4(WHO), (), b"p0\r\n"),
+                Received(v4(IDENTITY), (), b"p0\r\n"),
                 Received(v4("*"), (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"A?\r\n"),
                 Sent(m.Query(), b""),
@@ -158,14 +159,14 @@ class TestPcicWire(WireSuite):
             dialect="v2",
             steps=[
                 Sent(m.Connect(), b"1000G?\r\n"),
-                Received(f"1000{WHO}\r\n".encode(), (), b"1001p7\r\n"),
+                Received(f"1000{IDENTITY}\r\n".encode(), (), b"1001p7\r\n"),
                 Received(b"1001*\r\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Trigger(), b"1002A?\r\n1003T?\r\n"),
-                Received(f"1002{APPS_7}\r\n".encode(), ()),
+                Received(f"1002{APPLICATION_7}\r\n".encode(), ()),
                 Received(b"0000star;old;stop\r\n", (), b"1004A?\r\n"),
                 Received(b"1003!\r\n", ()),
                 Received(
-                    f"1004{APPS_7}\r\n".encode(),
+                    f"1004{APPLICATION_7}\r\n".encode(),
                     (result(7, b"star;old;stop"), m.TriggerAnswer(code=4)),
                 ),
             ],
@@ -175,7 +176,7 @@ class TestPcicWire(WireSuite):
             dialect="v1",
             steps=[
                 Sent(m.Connect(), b"G?\r\n"),
-                Received(f"{WHO}\r\n".encode(), (), b"p0\r\n"),
+                Received(f"{IDENTITY}\r\n".encode(), (), b"p0\r\n"),
                 Received(b"*\r\n", (m.ConnectAnswer(version=1),)),
                 Sent(m.Query(), b"A?\r\n"),
                 Received(b"!\r\n", (m.QueryAnswer(application=m.UNNAMED_APPLICATION),)),

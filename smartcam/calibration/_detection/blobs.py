@@ -1,9 +1,9 @@
 """Find filled, round spots in an image that are darker than their surroundings.
 
 Pixels darker than the mean of their surroundings are joined into connected pieces. A piece whose
-area is that of the ellipse with its second moments is a spot: letters, lines, rings and corners
-fill less of that ellipse. The size of the surroundings limits the size of the dots that are dark
-all over; a few sizes cover all grids that an image can show.
+area is about that of the ellipse with the same second moments is a spot: letters, lines, rings and
+corners fill less of that ellipse. The size of the surroundings limits the size of the dots that are
+found; a few sizes cover all grids that an image can show.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MIN_SPOT_PIXELS = 9
 """A spot has at least this many pixels."""
 
 MIN_SPECK_PIXELS, MAX_SPECK_PIXELS = 3, 24
-"""Areas in pixels: a dot below the first is noise; one up to the second is called small."""
+"""Least and largest area of a speck, a dot of a few pixels; smaller ones are noise."""
 
 MAX_PART_OF_IMAGE = 1 / 16
 """A spot covers at most this part of the image's area: a grid has nine dots or more."""
@@ -40,8 +40,8 @@ MAX_ASPECT_RATIO = 6.0
 
 
 MIN_RECTANGLE_SHARE = 0.2
-"""A dot fills at least this part of the upright rectangle around it: an ellipse six times as long
-as wide that lies aslant fills 0.22, if it is filled as little as MIN_ELLIPSE_SHARE allows."""
+"""A dot fills at least this part of the upright rectangle around it: a slanted ellipse six times as
+long as wide, of which MIN_ELLIPSE_SHARE is filled, fills 0.22."""
 
 
 class Spots(NamedTuple):
@@ -58,72 +58,84 @@ class Pieces(NamedTuple):
     labels: NDArray[np.int32]  # (H, W), number of the piece that a pixel belongs to, or 0
     # (N, 5): left, top, width, height, area; the first row is the background
     boxes: NDArray[np.int32]
-    middles: Array  # (N, 2), pixels
+    centres: Array  # (N, 2), pixels
 
-    def spots(self, most: int) -> Spots:
-        """Return the filled, round pieces among the ``most`` largest ones."""
-        _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= MAX_PART_OF_IMAGE * self.dark.size)
-        chosen &= areas >= MIN_RECTANGLE_SHARE * wide * high
-        chosen[0] = False
-        picked = np.flatnonzero(chosen)
-        if len(picked) > most:
-            picked = picked[np.argsort(areas[picked])[-most:]]
-        number = np.full(len(areas), -1, dtype=np.int32)
-        number[picked] = np.arange(len(picked))
-        pieces = self._selected(picked)
-        good = _filled(self, number, pieces)
-        return Spots(pieces.points[good], pieces.areas[good])
+    def find_spots(self, max_count: int) -> Spots:
+        """Return the filled, round pieces among the ``max_count`` largest candidates."""
+        _, _, widths, heights, areas = self.boxes.T
+        is_candidate = (areas >= MIN_SPOT_PIXELS) & (areas <= MAX_PART_OF_IMAGE * self.dark.size)
+        is_candidate &= areas >= MIN_RECTANGLE_SHARE * widths * heights
+        is_candidate[0] = False
+        indices = np.flatnonzero(is_candidate)
+        if len(indices) > max_count:
+            indices = indices[np.argsort(areas[indices])[-max_count:]]
+        index_of_piece = np.full(len(areas), -1, dtype=np.int32)
+        index_of_piece[indices] = np.arange(len(indices))
+        candidates = self._as_spots(indices)
+        is_spot = _fills_ellipse(self, index_of_piece, candidates)
+        return Spots(candidates.points[is_spot], candidates.areas[is_spot])
 
-    def specks(self) -> Spots:
-        """Return the pieces that may be dots that cover only a few pixels."""
-        _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
-        chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
-        chosen[0] = False
-        return self._selected(np.flatnonzero(chosen))
+    def find_specks(self) -> Spots:
+        """Return the pieces that may be dots of only a few pixels."""
+        _, _, widths, heights, areas = self.boxes.T
+        is_candidate = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
+        is_candidate &= (widths <= MAX_ASPECT_RATIO / 2 * heights) & (
+            heights <= MAX_ASPECT_RATIO / 2 * widths
+        )
+        is_candidate[0] = False
+        return self._as_spots(np.flatnonzero(is_candidate))
 
-    def _selected(self, which: NDArray[np.intp]) -> Spots:
-        middles, areas = self.middles[which], self.boxes[which, 4]
-        return Spots(middles.astype(np.float64), areas.astype(np.float64))
+    def _as_spots(self, indices: NDArray[np.intp]) -> Spots:
+        centres, areas = self.centres[indices], self.boxes[indices, 4]
+        return Spots(centres.astype(np.float64), areas.astype(np.float64))
 
 
-def dark_pieces(image: NDArray[np.uint8], around: int) -> Pieces:
+def find_dark_pieces(image: NDArray[np.uint8], window: int) -> Pieces:
     """Return the dark pieces of an image (H, W).
 
-    ``around``: side of the square whose mean a pixel is compared with; about twice the distance
-    between dots.
+    ``window``: side of the square around each pixel with whose mean the pixel is compared, about
+    twice the distance between dots.
     """
     cv2 = load("cv2")
     smooth = cv2.blur(image, (3, 3))
-    side = max(3, around | 1)
+    odd_side = max(3, window | 1)
     dark = cv2.adaptiveThreshold(
-        smooth, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, MIN_CONTRAST
+        smooth, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, odd_side, MIN_CONTRAST
     )
-    _, labels, boxes, middles = cv2.connectedComponentsWithStats(dark, connectivity=4)
-    return Pieces(dark, labels, boxes, middles)
+    _, labels, boxes, centres = cv2.connectedComponentsWithStats(dark, connectivity=4)
+    return Pieces(dark, labels, boxes, centres)
 
 
-def _filled(all_: Pieces, number: NDArray[np.int32], pieces: Spots) -> NDArray[np.bool_]:
-    """Return True for each piece that fills an ellipse which is not too long.
+def _fills_ellipse(
+    pieces: Pieces, index_of_piece: NDArray[np.int32], candidates: Spots
+) -> NDArray[np.bool_]:
+    """Return a mask of the candidates that fill an ellipse which is not too long.
 
-    ``number`` (for all pieces) is the index of a piece among ``pieces``, or -1.
+    ``index_of_piece``: for each of the pieces its index among ``candidates``, or -1.
     """
-    count = len(pieces.areas)
-    at = np.flatnonzero(all_.dark)
-    which = number[all_.labels.ravel()[at]]
-    chosen = which >= 0
-    which = which[chosen]
-    v, u = np.divmod(at[chosen], all_.dark.shape[1])
-    x, y = u - pieces.points[which, 0], v - pieces.points[which, 1]
+    count = len(candidates.areas)
+    dark_pixels = np.flatnonzero(pieces.dark)
+    candidate_of_pixel = index_of_piece[pieces.labels.ravel()[dark_pixels]]
+    is_candidate = candidate_of_pixel >= 0
+    candidate_of_pixel = candidate_of_pixel[is_candidate]
+    v, u = np.divmod(dark_pixels[is_candidate], pieces.dark.shape[1])
+    x, y = (
+        u - candidates.points[candidate_of_pixel, 0],
+        v - candidates.points[candidate_of_pixel, 1],
+    )
     # An ellipse with half axes a and b has second moments a^2 / 4 and b^2 / 4 along them: its area,
     # pi a b, is 4 pi sqrt(det M). The larger eigenvalue of M over sqrt(det M) is a / b.
-    xx, xy, yy = (np.bincount(which, of, count) / pieces.areas for of in (x * x, x * y, y * y))
-    xx, yy = xx + 1 / 12, yy + 1 / 12  # a pixel's own: the variance of a side of 1
-    spread = np.sqrt(np.maximum(xx * yy - xy * xy, 0))
-    mean = (xx + yy) / 2
-    longest = mean + np.sqrt(np.maximum(mean * mean - spread * spread, 0))
-    filled: NDArray[np.bool_] = (pieces.areas >= MIN_ELLIPSE_SHARE * 4 * np.pi * spread) & (
-        longest <= MAX_ASPECT_RATIO * spread
+    xx, xy, yy = (
+        np.bincount(candidate_of_pixel, product, count) / candidates.areas
+        for product in (x * x, x * y, y * y)
     )
-    return filled
+    xx, yy = xx + 1 / 12, yy + 1 / 12  # a pixel's own: the variance of a side of 1
+    root_determinant = np.sqrt(np.maximum(xx * yy - xy * xy, 0))
+    mean = (xx + yy) / 2
+    larger_eigenvalue = mean + np.sqrt(
+        np.maximum(mean * mean - root_determinant * root_determinant, 0)
+    )
+    is_filled: NDArray[np.bool_] = (
+        candidates.areas >= MIN_ELLIPSE_SHARE * 4 * np.pi * root_determinant
+    ) & (larger_eigenvalue <= MAX_ASPECT_RATIO * root_determinant)
+    return is_filled

@@ -1,8 +1,8 @@
 """Find checkerboards of any size in images, whole or in part.
 
 A corner of a board is a saddle of the grey levels, and the saddles next to it are turned by 90
-degrees. Little else in a picture is connected like that. Saddles are looked for in a reduced image;
-missing corners are then fitted in the full image, at places predicted from those found.
+degrees. Little else in a picture is connected like that. Saddles are searched in a reduced image;
+missing corners are then fitted in the full image, at places that the found corners predict.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.dots import GridMap
-from smartcam.calibration._detection.grid_growing import lattices
-from smartcam.calibration._detection.image import reduced
+from smartcam.calibration._detection.grid_growing import grow_grids
+from smartcam.calibration._detection.image import reduce_levels
 from smartcam.calibration._detection.saddles import find_saddles
 from smartcam.calibration._homography import local_steps
 
@@ -31,26 +31,24 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 USUAL_SIDE_PX = 800
-"""Longest side of a usual image, pixels: a board is looked for at half of this size, at this size
-and at twice this size, unless the image is smaller."""
+"""Longest side of a usual image, pixels: a board is searched at half of this size, at this size and
+at twice this size, unless the image is smaller."""
 
 NEIGHBOURS = 8
-"""Nearest saddles among which the next corners are looked for: four corners and other saddles
-nearby."""
+"""Number of nearest saddles among which the next corners are searched: four corners and others."""
 
 FITTED_SHARE = 0.45
 """Edges at a corner are fitted along this part of a square's side, which ends before the next
 edges."""
 
 MIN_FITTED_SHARE = 0.6
-"""A board has at least this part of its tried corners fitted well, with alternating colours."""
+"""At least this part of a board's sampled corners is fitted well, with alternating colours."""
 
 MIN_FILLED_SHARE = 0.5
-"""An outermost row or column is left out where fewer than this part of its corners are seen."""
+"""An outermost row or column is left out if less than this part of its corners is found."""
 
 MAX_OFFSET_STEPS = 0.25
-"""A fitted corner may lie this part of a step, from one corner to the next, off its predicted
-place."""
+"""A fitted corner may differ from its predicted place by this part of the step between corners."""
 
 MIN_SQUARE_PIXELS = 9.0
 """A corner is fitted only where a square has a larger area than this in the image, pixels^2."""
@@ -61,177 +59,208 @@ MAX_REACH_PX = 8.0
 MAX_CORNERS_JUDGED = 24
 """At most this many corners of a candidate are checked to decide whether it is a board."""
 
-PLACES_IN_SQUARES = np.array(
+SQUARE_SAMPLES = np.array(
     [
         (side * x, up * y)
         for side, up in ((1, 1), (-1, -1), (1, -1), (-1, 1))
         for x, y in itertools.product((0.2, 0.35), repeat=2)
     ]
 )
-"""(16, 2), places in the four squares beside a corner, as parts of the steps to the next corners:
-first those in two opposite squares, then those in the other two."""
+"""(16, 2), places in the four squares at a corner, as parts of the steps to the next corners: first
+in two opposite squares, then in the other two."""
 
 MAX_SAME_BOARD_OFF_PX = 3.0
-"""Two sizes of an image show the same board if its corners differ by at most this median
-distance."""
+"""Boards found in two sizes of an image are the same if the median distance between their corners
+is less than this many pixels."""
 
-MAX_ROUNDS = 4
-"""A board is completed in at most this many rounds."""
+MAX_ITERATIONS = 4
+"""Missing corners of a board are added in at most this many rounds."""
 
 
 class Board(NamedTuple):
-    """Corners in rows and columns."""
+    """The found corners of a board, with their columns and rows."""
 
     points: Array  # (N, 2), pixels
-    places: NDArray[np.intp]  # (N, 2), column and row; their origin and directions are arbitrary
-    # whether the image has another board with the same numbers of columns and rows
-    again: bool = False
+    grid_positions: NDArray[np.intp]  # (N, 2), column and row; origin and directions are arbitrary
+    # whether the image has another board with as many columns, rows and corners
+    has_twin: bool = False
 
     @property
-    def shape(self) -> tuple[int, int]:
+    def counts(self) -> tuple[int, int]:
         """Columns and rows."""
-        if not len(self.places):
+        if not len(self.grid_positions):
             return 0, 0
-        columns, rows = (np.ptp(self.places, axis=0) + 1).tolist()
+        columns, rows = (np.ptp(self.grid_positions, axis=0) + 1).tolist()
         return columns, rows
 
     @property
     def is_full(self) -> bool:
         """True if no corner is missing."""
-        columns, rows = self.shape
-        return len(self.places) == columns * rows
+        columns, rows = self.counts
+        return len(self.grid_positions) == columns * rows
 
-    def by_rows(self, columns: int, rows: int) -> Array | None:
-        """Return all points (columns * rows, 2) row by row; None if the board has another shape."""
-        if not self.is_full or sorted(self.shape) != sorted((columns, rows)):
+    def points_by_rows(self, columns: int, rows: int) -> Array | None:
+        """Return all points (columns * rows, 2) row by row; None if any is missing."""
+        if not self.is_full or sorted(self.counts) != sorted((columns, rows)):
             return None
-        row, column = (1, 0) if self.shape == (columns, rows) else (0, 1)
-        return self.points[np.lexsort((self.places[:, column], self.places[:, row]))]
+        row, column = (1, 0) if self.counts == (columns, rows) else (0, 1)
+        return self.points[
+            np.lexsort((self.grid_positions[:, column], self.grid_positions[:, row]))
+        ]
 
-    def shows(self, other: Board) -> bool:
+    def shows_same_board(self, other: Board) -> bool:
         """Return True if this board has most of the corners of another one."""
         tree = load("scipy.spatial").cKDTree(self.points)
         return bool(np.median(tree.query(other.points)[0]) < MAX_SAME_BOARD_OFF_PX)
 
-    def filled(self) -> Board:
+    def fill_missing(self) -> Board:
         """Return the board with each missing corner at the place that the others predict."""
-        low, high = self.places.min(axis=0), self.places.max(axis=0)
-        missing = _missing(self, low, high)
-        points = GridMap(self.places.astype(np.float64), self.points)(missing.astype(np.float64))
-        return Board(np.concatenate([self.points, points]), np.concatenate([self.places, missing]))
+        low, high = self.grid_positions.min(axis=0), self.grid_positions.max(axis=0)
+        missing = _missing_positions(self, low, high)
+        points = GridMap(self.grid_positions.astype(np.float64), self.points)(
+            missing.astype(np.float64)
+        )
+        return Board(
+            np.concatenate([self.points, points]), np.concatenate([self.grid_positions, missing])
+        )
 
-    def trimmed(self) -> Board:
+    def trim_rim(self) -> Board:
         """Return the board without outermost rows and columns that have few corners."""
-        places = self.places
+        grid_positions = self.grid_positions
         for axis, end in itertools.product((0, 1), (np.min, np.max)):
-            if not len(places):
+            if not len(grid_positions):
                 break
-            outermost = places[:, axis] == end(places[:, axis])
-            if outermost.sum() < MIN_FILLED_SHARE * self.shape[1 - axis]:
+            is_outermost = grid_positions[:, axis] == end(grid_positions[:, axis])
+            if is_outermost.sum() < MIN_FILLED_SHARE * self.counts[1 - axis]:
                 return self._replace(
-                    points=self.points[~outermost], places=places[~outermost]
-                ).trimmed()
+                    points=self.points[~is_outermost], grid_positions=grid_positions[~is_outermost]
+                ).trim_rim()
         return self
 
 
-def parity(places: NDArray[np.intp]) -> Array:
-    """Return 1 and -1 in alternation, like the colours of a board."""
-    return np.where(places.sum(axis=1) % 2 == 0, 1.0, -1.0)
+def colour_signs(grid_positions: NDArray[np.intp]) -> Array:
+    """Return 1 and -1, which alternate over the grid like the colours of a board."""
+    return np.where(grid_positions.sum(axis=1) % 2 == 0, 1.0, -1.0)
 
 
-def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
-    """Yield the largest board in each size of an image, of about ``most`` corners at the most.
+def find_boards(image: GreyImage, wanted_count: int, *, max_count: int) -> Iterator[Board]:
+    """Yield the largest board in each size of an image, of at most about ``max_count`` corners.
 
-    The search in a size ends with the first one of ``count`` corners or more.
+    The search in a size ends with the first board of ``wanted_count`` corners or more.
     """
-    least = math.ceil(max(image.size) / USUAL_SIDE_PX)
-    for times in dict.fromkeys((2 * least, least, (least + 1) // 2)):
-        seen = find_saddles(reduced(image.bytes, times))
+    min_factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
+    for factor in dict.fromkeys((2 * min_factor, min_factor, (min_factor + 1) // 2)):
+        saddles = find_saddles(reduce_levels(image.bytes, factor))
         largest: Lattice = {}
-        grids = lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS)
+        grids = grow_grids(
+            saddles.points,
+            saddles.may_be_neighbours,
+            min_count=4,
+            max_count=max_count,
+            neighbours=NEIGHBOURS,
+        )
         for grid in grids:
             largest = max(largest, grid, key=len)
-            if len(largest) >= count:
+            if len(largest) >= wanted_count:
                 break
         if largest:
-            again = any(_shape(grid) == _shape(largest) for grid in grids)
-            points = (seen.points[list(largest.values())] + 0.5) * times - 0.5
-            yield Board(points, np.array(list(largest), dtype=np.intp), again).trimmed()
+            has_twin = any(_grid_size(grid) == _grid_size(largest) for grid in grids)
+            points = (saddles.points[list(largest.values())] + 0.5) * factor - 0.5
+            yield Board(points, np.array(list(largest), dtype=np.intp), has_twin).trim_rim()
 
 
-def _shape(grid: Lattice) -> list[int]:
+def _grid_size(grid: Lattice) -> list[int]:
     """Return a grid's counts of columns and rows, the smaller first, and of its corners."""
     return [*sorted(np.ptp(np.array(list(grid)), axis=0).tolist()), len(grid)]
 
 
-def completed(image: GreyImage, board: Board) -> Board | None:
-    """Return the board with missed corners added; None if the fits find no corners."""
-    sampled = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
-    _, signs = _fitted(image, board, sampled)
-    sign = float(parity(sampled) @ signs)
-    if abs(sign) < MIN_FITTED_SHARE * len(sampled):
+def complete_board(image: GreyImage, board: Board) -> Board | None:
+    """Return the board with missing corners added; None if the fits show that it is no board."""
+    sampled_positions = board.grid_positions[
+        :: math.ceil(len(board.grid_positions) / MAX_CORNERS_JUDGED)
+    ]
+    _, signs = _fit_corners(image, board, sampled_positions)
+    board_sign = float(colour_signs(sampled_positions) @ signs)
+    if abs(board_sign) < MIN_FITTED_SHARE * len(sampled_positions):
         return None
-    recent = board.places
-    for _ in range(MAX_ROUNDS):
-        missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
-        # a new corner beside an empty place may predict that place better
-        beside = np.abs(missing[:, None] - recent).max(axis=2).min(axis=1, initial=2) <= 1
-        missing = missing[beside]
-        points, signs = _fitted(image, board, missing)
-        right = parity(missing) * signs * sign > 0
-        if not right.any():
+    new_positions = board.grid_positions
+    for _ in range(MAX_ITERATIONS):
+        missing = _missing_positions(
+            board, board.grid_positions.min(axis=0) - 1, board.grid_positions.max(axis=0) + 1
+        )
+        # new corners may predict the empty positions next to them better
+        is_beside_new = (
+            np.abs(missing[:, None] - new_positions).max(axis=2).min(axis=1, initial=2) <= 1
+        )
+        missing = missing[is_beside_new]
+        points, signs = _fit_corners(image, board, missing)
+        is_corner = colour_signs(missing) * signs * board_sign > 0
+        if not is_corner.any():
             break
-        recent = missing[right]
+        new_positions = missing[is_corner]
         board = Board(
-            np.concatenate([board.points, points[right]]), np.concatenate([board.places, recent])
-        ).trimmed()
+            np.concatenate([board.points, points[is_corner]]),
+            np.concatenate([board.grid_positions, new_positions]),
+        ).trim_rim()
     return board
 
 
-def _missing(board: Board, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the places (N, 2) from ``low`` to ``high`` where no corner has been found yet."""
-    every = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
-    found_places = set(map(tuple, board.places.tolist()))
-    missing = [place for place in every if place not in found_places]
+def _missing_positions(
+    board: Board, low: NDArray[np.intp], high: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """Return the grid positions (N, 2) from ``low`` to ``high`` without a corner so far."""
+    all_positions = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
+    found_positions = set(map(tuple, board.grid_positions.tolist()))
+    missing = [position for position in all_positions if position not in found_positions]
     return np.array(missing, dtype=np.intp).reshape(-1, 2)
 
 
-def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return corners (N, 2) at a board's places, and the signs of their gains.
+def _fit_corners(
+    image: GreyImage, board: Board, grid_positions: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """Return corners (N, 2) at a board's grid positions, and the signs of their gains.
 
-    The sign is 0 where the image shows no corner, and for places outside of the image.
+    The sign is 0 where the image shows no corner, and for positions outside of the image.
     """
-    mapped = GridMap(board.places.astype(np.float64), board.points)
-    at = places.astype(np.float64)
-    points, ways = mapped(at), local_steps(mapped, at, 1.0)
-    signs = np.zeros(len(places))
-    inside = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
-    inside &= np.abs(np.linalg.det(ways)) > MIN_SQUARE_PIXELS
-    inside[inside] = like_corners(image, points[inside], ways[inside])
-    if inside.any():
-        lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(FITTED_SHARE, MAX_REACH_PX / lengths.max(axis=1))[:, None, None]
-        corners = refine_corners(image, points[inside], part * ways[inside])
-        aside = np.linalg.norm(corners.points - points[inside], axis=1)
-        step = lengths.min(axis=1)
-        good = corners.fitted & (aside < MAX_OFFSET_STEPS * step)
-        points[inside] = corners.points
-        signs[inside] = np.sign(corners.gains) * good
+    grid_map = GridMap(board.grid_positions.astype(np.float64), board.points)
+    coordinates = grid_positions.astype(np.float64)
+    points, steps = grid_map(coordinates), local_steps(grid_map, coordinates, 1.0)
+    signs = np.zeros(len(grid_positions))
+    is_candidate = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
+    is_candidate &= np.abs(np.linalg.det(steps)) > MIN_SQUARE_PIXELS
+    is_candidate[is_candidate] = looks_like_corners(
+        image, points[is_candidate], steps[is_candidate]
+    )
+    if is_candidate.any():
+        lengths = np.linalg.norm(steps[is_candidate], axis=2)
+        share = np.minimum(FITTED_SHARE, MAX_REACH_PX / lengths.max(axis=1))[:, None, None]
+        corners = refine_corners(image, points[is_candidate], share * steps[is_candidate])
+        offsets = np.linalg.norm(corners.points - points[is_candidate], axis=1)
+        shortest = lengths.min(axis=1)
+        is_good = corners.fitted & (offsets < MAX_OFFSET_STEPS * shortest)
+        points[is_candidate] = corners.points
+        signs[is_candidate] = np.sign(corners.gains) * is_good
     return points, signs
 
 
-def like_corners(image: GreyImage, points: Array, ways: Array) -> NDArray[np.bool_]:
-    """Return True for each point (N, 2) beside which two opposite squares are darker than the rest.
+def looks_like_corners(image: GreyImage, points: Array, steps: Array) -> NDArray[np.bool_]:
+    """Return a mask of the points (N, 2) at which two opposite squares are darker than the others.
 
-    The test rejects most places that are no corners, in a small part of the time of a fit. ``ways``
+    The test rejects most positions that are no corners, and is much faster than a fit. ``steps``
     (N, 2, 2) lead to the next corners, pixels.
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
     cv2 = load("cv2")
-    at = points[:, None] + np.einsum("pk,nki->npi", PLACES_IN_SQUARES, ways)
+    samples = points[:, None] + np.einsum("pk,nki->npi", SQUARE_SAMPLES, steps)
     levels = cv2.remap(
-        image.levels, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        image.levels,
+        samples.astype(np.float32),
+        None,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
-    one, other = levels.reshape(len(points), 2, 2, -1).mean(axis=3).transpose(1, 0, 2)
-    return np.asarray((one.max(axis=1) < other.min(axis=1)) | (other.max(axis=1) < one.min(axis=1)))
+    pair, other_pair = levels.reshape(len(points), 2, 2, -1).mean(axis=3).transpose(1, 0, 2)
+    return np.asarray(
+        (pair.max(axis=1) < other_pair.min(axis=1)) | (other_pair.max(axis=1) < pair.min(axis=1))
+    )

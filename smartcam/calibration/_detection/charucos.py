@@ -10,16 +10,21 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
-from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
+from smartcam.calibration._detection.grid_growing import area_test, grow_grids
+from smartcam.calibration._detection.image import (
+    USUAL_SIDE_PX,
+    GreyImage,
+    reduce_levels,
+    resize_image,
+)
 from smartcam.calibration._detection.markers import (
     Markers,
-    agreeing,
     check_one_board,
+    compare_with_board,
     marker_dictionary,
     marker_finder,
-    remarks_on_strays,
-    seen_from_nearest,
+    predict_pixels,
+    stray_remarks,
 )
 from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._views import TargetView
@@ -41,15 +46,14 @@ MAX_DOUBLED_PX = 2600
 """An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 MIN_QUADRANGLES = 5
-"""Fewer dark quadrangles than this, in rows and columns, are not taken for a board's markers."""
+"""At least this many dark quadrangles in rows and columns may be a board's markers."""
 
 MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
-"""Sides of a marker's module, pixels: a smaller one than the first cannot be read even at twice the
-size; one larger than the second would have been read, so quadrangles of that size are no
-markers."""
+"""Limits for the side of a marker's module, pixels. Smaller ones cannot be read even at twice the
+size. Larger ones would have been read, so quadrangles of that size are no markers."""
 
 MAX_SQUARES_OFF = 0.3
-"""A corner may lie this many sides of a square away from where the nearest markers predict it."""
+"""A corner may differ from the nearest markers' prediction by this part of a square's side."""
 
 FITTED_SHARE = 0.45
 """The edges at a corner are fitted along this part of a square's side."""
@@ -61,8 +65,8 @@ def charuco_board(target: Charuco, *, legacy_pattern: bool | None = None) -> Any
     ``legacy_pattern``: None uses the target's own.
     """
     cv2 = load("cv2")
-    needed = target.columns * target.rows // 2
-    dictionary = marker_dictionary(target.dictionary, needed, _name(target))
+    min_markers = target.columns * target.rows // 2
+    dictionary = marker_dictionary(target.dictionary, min_markers, _name(target))
     board = cv2.aruco.CharucoBoard(
         (target.columns, target.rows), target.square, target.marker, dictionary
     )
@@ -79,68 +83,73 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
 
     Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE if the dictionary is unknown.
     """
-    sighting = _numbered(image, target)
+    sighting = _find_board(image, target)
     ids, points = sighting.ids, sighting.points
-    flat = target.points[ids, :2]
-    matrix = fit_homography(flat, points)
+    board_points = target.points[ids, :2]
+    matrix = fit_homography(board_points, points)
     if matrix is None:
         raise _not_found_error(target, "all in a line", len(ids))
-    ways = local_steps(partial(apply_homography, matrix), flat, FITTED_SHARE * target.square)
-    clear = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
-        ways, axis=2
+    edge_steps = local_steps(
+        partial(apply_homography, matrix), board_points, FITTED_SHARE * target.square
     )
-    corners = refine_corners(image, points, ways, clear)
+    arm_widths = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
+        edge_steps, axis=2
+    )
+    corners = refine_corners(image, points, edge_steps, arm_widths)
     row, column = np.divmod(ids, target.columns - 1)
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)
-    seen = corners.fitted & (colours * (colours @ corners.fitted) > 0)
-    if seen.sum() < MIN_CORNERS:
-        raise _not_found_error(target, "clear enough", int(seen.sum()))
+    is_good = corners.fitted & (colours * (colours @ corners.fitted) > 0)
+    if is_good.sum() < MIN_CORNERS:
+        raise _not_found_error(target, "clear enough", int(is_good.sum()))
     return TargetView(
         target=target,
         size=image.size,
-        ids=ids[seen],
-        points=corners.points[seen],
-        covariance=corners.covariance[seen],
+        ids=ids[is_good],
+        points=corners.points[is_good],
+        covariance=corners.covariance[is_good],
         name=name,
-        warnings=remarks_on_strays(sighting.strays),
+        warnings=stray_remarks(sighting.stray_ids),
     )
 
 
-def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
+def _find_board(image: GreyImage, target: Charuco) -> _Sighting:
     """Return the sighting of a board, with at least four corners.
 
-    If only few markers are read beside many quadrangles, the mirrored image is searched as well:
-    the mirror image of a marker can be another marker of the dictionary.
+    If only few corners are found, the mirrored image is searched as well: the mirror image of a
+    marker can be another marker of the dictionary.
     """
-    seen = _detect(image, target)
-    count = len(seen.ids)
-    if seen.otherwise >= max(MIN_CORNERS, seen.agreeing + 1):
-        raise _other_pattern_error(target, seen)
-    check_one_board(seen.agreeing, seen.contrary, _name(target))
-    if 2 * count > max(len(target.points), 4 * MIN_CORNERS):
-        return seen
-    if seen.side and len(_detect(_flipped(image), target).ids) >= max(MIN_CORNERS, 2 * count):
+    sighting = _search_sizes(image, target)
+    corner_count = len(sighting.ids)
+    if sighting.other_pattern_count >= max(MIN_CORNERS, sighting.agreeing_count + 1):
+        raise _other_pattern_error(target, sighting)
+    check_one_board(sighting.agreeing_count, sighting.contrary_count, _name(target))
+    if 2 * corner_count > max(len(target.points), 4 * MIN_CORNERS):
+        return sighting
+    if sighting.marker_side and len(_search_sizes(_flipped(image), target).ids) >= max(
+        MIN_CORNERS, 2 * corner_count
+    ):
         raise Code.MIRRORED.refusal(
             f"{_name(target)}: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
             "the sheet as one reads it",
             "its mirror image",
         )
-    if count < MIN_CORNERS:
-        read = f"beside {seen.markers} markers of its dictionary"
-        if seen.markers:
-            read += f", of which {seen.agreeing} stand to each other as on such a board"
-        raise _not_found_error(target, read, count)
-    return seen
+    if corner_count < MIN_CORNERS:
+        text = f"beside {sighting.marker_count} markers of its dictionary"
+        if sighting.marker_count:
+            text += f", of which {sighting.agreeing_count} stand to each other as on such a board"
+        raise _not_found_error(target, text, corner_count)
+    return sighting
 
 
-def _other_pattern_error(target: Charuco, seen: _Sighting) -> CalibrationError:
+def _other_pattern_error(target: Charuco, sighting: _Sighting) -> CalibrationError:
     """Return the error for markers that are arranged as in the other ``legacy_pattern``."""
     expected, other = target.legacy_pattern, not target.legacy_pattern
     return Code.WRONG_TARGET.refusal(
         f"{_name(target)}: expected markers as "
-        f"legacy_pattern={expected} has them, of which {seen.agreeing} stand to each other as on "
-        f"that board; got {seen.otherwise} that stand as legacy_pattern={other} has them",
+        f"legacy_pattern={expected} has them, of which {sighting.agreeing_count} stand to each "
+        f"other as on that board; got {sighting.other_pattern_count} that stand as "
+        f"legacy_pattern={other} has them",
         f"legacy_pattern={expected}",
         f"legacy_pattern={other}",
     )
@@ -157,78 +166,89 @@ class _Sighting(NamedTuple):
 
     ids: NDArray[np.intp]  # (N,), ascending
     points: Array  # (N, 2), pixels
-    markers: int  # count of the markers that were read
-    agreeing: int  # count of those that are arranged as on the board
-    contrary: int  # count of others that agree with each other, but not with these
-    otherwise: int  # count of those arranged as on the board of the other legacy_pattern
-    strays: tuple[int, ...]  # ids of the markers that were left out
-    # side of a module, pixels of the given image: of the markers that were read, or else of
-    # quadrangles in rows and columns; 0 if there are neither
-    side: float
+    marker_count: int  # number of markers that were read
+    agreeing_count: int  # number of read markers that are arranged as on the board
+    contrary_count: int  # number of other markers that agree with each other
+    other_pattern_count: int  # number of markers arranged as with the other legacy_pattern
+    stray_ids: tuple[int, ...]  # ids of the markers that were left out
+    # side of a marker, pixels of the given image: of those that were read, or else of quadrangles
+    # in rows and columns; 0 if there are neither
+    marker_side: float
 
 
-def _detect(image: GreyImage, target: Charuco) -> _Sighting:
-    """Find a board in a reduced image, else in the given image, else in it enlarged twofold.
+def _search_sizes(image: GreyImage, target: Charuco) -> _Sighting:
+    """Search a board in a reduced image, then in the given image, then at twice its size.
 
-    Each image is searched only if the one before shows too little, and the last one only if there
-    may be markers that were too small to be read.
+    Each search ends if it shows enough of the board. The image is enlarged only if there may be
+    markers that are too small to be read.
     """
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
-    times = math.ceil(max(image.size) / USUAL_SIDE_PX)
-    if times > 1:
-        best = _look(reduced(image.bytes, times), 1 / times, target, best)
-        if _is_all(best, target, image):
+    factor = math.ceil(max(image.size) / USUAL_SIDE_PX)
+    if factor > 1:
+        best = _search_image(reduce_levels(image.bytes, factor), 1 / factor, target, best)
+        if _has_all_corners(best, target, image):
             return best
-    best = _look(image.bytes, 1.0, target, best)
-    few = max(image.size) <= MAX_DOUBLED_PX and 2 * len(best.ids) <= len(target.points)
-    if few and (
-        best.markers or 0 < best.side < MAX_UNREAD_MODULE_PIXELS * _modules(charuco_board(target))
+    best = _search_image(image.bytes, 1.0, target, best)
+    can_double = max(image.size) <= MAX_DOUBLED_PX and 2 * len(best.ids) <= len(target.points)
+    if can_double and (
+        best.marker_count
+        or 0
+        < best.marker_side
+        < MAX_UNREAD_MODULE_PIXELS * _modules_per_side(charuco_board(target))
     ):
-        best = _look(scaled(image.bytes, 2.0), 2.0, target, best)
+        best = _search_image(resize_image(image.bytes, 2.0), 2.0, target, best)
     return best
 
 
-def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
+def _has_all_corners(sighting: _Sighting, target: Charuco, image: GreyImage) -> bool:
     """Return True if all corners were found that should be in the image."""
-    if len(seen.ids) < MIN_CORNERS:
+    if len(sighting.ids) < MIN_CORNERS:
         return False
-    matrix = fit_homography(target.points[seen.ids, :2], seen.points)
+    matrix = fit_homography(target.points[sighting.ids, :2], sighting.points)
     if matrix is None:
         return False
     expected = apply_homography(matrix, target.points[:, :2])
-    inside = ((expected >= 0) & (expected <= np.array(image.size) - 1)).all(axis=1)
-    return bool(np.isin(np.flatnonzero(inside), seen.ids).all())
+    is_inside = ((expected >= 0) & (expected <= np.array(image.size) - 1)).all(axis=1)
+    return bool(np.isin(np.flatnonzero(is_inside), sighting.ids).all())
 
 
-def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting) -> _Sighting:
-    """Return the sighting in an image ``scale`` times as large, or the best one before it."""
+def _search_image(
+    image: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting
+) -> _Sighting:
+    """Return the sighting in an image of ``scale`` times the size if it is better than ``best``."""
     board = charuco_board(target)
-    finder = marker_finder(bytes_, board.getDictionary())
-    quads, numbers, others = finder.detectMarkers(bytes_)
-    side = _side(quads) if numbers is not None else _side_in_rows(others, board)
-    best = best._replace(side=max(best.side, side / scale))
-    if numbers is None:
+    finder = marker_finder(image, board.getDictionary())
+    quads, ids_read, rejected = finder.detectMarkers(image)
+    marker_side = _median_side(quads) if ids_read is not None else _side_in_grid(rejected, board)
+    best = best._replace(marker_side=max(best.marker_side, marker_side / scale))
+    if ids_read is None:
         return best
-    flat = _map(board)
-    read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
-    good, contrary = agreeing(read, flat)
-    strays = tuple(sorted(read.ids[~good].tolist()))
-    otherwise = 0
+    board_corners = _marker_corners(board)
+    markers = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), ids_read.ravel())
+    mask, contrary_count = compare_with_board(markers, board_corners)
+    stray_ids = tuple(sorted(markers.ids[~mask].tolist()))
+    other_pattern_count = 0
     if target.rows % 2 == 0:
-        turned = charuco_board(target, legacy_pattern=not target.legacy_pattern)
-        otherwise = int(agreeing(read, _map(turned)).good.sum())
+        other_board = charuco_board(target, legacy_pattern=not target.legacy_pattern)
+        other_pattern_count = int(
+            compare_with_board(markers, _marker_corners(other_board)).mask.sum()
+        )
     best = best._replace(
-        markers=max(best.markers, len(good)),
-        agreeing=max(best.agreeing, int(good.sum())),
-        contrary=max(best.contrary, contrary),
-        otherwise=max(best.otherwise, otherwise),
+        marker_count=max(best.marker_count, len(mask)),
+        agreeing_count=max(best.agreeing_count, int(mask.sum())),
+        contrary_count=max(best.contrary_count, contrary_count),
+        other_pattern_count=max(best.other_pattern_count, other_pattern_count),
     )
-    if not good.any():
+    if not mask.any():
         return best
-    shaped = [quad for quad, fits in zip(quads, good, strict=True) if fits]
-    quads, numbers, *_ = finder.refineDetectedMarkers(bytes_, board, shaped, numbers[good], others)
-    read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
-    ids, corners = _between(bytes_, board, read.selected(agreeing(read, flat).good))
+    kept_quads = [quad for quad, is_kept in zip(quads, mask, strict=True) if is_kept]
+    quads, ids_read, *_ = finder.refineDetectedMarkers(
+        image, board, kept_quads, ids_read[mask], rejected
+    )
+    markers = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), ids_read.ravel())
+    ids, corners = _interpolate_corners(
+        image, board, markers.subset(compare_with_board(markers, board_corners).mask)
+    )
     if len(ids) <= len(best.ids):
         return best
     # OpenCV counts rows from the top
@@ -236,77 +256,80 @@ def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sight
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
     order = np.argsort(ids)
     points = (corners + 0.5) / scale - 0.5
-    return best._replace(ids=ids[order], points=points[order], strays=strays)
+    return best._replace(ids=ids[order], points=points[order], stray_ids=stray_ids)
 
 
-def _map(board: Any) -> Array:
+def _marker_corners(board: Any) -> Array:
     """Return the corners of a board's markers, in the order of their ids, (M, 4, 2)."""
     return np.asarray(board.getObjPoints(), dtype=np.float64)[:, :, :2]
 
 
-def _between(
-    bytes_: NDArray[np.uint8], board: Any, markers: Markers
+def _interpolate_corners(
+    image: NDArray[np.uint8], board: Any, markers: Markers
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return OpenCV's numbers of the corners beside markers, and their places (N, 2).
+    """Return OpenCV's numbers of the corners next to markers, and their pixels (N, 2).
 
-    Corners that are not where their markers predict them are left out.
+    Corners that are not where the markers predict them are left out.
     """
     cv2 = load("cv2")
-    given = cv2.aruco.CharucoParameters()
-    given.minMarkers = 1
-    if hasattr(given, "checkMarkers"):  # OpenCV 4.11 and later
-        given.checkMarkers = False  # the two forms of OpenCV's result agree
-    detector = cv2.aruco.CharucoDetector(board, given)
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.minMarkers = 1
+    if hasattr(parameters, "checkMarkers"):  # OpenCV 4.11 and later
+        parameters.checkMarkers = False  # the two forms of OpenCV's result agree
+    detector = cv2.aruco.CharucoDetector(board, parameters)
     quads = [quad[None].astype(np.float32) for quad in markers.quads]
-    numbers = markers.ids.astype(np.int32)[:, None]
-    corners, seen_ids, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
-    if seen_ids is None or not len(seen_ids):
+    marker_ids = markers.ids.astype(np.int32)[:, None]
+    corners, corner_ids, *_ = detector.detectBoard(image, markerCorners=quads, markerIds=marker_ids)
+    if corner_ids is None or not len(corner_ids):
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
-    ids = np.asarray(seen_ids, dtype=np.intp).ravel()
+    ids = np.asarray(corner_ids, dtype=np.intp).ravel()
     points = np.array(corners, dtype=np.float64).reshape(-1, 2)
-    at = np.asarray(board.getChessboardCorners(), dtype=np.float64)[ids, :2]
-    flat = _map(board)[markers.ids]
-    seen, step = seen_from_nearest(markers.quads, flat, at)
+    places = np.asarray(board.getChessboardCorners(), dtype=np.float64)[ids, :2]
+    board_corners = _marker_corners(board)[markers.ids]
+    expected, scales = predict_pixels(markers.quads, board_corners, places)
     square = float(board.getSquareLength())
-    right = np.linalg.norm(points - seen, axis=1) < MAX_SQUARES_OFF * square * step
-    return ids[right], points[right]
+    is_right = np.linalg.norm(points - expected, axis=1) < MAX_SQUARES_OFF * square * scales
+    return ids[is_right], points[is_right]
 
 
-def _modules(board: Any) -> int:
-    """Return the count of squares along a marker's side, its black rim included."""
+def _modules_per_side(board: Any) -> int:
+    """Return the number of modules along a marker's side, including its black border."""
     return int(board.getDictionary().markerSize) + 2
 
 
-def _areas(quads: Sequence[Array]) -> Array:
+def _quad_areas(quads: Sequence[Array]) -> Array:
     corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
     (a, b), (c, d) = (corners[:, 2] - corners[:, 0]).T, (corners[:, 3] - corners[:, 1]).T
     areas: Array = np.maximum(np.abs(a * d - b * c) / 2, 1.0)
     return areas
 
 
-def _side(quads: Sequence[Array]) -> float:
-    return float(np.sqrt(np.median(_areas(quads))))
+def _median_side(quads: Sequence[Array]) -> float:
+    return float(np.sqrt(np.median(_quad_areas(quads))))
 
 
-def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
-    """Return the side of dark quadrangles (1, 4, 2) that stand in rows and columns as markers do.
+def _side_in_grid(quads: Sequence[Array], board: Any) -> float:
+    """Return the side, pixels, of dark quadrangles (1, 4, 2) in rows and columns.
 
-    0: there are none, or too small ones for a marker that can be read.
+    These may be markers. It is 0 if there are none, or only quadrangles too small for a marker that
+    can be read.
     """
     if len(quads) < MIN_QUADRANGLES:
         return 0.0
-    areas = _areas(quads)
-    middles = np.array(quads, dtype=np.float64).reshape(-1, 4, 2).mean(axis=1)
-    most = len(board.getIds())
-    grids = lattices(middles, alike_areas(areas), least=MIN_QUADRANGLES, most=most)
-    sides = [_side([quads[index] for index in grid.values()]) for grid in grids]
-    return max((side for side in sides if side > MIN_MODULE_PIXELS * _modules(board)), default=0.0)
+    areas = _quad_areas(quads)
+    centres = np.array(quads, dtype=np.float64).reshape(-1, 4, 2).mean(axis=1)
+    marker_count = len(board.getIds())
+    grids = grow_grids(centres, area_test(areas), min_count=MIN_QUADRANGLES, max_count=marker_count)
+    sides = [_median_side([quads[index] for index in grid.values()]) for grid in grids]
+    return max(
+        (side for side in sides if side > MIN_MODULE_PIXELS * _modules_per_side(board)), default=0.0
+    )
 
 
-def _not_found_error(target: Charuco, how: str, count: int) -> CalibrationError:
+def _not_found_error(target: Charuco, reason: str, count: int) -> CalibrationError:
     return Code.TARGET_NOT_FOUND.refusal(
         f"charuco: expected at least {MIN_CORNERS} corners of a board of {target.columns} x "
-        f"{target.rows} squares, found {count} {how}",
+        f"{target.rows} squares, found {count} {reason}",
         MIN_CORNERS,
         count,
     )

@@ -1,7 +1,7 @@
 """Find grids of dots in images, number them from their origin and fit their centres.
 
-A grid that is seen in part could be numbered in more than one way. It is refused: all its dots must
-be visible, and no further ones beside them.
+A grid that is seen in part could be numbered in more than one way. It is refused: all its dots
+must be visible, and there must be no further dots where its rows and columns would continue.
 """
 
 from __future__ import annotations
@@ -13,11 +13,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._detection.blobs import dark_pieces
+from smartcam.calibration._detection.blobs import find_dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
-from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
-from smartcam.calibration._detection.ordering import arrangements, marked, most_rightward
+from smartcam.calibration._detection.grid_growing import area_test, grow_grids
+from smartcam.calibration._detection.image import (
+    USUAL_SIDE_PX,
+    GreyImage,
+    reduce_levels,
+    resize_image,
+)
+from smartcam.calibration._detection.ordering import (
+    choose_marked,
+    choose_rightward,
+    find_arrangements,
+)
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import local_steps
 from smartcam.calibration._views import TargetView
@@ -36,29 +45,28 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO = 1.0, 0.3
-"""Side of the square whose mean a pixel is compared with, in distances between dots of a grid that
-fills the image: a wide and a narrow square."""
+"""Side of the square with whose mean a pixel is compared, in distances between dots of a grid that
+fills the image: of a wide and of a narrow square."""
 
 SMALL_SIDE_PX = 800
-"""A grid is looked for first in an image whose longest side has this many pixels."""
+"""A grid is searched first in an image whose longest side has at most this many pixels."""
 
 MIN_DOT_SHARE = 0.4
-"""At least this part of a grid's dots must be found in rows and columns among dots of a few pixels,
-before the image is searched at twice its size. If all dots are visible at twice the size, this many
-can be separated in the given one."""
+"""The image is searched at twice its size only if at least this part of a grid's dots is found in
+rows and columns among dots of a few pixels: as many are separated if all are at twice the size."""
 
 NEIGHBOURS = 8
-"""Dots of a few pixels: the next dots of a grid are looked for among this many neighbours."""
+"""The next dots of a grid of dots of a few pixels are searched among this many neighbours."""
 
 EXTRA_SPOTS = 1000
-"""Spots examined beyond twice the number of the target's dots; in an image with more, the
-largest."""
+"""Number of spots that are examined, in addition to twice the number of the target's dots; in an
+image with more spots, the largest."""
 
 MIN_DOTS_REPORTED = 9
 """An error reports dots in rows and columns only if there are at least this many."""
 
 MAX_OFFSET_RATIO = 0.15
-"""A dot may lie this part of the distance between dots off the place that the others predict."""
+"""A dot may lie off the place that the others predict by this part of the distance between dots."""
 
 RING_DIRECTIONS = np.column_stack(
     [np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)]
@@ -71,179 +79,212 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 
     Raises TARGET_NOT_FOUND, AMBIGUOUS_ORIGIN, MIRRORED.
     """
-    seen = _Counted()
-    for inked, points, ways in _grids(image, target, seen):
-        if _is_whole(inked, target, points[ways[0].order.ravel()]):
-            return _view(inked, target, points, ways, name)
-        seen.largest = len(points) + 1
-    raise _not_found_error(target, seen)
+    counts = _SearchCounts()
+    for dark_image, points, numberings in _find_grids(image, target, counts):
+        if _is_complete(dark_image, target, points[numberings[0].order.ravel()]):
+            return _make_view(dark_image, target, points, numberings, name)
+        counts.max_grid_count = len(points) + 1
+    raise _not_found_error(target, counts)
 
 
 @dataclass
-class _Counted:
-    """The counts of a search, kept for the text of its error."""
+class _SearchCounts:
+    """The counts of a search, for the text of its error."""
 
-    spots: int | None = None  # count of dark spots, in the first search
-    # the most dots found in rows and columns; a count above the target's is not completed
-    largest: int = 0
+    spot_count: int | None = None  # count of dark spots, in the first search
+    # largest number of dots in rows and columns; growing stops above the target's number
+    max_grid_count: int = 0
 
 
-def _grids(
-    image: GreyImage, target: CircleGrid, seen: _Counted
+def _find_grids(
+    image: GreyImage, target: CircleGrid, counts: _SearchCounts
 ) -> Iterator[tuple[GreyImage, Array, list[Arrangement]]]:
-    """Yield dots (N, 2), pixels, that are arranged as the target's, and the ways to number them.
+    """Yield an image, dots (N, 2) arranged as the target's, pixels, and the ways to number them.
 
-    With them comes the image in which they are dark: the given one or its negative.
+    The image is the one in which the dots are dark: the given one or its negative.
     """
-    for light, scale, spots in _looks(image.bytes, target):
-        for points, places in _laid_out(spots, target, seen):
+    for is_negative, scale, spots in _search_image(image.bytes, target):
+        for points, grid_positions in _find_layouts(spots, target, counts):
             centres = (points + 0.5) / scale - 0.5
-            ways = arrangements(centres, places, target)
-            if ways and _is_flat(target, centres[ways[0].order.ravel()]):
-                dark = GreyImage(255 - image.levels, 255 - image.bytes) if light else image
-                yield dark, centres, ways
+            numberings = find_arrangements(centres, grid_positions, target)
+            if numberings and _fits_flat_grid(target, centres[numberings[0].order.ravel()]):
+                dark_image = (
+                    GreyImage(255 - image.levels, 255 - image.bytes) if is_negative else image
+                )
+                yield dark_image, centres, numberings
 
 
-def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
-    """Yield each search of an image: whether of its negative, at which scale, and the spots found.
+def _search_image(
+    image: NDArray[np.uint8], target: CircleGrid
+) -> Iterator[tuple[bool, float, Spots]]:
+    """Search an image in several ways; yield whether it is the negative, its scale, and its spots.
 
     A large image is searched at a small size first. Any image is searched at twice its size if it
     may have dots of a few pixels.
     """
-    longest = max(image.shape)
-    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIDE_PX / longest)
-    most = EXTRA_SPOTS + 2 * len(target.points)
-    if times > 1:
-        small = reduced(image, times)
-        for light in (False, True):
-            yield light, 1 / times, _pieces(small, light, WIDE_WINDOW_RATIO, target).spots(most)
-    looked_at = scaled(image, usual)
-    fine = []
-    for part, light in itertools.product((WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO), (False, True)):
-        pieces = _pieces(looked_at, light, part, target)
-        yield light, usual, pieces.spots(most)
-        if part == NARROW_WINDOW_RATIO and _may_be_dots(pieces.specks(), target):
-            fine.append(light)
-    for light in fine:
-        pieces = _pieces(scaled(image, 2 * usual), light, NARROW_WINDOW_RATIO, target)
-        yield light, 2 * usual, pieces.spots(most)
+    longest_side = max(image.shape)
+    factor, usual_scale = (
+        math.ceil(longest_side / SMALL_SIDE_PX),
+        min(1.0, USUAL_SIDE_PX / longest_side),
+    )
+    max_spots = EXTRA_SPOTS + 2 * len(target.points)
+    if factor > 1:
+        reduced = reduce_levels(image, factor)
+        for is_negative in (False, True):
+            yield (
+                is_negative,
+                1 / factor,
+                _find_pieces(reduced, is_negative, WIDE_WINDOW_RATIO, target).find_spots(max_spots),
+            )
+    resized = resize_image(image, usual_scale)
+    negatives_with_specks = []
+    for window_ratio, is_negative in itertools.product(
+        (WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO), (False, True)
+    ):
+        pieces = _find_pieces(resized, is_negative, window_ratio, target)
+        yield is_negative, usual_scale, pieces.find_spots(max_spots)
+        if window_ratio == NARROW_WINDOW_RATIO and _contain_grid(pieces.find_specks(), target):
+            negatives_with_specks.append(is_negative)
+    for is_negative in negatives_with_specks:
+        pieces = _find_pieces(
+            resize_image(image, 2 * usual_scale), is_negative, NARROW_WINDOW_RATIO, target
+        )
+        yield is_negative, 2 * usual_scale, pieces.find_spots(max_spots)
 
 
-def _pieces(image: NDArray[np.uint8], light: bool, part: float, target: CircleGrid) -> Pieces:
+def _find_pieces(
+    image: NDArray[np.uint8], is_negative: bool, window_ratio: float, target: CircleGrid
+) -> Pieces:
     # length of the grid's longer side, in distances between its dots
-    longest = max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
-    around = round(part * max(image.shape) / longest)
-    return dark_pieces(255 - image if light else image, around)
+    longer_side = max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
+    window = round(window_ratio * max(image.shape) / longer_side)
+    return find_dark_pieces(255 - image if is_negative else image, window)
 
 
-def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
-    """Return True if dots of a few pixels may be a good part of the grid."""
-    least = max(4, round(MIN_DOT_SHARE * len(target.points)))
-    alike = alike_areas(specks.areas)
-    return any(lattices(specks.points, alike, least=least, most=least, neighbours=NEIGHBOURS))
+def _contain_grid(specks: Spots, target: CircleGrid) -> bool:
+    """Return True if a good part of the grid is among dots of a few pixels."""
+    min_count = max(4, round(MIN_DOT_SHARE * len(target.points)))
+    may_be_neighbours = area_test(specks.areas)
+    return any(
+        grow_grids(
+            specks.points,
+            may_be_neighbours,
+            min_count=min_count,
+            max_count=min_count,
+            neighbours=NEIGHBOURS,
+        )
+    )
 
 
-def _laid_out(
-    spots: Spots, target: CircleGrid, seen: _Counted
+def _find_layouts(
+    spots: Spots, target: CircleGrid, counts: _SearchCounts
 ) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-    """Yield the target's number of dots (N, 2) in rows and columns, and their places (N, 2)."""
+    """Yield grids of the target's number of dots: dots (N, 2) and their grid positions (N, 2)."""
     count = target.columns * target.rows
-    if seen.spots is None:
-        seen.spots = len(spots.areas)
+    if counts.spot_count is None:
+        counts.spot_count = len(spots.areas)
     elif len(spots.areas) < count:
         return
-    larger = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
-    like, larger_like = alike_areas(spots.areas), alike_areas(spots.areas, larger)
+    origin_area_ratio = ((target.origin_diameter or target.diameter) / target.diameter) ** 2
+    same_size, origin_size = area_test(spots.areas), area_test(spots.areas, origin_area_ratio)
 
-    def follows(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
-        return like(one, other) | larger_like(one, other)
+    def may_follow(first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return same_size(first, second) | origin_size(first, second)
 
-    for grid in lattices(spots.points, like, follows=follows, least=MIN_DOTS_REPORTED, most=count):
-        seen.largest = max(seen.largest, len(grid))
+    for grid in grow_grids(
+        spots.points, same_size, may_follow=may_follow, min_count=MIN_DOTS_REPORTED, max_count=count
+    ):
+        counts.max_grid_count = max(counts.max_grid_count, len(grid))
         if len(grid) == count:
             yield spots.points[list(grid.values())], np.array(list(grid), dtype=np.intp)
 
 
-def _is_flat(target: CircleGrid, points: Array) -> bool:
+def _fits_flat_grid(target: CircleGrid, points: Array) -> bool:
     """Return True if the dots lie where a flat grid would show them."""
-    flat = target.points[:, :2]
-    mapped = GridMap(flat, points)
-    steps = np.linalg.norm(local_steps(mapped, flat, target.spacing), axis=2).min(axis=1)
-    distances = np.linalg.norm(mapped(flat) - points, axis=1)
+    flat_points = target.points[:, :2]
+    grid_map = GridMap(flat_points, points)
+    steps = np.linalg.norm(local_steps(grid_map, flat_points, target.spacing), axis=2).min(axis=1)
+    distances = np.linalg.norm(grid_map(flat_points) - points, axis=1)
     return bool((distances < MAX_OFFSET_RATIO * steps).all())
 
 
-def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
-    """Return True if no dots stand where the grid's rows and columns would go on.
+def _is_complete(image: GreyImage, target: CircleGrid, points: Array) -> bool:
+    """Return True if there are no further dots where the grid's rows and columns would continue.
 
-    A further dot would be dark with light paper all around; a place outside of the image is
-    neither.
+    A further dot would be dark with light paper all around. Places outside of the image are not
+    counted.
     """
-    flat = target.points[:, :2]
-    mapped = GridMap(flat, points)
-    next_to = _next_to(target)
-    half = sum(_contrast(image, target, mapped)) / 2
-    inside = _levels(image, mapped, next_to, target.diameter / 4)
-    outside = _levels(image, mapped, next_to, (_apart(target) + target.diameter) / 4)
-    known = np.isfinite(inside).any(axis=1)
-    darkest = np.where(np.isfinite(inside), inside, -np.inf).max(axis=1)
-    lightest = np.where(np.isfinite(outside), outside, np.inf).min(axis=1)
-    beyond: NDArray[np.bool_] = known & (darkest < half) & (lightest > half)
-    return not beyond.any()
+    flat_points = target.points[:, :2]
+    grid_map = GridMap(flat_points, points)
+    positions = _positions_beyond(target)
+    threshold = sum(_dot_and_gap_levels(image, target, grid_map)) / 2
+    inner_levels = _ring_levels(image, grid_map, positions, target.diameter / 4)
+    outer_levels = _ring_levels(
+        image, grid_map, positions, (_min_distance(target) + target.diameter) / 4
+    )
+    is_in_image = np.isfinite(inner_levels).any(axis=1)
+    darkest = np.where(np.isfinite(inner_levels), inner_levels, -np.inf).max(axis=1)
+    lightest = np.where(np.isfinite(outer_levels), outer_levels, np.inf).min(axis=1)
+    is_dot: NDArray[np.bool_] = is_in_image & (darkest < threshold) & (lightest > threshold)
+    return not is_dot.any()
 
 
-def _apart(target: CircleGrid) -> float:
+def _min_distance(target: CircleGrid) -> float:
     """Return the least distance between two dots, metres."""
     return target.spacing * (math.sqrt(0.5) if target.asymmetric else 1.0)
 
 
-def _contrast(image: GreyImage, target: CircleGrid, mapped: GridMap) -> tuple[float, float]:
-    """Return the mean grey level within the dots, and the mean level of the gaps around them."""
-    flat = target.points[:, None, :2]
-    gap = (_apart(target) + target.diameter) / 4
-    inside, outside = (
-        mean_level(image, mapped((flat + radius * RING_DIRECTIONS).reshape(-1, 2)))
+def _dot_and_gap_levels(
+    image: GreyImage, target: CircleGrid, grid_map: GridMap
+) -> tuple[float, float]:
+    """Return the mean grey level in the dots, and that in the gaps around them."""
+    flat_points = target.points[:, None, :2]
+    gap = (_min_distance(target) + target.diameter) / 4
+    inner_level, outer_level = (
+        mean_level(image, grid_map((flat_points + radius * RING_DIRECTIONS).reshape(-1, 2)))
         for radius in (target.diameter / 4, gap)
     )
-    return inside, outside
+    return inner_level, outer_level
 
 
-def _next_to(target: CircleGrid) -> Array:
-    """Return the places around the grid where rows and columns would go on, (N, 2), metres."""
-    half = target.spacing / 2
-    half_steps = np.rint(target.points[:, :2] / half).astype(np.intp)
+def _positions_beyond(target: CircleGrid) -> Array:
+    """Return the positions (N, 2) where the grid's rows and columns would continue, metres."""
+    half_spacing = target.spacing / 2
+    half_steps = np.rint(target.points[:, :2] / half_spacing).astype(np.intp)
     steps = [(1, 1), (1, -1)] if target.asymmetric else [(2, 0), (0, 2)]
-    ways = np.array(steps + [(-x, -y) for x, y in steps])
-    around = {(x, y) for x, y in (half_steps[:, None] + ways).reshape(-1, 2).tolist()}
-    return half * np.array(sorted(around - {(x, y) for x, y in half_steps.tolist()}))
+    all_steps = np.array(steps + [(-x, -y) for x, y in steps])
+    neighbours = {(x, y) for x, y in (half_steps[:, None] + all_steps).reshape(-1, 2).tolist()}
+    return half_spacing * np.array(sorted(neighbours - {(x, y) for x, y in half_steps.tolist()}))
 
 
-def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Array:
-    """Return grey levels (N, 16) on circles around places; NaN outside of the image."""
-    u, v = mapped((flat[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
+def _ring_levels(image: GreyImage, grid_map: GridMap, positions: Array, radius: float) -> Array:
+    """Return grey levels (N, 16) on circles around N positions; NaN outside of the image."""
+    u, v = grid_map((positions[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
     width, height = image.size
-    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    is_inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     column, row = (
-        np.rint(np.where(inside, coordinates, 0)).astype(np.intp) for coordinates in (u, v)
+        np.rint(np.where(is_inside, coordinates, 0)).astype(np.intp) for coordinates in (u, v)
     )
-    levels = np.where(inside, image.levels[row, column], np.nan)
-    return levels.reshape(len(flat), len(RING_DIRECTIONS))
+    levels = np.where(is_inside, image.levels[row, column], np.nan)
+    return levels.reshape(len(positions), len(RING_DIRECTIONS))
 
 
-def _view(
-    image: GreyImage, target: CircleGrid, points: Array, ways: list[Arrangement], name: str
+def _make_view(
+    image: GreyImage, target: CircleGrid, points: Array, numberings: list[Arrangement], name: str
 ) -> TargetView:
-    arrangement, margin = _number(image, target, points, ways)
-    flat, order = target.points[:, :2], arrangement.order.ravel()
-    diameters = np.full(len(flat), target.diameter)
+    arrangement, margin = _number_dots(image, target, points, numberings)
+    flat_points, order = target.points[:, :2], arrangement.order.ravel()
+    diameters = np.full(len(flat_points), target.diameter)
     diameters[0] = target.origin_diameter or target.diameter
-    seen = GridMap(flat, points[order])
-    dots = _refine(image, target, seen, points[order], diameters)
-    shifts = GridMap(flat, dots.points - seen.shifts(flat, diameters)).shifts(flat, diameters)
+    grid_map = GridMap(flat_points, points[order])
+    dots = _refine_grid(image, target, grid_map, points[order], diameters)
+    shifts = GridMap(flat_points, dots.points - grid_map.shifts(flat_points, diameters)).shifts(
+        flat_points, diameters
+    )
     return TargetView(
         target=target,
         size=image.size,
-        ids=np.arange(len(flat), dtype=np.intp),
+        ids=np.arange(len(flat_points), dtype=np.intp),
         points=dots.points - shifts,
         covariance=dots.covariance,
         margin=margin,
@@ -251,15 +292,15 @@ def _view(
     )
 
 
-def _refine(
-    image: GreyImage, target: CircleGrid, seen: GridMap, points: Array, diameters: Array
+def _refine_grid(
+    image: GreyImage, target: CircleGrid, grid_map: GridMap, points: Array, diameters: Array
 ) -> Dots:
-    """Return the fitted dots, each from the pixels up to half way to the next dot."""
-    flat, radii = target.points[:, :2], diameters / 2
-    gaps = _apart(target) - 2 * radii
-    gaps[1:] = np.minimum(gaps[1:], np.linalg.norm(flat[1:], axis=1) - radii[0] - radii[1:])
+    """Return the fitted dots; each fit uses the pixels up to half the gap around the dot."""
+    flat_points, radii = target.points[:, :2], diameters / 2
+    gaps = _min_distance(target) - 2 * radii
+    gaps[1:] = np.minimum(gaps[1:], np.linalg.norm(flat_points[1:], axis=1) - radii[0] - radii[1:])
     gaps[0] = gaps[1:].min()
-    directions = local_steps(seen, flat, target.diameter / 2) / (target.diameter / 2)
+    directions = local_steps(grid_map, flat_points, target.diameter / 2) / (target.diameter / 2)
     reaches = radii + gaps / 2
     return refine_dots(
         image,
@@ -269,42 +310,44 @@ def _refine(
     )
 
 
-def _number(
-    image: GreyImage, target: CircleGrid, points: Array, ways: list[Arrangement]
+def _number_dots(
+    image: GreyImage, target: CircleGrid, points: Array, numberings: list[Arrangement]
 ) -> tuple[Arrangement, float | None]:
     name = f"{target.columns} x {target.rows} dots"
     if target.origin_diameter is None:
-        return most_rightward(ways, name), None
-    flat = target.points[:, :2]
+        return choose_rightward(numberings, name), None
+    flat_points = target.points[:, :2]
     rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
-    between = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
-    seen = {}
-    for arrangement in ways:
-        mapped = GridMap(flat, points[arrangement.order.ravel()])
-        seen[int(arrangement.order[0, 0])] = [
-            mean_level(image, mapped(at)) for at in (rim, between)
+    gap_ring = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
+    levels_by_origin = {}
+    for arrangement in numberings:
+        grid_map = GridMap(flat_points, points[arrangement.order.ravel()])
+        levels_by_origin[int(arrangement.order[0, 0])] = [
+            mean_level(image, grid_map(ring)) for ring in (rim, gap_ring)
         ]
-    light = sum(paper for _, paper in seen.values()) / len(seen)
+    mean_paper = sum(paper_level for _, paper_level in levels_by_origin.values()) / len(
+        levels_by_origin
+    )
 
     def level(order: NDArray[np.intp]) -> float:
-        """Return the level of the rim, as if the paper there had the mean brightness."""
-        dark, paper = seen[int(order[0, 0])]
-        return dark * light / max(paper, 1.0)
+        """Return the level of the rim, corrected for the brightness of the paper there."""
+        rim_level, paper_level = levels_by_origin[int(order[0, 0])]
+        return rim_level * mean_paper / max(paper_level, 1.0)
 
-    return marked(ways, level, f"{name}, of which the larger one is the origin")
+    return choose_marked(numberings, level, f"{name}, of which the larger one is the origin")
 
 
-def _not_found_error(target: CircleGrid, seen: _Counted) -> CalibrationError:
-    """Return an error that reports the dots seen instead."""
+def _not_found_error(target: CircleGrid, counts: _SearchCounts) -> CalibrationError:
+    """Return the error that reports the dots that were found instead."""
     count = target.columns * target.rows
-    if seen.largest > count:
+    if counts.max_grid_count > count:
         text = "saw more than these in rows and columns, as of a larger grid"
     else:
-        text = f"saw {seen.spots} dark spots and no such grid among them"
-        if seen.largest:
-            text += f", at most {seen.largest} in rows and columns"
+        text = f"saw {counts.spot_count} dark spots and no such grid among them"
+        if counts.max_grid_count:
+            text += f", at most {counts.max_grid_count} in rows and columns"
     return Code.TARGET_NOT_FOUND.refusal(
         f"circles: expected {target.columns} x {target.rows} dots, {text}",
         count,
-        seen.largest or seen.spots,
+        counts.max_grid_count or counts.spot_count,
     )

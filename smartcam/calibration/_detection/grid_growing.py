@@ -1,9 +1,9 @@
 """Find the dots of a grid among other dots.
 
-A dot whose neighbours lie opposite each other in two directions may belong to a grid. From there
-each next dot is looked for at the place that the ones before it predict, until no more are found.
-The steps of a tilted sheet change from dot to dot, which is why the last two dots of a row predict
-the third.
+A dot whose neighbours lie opposite each other in two directions may belong to a grid. From such a
+dot, each next dot is searched at the place that the dots before it predict, until no more are
+found. The steps of a tilted sheet change from dot to dot, so the last two dots of a row predict the
+third.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 NEIGHBOURS = 12
-"""Opposite neighbours of a dot are looked for among this many nearest dots: the eight of a grid,
-and others that may be printed between."""
+"""Opposite neighbours of a dot are searched among this many nearest dots: the eight of a grid, and
+others that may be printed between them."""
 
 MAX_OPPOSITE_DIFFERENCE = 0.2
 """The steps to two opposite dots differ by less than this part of the shorter step."""
@@ -36,228 +36,250 @@ MIN_SINE = 0.5
 this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more."""
 
 MAX_STEP_OFFSET, MAX_FIRST_STEP_OFFSET = 0.3, 0.2
-"""A dot is the grid's next one if it lies within the first part of a step from the place that the
-step leads to; within two steps of the first dot, where steps change less, within the second
-part."""
+"""A dot is the grid's next dot if its distance from the end of the step is less than this part of
+the step. The second value is for the first wave of steps, where steps change less."""
 
 MAX_AREA_RATIO = 1.8
 """A dot has at most this many times the area of its neighbour."""
 
 MAX_MEDIAN_OFFSET = 0.08
-"""The dots of a flat grid lie off their places by a median of less than this part of a step: lenses
-bend a grid of fewer than 20 dots by less."""
+"""The median distance of a flat grid's dots from their predicted places is less than this part of a
+step: lenses bend a grid of fewer than 20 dots by less."""
 
 MAX_SEEDS_RANKED = 128
-"""At most this many dots, those with the best pair of opposite neighbours, are searched for a
-second pair."""
+"""A second pair of opposite neighbours is searched at this many dots, those with the best first
+pair."""
 
 MAX_SEEDS_TRIED = 4
-"""A grid is grown from at most this many dots. A grid's dots stand opposite each other more exactly
-than dots that do so by chance, so the first dot that is tried is the grid's as a rule."""
+"""A grid is grown from at most this many dots. The neighbours of a grid's dot are more exactly
+opposite than those of other dots, so the first dot that is tried is usually one of the grid."""
 
 MIN_DOTS_REACHED = 8
 """At least this many dots of a grid lie within two steps of its first dot, that dot included."""
 
 Place = tuple[int, int]
 
-_AROUND: Final[list[Place]] = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+_SIDES: Final[list[Place]] = [(1, 0), (0, 1), (-1, 0), (0, -1)]
 
 Lattice = dict[Place, int]
 """The dot at each column and row; the origin and directions of these are arbitrary."""
 
-Alike: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
-"""Function that returns, from the indices of pairs of dots, whether the two may be neighbours."""
+PairTest: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
+"""Function that returns a mask of the pairs, given by the indices of dots, that fit together."""
 
 
-def lattices(
+def grow_grids(
     points: Array,
-    alike: Alike,
+    may_be_neighbours: PairTest,
     *,
-    least: int,
-    most: int,
-    follows: Alike | None = None,
+    min_count: int,
+    max_count: int,
+    may_follow: PairTest | None = None,
     neighbours: int = NEIGHBOURS,
 ) -> Iterator[Lattice]:
     """Yield grids of connected dots.
 
-    ``alike`` says which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
-    others may come after a dot. A grid has at least ``least`` dots, four or more. Growing stops
-    soon after ``most`` dots. A grid is grown from a dot that has two pairs of opposite dots among
-    its nearest ``neighbours``; at most MAX_SEEDS_TRIED of these are tried.
+    ``may_be_neighbours`` tells which of the ``points`` (N, 2), pixels, may be neighbours,
+    ``may_follow`` which others may come after a dot (None: the same). A grid has at least
+    ``min_count`` dots, four or more. Growing stops soon after ``max_count`` dots. A grid is grown
+    from a dot that has two pairs of opposite dots among its nearest ``neighbours``; at most
+    MAX_SEEDS_TRIED of these are tried.
     """
     if len(points) < 5:
         return
-    tries = MAX_SEEDS_TRIED
-    grown = _Grown(points, alike, follows or alike)
-    seen = np.zeros(len(points), dtype=np.bool_)
-    for start, steps in grown.starts(neighbours):
-        if seen[start]:
+    tries_left = MAX_SEEDS_TRIED
+    grower = _GridGrower(points, may_be_neighbours, may_follow or may_be_neighbours)
+    is_in_a_grid = np.zeros(len(points), dtype=np.bool_)
+    for start, steps in grower.find_starts(neighbours):
+        if is_in_a_grid[start]:
             continue
-        grid = grown.grow(start, steps, most)
-        seen[list(grid.values())] = True
-        if len(grid) >= least and _is_regular(points, grid):
-            grown.complete(grid, most)
+        grid = grower.grow(start, steps, max_count)
+        is_in_a_grid[list(grid.values())] = True
+        if len(grid) >= min_count and _is_regular(points, grid):
+            grower.complete(grid, max_count)
             yield grid
-        tries -= 1
-        if tries == 0:
+        tries_left -= 1
+        if tries_left == 0:
             return
 
 
-def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
-    """Return a test whether two ``areas`` (N,) are alike, or one ``larger`` times the other."""
+def area_test(areas: Array, ratio: float = 1.0) -> PairTest:
+    """Return a test whether the first of two dots has about ``ratio`` times the second's area."""
 
-    def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
-        part = areas[one] / (larger * areas[other])
-        return np.asarray((part < MAX_AREA_RATIO) & (part > 1 / MAX_AREA_RATIO))
+    def has_ratio(first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.bool_]:
+        quotient = areas[first] / (ratio * areas[second])
+        return np.asarray((quotient < MAX_AREA_RATIO) & (quotient > 1 / MAX_AREA_RATIO))
 
-    return alike
+    return has_ratio
 
 
 @dataclass(eq=False)
-class _Grown:
-    """Dots by their places, and the grids that are grown from one of them."""
+class _GridGrower:
+    """Grows grids among dots, from one of the dots."""
 
     _points: Array
-    _alike: Alike
-    _follows: Alike
+    _may_be_neighbours: PairTest
+    _may_follow: PairTest
 
     def __post_init__(self) -> None:
         self._tree = load("scipy.spatial").cKDTree(self._points)
 
-    def starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
-        """Yield dots with neighbours on four sides, and the steps (2, 2) to two of them.
+    def find_starts(self, neighbours: int) -> Iterator[tuple[int, Array]]:
+        """Yield dots with neighbours on four sides, and the steps (2, 2) to two of the neighbours.
 
         Dots whose neighbours lie most exactly opposite each other come first.
         """
         points = self._points
-        _, neighbours_of = self._tree.query(points, min(neighbours + 1, len(points)))
-        neighbours_of = neighbours_of[:, 1:]
-        alike = self._alike(neighbours_of, np.arange(len(points))[:, None])
-        ways = points[neighbours_of] - points[:, None]
+        _, neighbour_indices = self._tree.query(points, min(neighbours + 1, len(points)))
+        neighbour_indices = neighbour_indices[:, 1:]
+        is_neighbour = self._may_be_neighbours(neighbour_indices, np.arange(len(points))[:, None])
+        vectors = points[neighbour_indices] - points[:, None]
         # |a + b|^2 = |a|^2 + |b|^2 + 2 a b, all pairs by one product
-        products = ways @ ways.transpose(0, 2, 1)
+        products = vectors @ vectors.transpose(0, 2, 1)
         squares = np.maximum(np.einsum("nii->ni", products), 1e-18)
-        apart = squares[:, :, None] + squares[:, None] + 2 * products
-        apart = np.sqrt(np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None]))
-        apart[~(alike[:, :, None] & alike[:, None])] = np.inf
-        best = apart.min(axis=(1, 2))
-        ranked = np.argsort(best)[
-            : min(MAX_SEEDS_RANKED, int((best < MAX_OPPOSITE_DIFFERENCE).sum()))
+        deviations = squares[:, :, None] + squares[:, None] + 2 * products
+        deviations = np.sqrt(
+            np.maximum(deviations, 0) / np.minimum(squares[:, :, None], squares[:, None])
+        )
+        deviations[~(is_neighbour[:, :, None] & is_neighbour[:, None])] = np.inf
+        least_deviations = deviations.min(axis=(1, 2))
+        ranked = np.argsort(least_deviations)[
+            : min(MAX_SEEDS_RANKED, int((least_deviations < MAX_OPPOSITE_DIFFERENCE).sum()))
         ]
-        worse = _across(ways[ranked], apart[ranked])
-        for index in ranked[np.argsort(worse)][
-            : int((worse < MAX_OPPOSITE_DIFFERENCE).sum())
+        second_deviations = _second_deviation(vectors[ranked], deviations[ranked])
+        for index in ranked[np.argsort(second_deviations)][
+            : int((second_deviations < MAX_OPPOSITE_DIFFERENCE).sum())
         ].tolist():
-            ahead, opposite = np.nonzero(np.triu(apart[index] < MAX_OPPOSITE_DIFFERENCE))
-            steps = (ways[index, ahead] - ways[index, opposite]) / 2
+            first, second = np.nonzero(np.triu(deviations[index] < MAX_OPPOSITE_DIFFERENCE))
+            steps = (vectors[index, first] - vectors[index, second]) / 2
             steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
-            across, *others = steps
-            for other in others:
-                area = abs(float(across[0] * other[1] - across[1] * other[0]))
-                if area > MIN_SINE * float(np.hypot(*across) * np.hypot(*other)):
-                    yield index, np.stack([across, other])
+            shortest, *longer_steps = steps
+            for longer in longer_steps:
+                area = abs(float(shortest[0] * longer[1] - shortest[1] * longer[0]))
+                if area > MIN_SINE * float(np.hypot(*shortest) * np.hypot(*longer)):
+                    yield index, np.stack([shortest, longer])
                     break
 
-    def grow(self, start: int, steps: Array, most: int) -> Lattice:
-        """Return the dots reached step by step from a dot; stop soon after ``most``."""
-        places: Lattice = {(0, 0): start}
-        taken = {start}
-        # each dot with the steps from it, and with the dot whose area the next ones must be like
-        reached = [((0, 0), start, steps, start)]
-        waves = 0
-        while reached and len(places) <= most:
-            if waves == 2 and len(places) < MIN_DOTS_REACHED:
+    def grow(self, start: int, steps: Array, max_count: int) -> Lattice:
+        """Return the dots reached step by step from a dot; stop soon after ``max_count``."""
+        grid: Lattice = {(0, 0): start}
+        used = {start}
+        # place, dot, steps to its neighbours, and the dot with which the neighbours' area is
+        # compared
+        front = [((0, 0), start, steps, start)]
+        wave_count = 0
+        while front and len(grid) <= max_count:
+            if wave_count == 2 and len(grid) < MIN_DOTS_REACHED:
                 break
-            waves += 1
-            around = self._around(reached, MAX_FIRST_STEP_OFFSET if waves < 2 else MAX_STEP_OFFSET)
-            wave, reached = reached, []
-            for (place, dot, steps, like), sides in zip(wave, around, strict=True):
-                for side, fits in enumerate(sides):
-                    column, row = _AROUND[side]
-                    neighbour = (place[0] + column, place[1] + row)
-                    free = next((near for near in fits if near not in taken), None)
-                    if free is None or neighbour in places:
-                        continue
-                    places[neighbour] = free
-                    taken.add(free)
-                    step = steps.copy()
-                    step[side % 2] = (column + row) * (self._points[free] - self._points[dot])
-                    is_alike = bool(self._alike(np.array(free), np.array(like)))
-                    reached.append((neighbour, free, step, free if is_alike else like))
-        return places
-
-    def complete(self, places: Lattice, most: int) -> None:
-        """Add the dots beside a grid that lie where all of its dots together predict them.
-
-        Far from the start and near the horizon, the last step alone predicts them less well.
-        """
-        added = True
-        while added and len(places) <= most:
-            added = False
-            mapped = GridMap(np.array(list(places), float), self._points[list(places.values())])
-            taken = set(places.values())
-            next_to = {
-                (x + column, y + row): dot
-                for (x, y), dot in places.items()
-                for column, row in _AROUND
-                if (x + column, y + row) not in places
-            }
-            at = np.array(list(next_to), dtype=np.float64)
-            longest = MAX_STEP_OFFSET * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(
-                axis=1
+            wave_count += 1
+            candidates = self._next_candidates(
+                front, MAX_FIRST_STEP_OFFSET if wave_count < 2 else MAX_STEP_OFFSET
             )
-            distances, nearest = self._tree.query(mapped(at))
-            fits = (distances < longest) & self._follows(nearest, np.array(list(next_to.values())))
-            for place, dot, fit in zip(next_to, nearest.tolist(), fits.tolist(), strict=True):
-                if fit and dot not in taken:
-                    places[place] = dot
-                    taken.add(dot)
-                    added = True
+            last_front, front = front, []
+            for (position, dot, steps, size_reference), candidates_by_side in zip(
+                last_front, candidates, strict=True
+            ):
+                for side, side_candidates in enumerate(candidates_by_side):
+                    column, row = _SIDES[side]
+                    neighbour = (position[0] + column, position[1] + row)
+                    free_dot = next(
+                        (candidate for candidate in side_candidates if candidate not in used), None
+                    )
+                    if free_dot is None or neighbour in grid:
+                        continue
+                    grid[neighbour] = free_dot
+                    used.add(free_dot)
+                    step = steps.copy()
+                    step[side % 2] = (column + row) * (self._points[free_dot] - self._points[dot])
+                    is_alike = bool(
+                        self._may_be_neighbours(np.array(free_dot), np.array(size_reference))
+                    )
+                    front.append(
+                        (neighbour, free_dot, step, free_dot if is_alike else size_reference)
+                    )
+        return grid
 
-    def _around(
-        self, reached: list[tuple[Place, int, Array, int]], limit: float
+    def complete(self, grid: Lattice, max_count: int) -> None:
+        """Add the dots next to a grid that lie where all of its dots together predict them.
+
+        Far from the start and near the horizon, the last step alone predicts a dot less well.
+        """
+        has_added = True
+        while has_added and len(grid) <= max_count:
+            has_added = False
+            grid_map = GridMap(np.array(list(grid), float), self._points[list(grid.values())])
+            used = set(grid.values())
+            neighbour_of_place = {
+                (x + column, y + row): dot
+                for (x, y), dot in grid.items()
+                for column, row in _SIDES
+                if (x + column, y + row) not in grid
+            }
+            empty_places = np.array(list(neighbour_of_place), dtype=np.float64)
+            max_distances = MAX_STEP_OFFSET * np.linalg.norm(
+                local_steps(grid_map, empty_places, 1.0), axis=2
+            ).min(axis=1)
+            distances, nearest = self._tree.query(grid_map(empty_places))
+            fit_mask = (distances < max_distances) & self._may_follow(
+                nearest, np.array(list(neighbour_of_place.values()))
+            )
+            for position, dot, is_fit in zip(
+                neighbour_of_place, nearest.tolist(), fit_mask.tolist(), strict=True
+            ):
+                if is_fit and dot not in used:
+                    grid[position] = dot
+                    used.add(dot)
+                    has_added = True
+
+    def _next_candidates(
+        self, front: list[tuple[Place, int, Array, int]], limit: float
     ) -> list[list[list[int]]]:
         """Return, for each dot and each of its four sides, the dots that may come next.
 
         ``limit``: largest distance of such a dot from the end of the step, as a part of the step.
         """
-        dots = np.array([dot for _, dot, _, _ in reached])
-        like = np.array([like for _, _, _, like in reached])
-        steps = np.stack([steps for _, _, steps, _ in reached])
-        ways = np.concatenate([steps, -steps], axis=1)
-        ahead = self._points[dots][:, None] + ways
-        distances, nearest = self._tree.query(ahead, min(3, len(self._points)))
-        fits = distances < limit * np.linalg.norm(ways, axis=2)[:, :, None]
-        fits &= self._follows(nearest, like[:, None, None])
+        dots = np.array([dot for _, dot, _, _ in front])
+        size_references = np.array([size_references for _, _, _, size_references in front])
+        steps = np.stack([steps for _, _, steps, _ in front])
+        vectors = np.concatenate([steps, -steps], axis=1)
+        ends = self._points[dots][:, None] + vectors
+        distances, nearest = self._tree.query(ends, min(3, len(self._points)))
+        fit_mask = distances < limit * np.linalg.norm(vectors, axis=2)[:, :, None]
+        fit_mask &= self._may_follow(nearest, size_references[:, None, None])
         return [
             [
-                [dot for dot, fit in zip(*side, strict=True) if fit]
+                [dot for dot, is_fit in zip(*side, strict=True) if is_fit]
                 for side in zip(*dots_and_fits, strict=True)
             ]
-            for dots_and_fits in zip(nearest.tolist(), fits.tolist(), strict=True)
+            for dots_and_fits in zip(nearest.tolist(), fit_mask.tolist(), strict=True)
         ]
 
 
-def _across(ways: Array, apart: Array) -> Array:
-    """Return the deviation from opposite (N,) of the best pair across the best one.
+def _second_deviation(vectors: Array, deviations: Array) -> Array:
+    """Return the least deviation (N,) of pairs in another direction than the best pair.
 
-    ``ways`` (N, K, 2) lead to the neighbours; ``apart`` (N, K, K) is the deviation of each two from
-    being opposite.
+    ``vectors`` (N, K, 2): to the K neighbours. ``deviations`` (N, K, K): how far each two
+    neighbours are from being opposite.
     """
-    count, around, _ = apart.shape
-    between = (ways[:, :, None] - ways[:, None]).reshape(count, around * around, 2)
-    between /= np.maximum(np.linalg.norm(between, axis=2, keepdims=True), 1e-9)
-    flat = apart.reshape(count, around * around)
-    first = between[np.arange(count), flat.argmin(axis=1)][:, None]
-    sine = np.abs(between[:, :, 0] * first[:, :, 1] - between[:, :, 1] * first[:, :, 0])
-    return np.asarray(np.where(sine > MIN_SINE, flat, np.inf).min(axis=1))
+    count, neighbour_count, _ = deviations.shape
+    directions = (vectors[:, :, None] - vectors[:, None]).reshape(
+        count, neighbour_count * neighbour_count, 2
+    )
+    directions /= np.maximum(np.linalg.norm(directions, axis=2, keepdims=True), 1e-9)
+    pair_deviations = deviations.reshape(count, neighbour_count * neighbour_count)
+    best_directions = directions[np.arange(count), pair_deviations.argmin(axis=1)][:, None]
+    sine = np.abs(
+        directions[:, :, 0] * best_directions[:, :, 1]
+        - directions[:, :, 1] * best_directions[:, :, 0]
+    )
+    return np.asarray(np.where(sine > MIN_SINE, pair_deviations, np.inf).min(axis=1))
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
-    """Return True if a flat sheet could look like the grid, which chance may have made."""
-    places = np.array(list(grid), dtype=np.float64)
+    """Return True if the grid could be that of a flat sheet, and not a chance arrangement."""
+    grid_positions = np.array(list(grid), dtype=np.float64)
     pixels = points[list(grid.values())]
-    seen = GridMap(places, pixels)
-    distances = np.linalg.norm(seen(places) - pixels, axis=1)
-    steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
+    grid_map = GridMap(grid_positions, pixels)
+    distances = np.linalg.norm(grid_map(grid_positions) - pixels, axis=1)
+    steps = np.linalg.norm(local_steps(grid_map, grid_positions, 1.0), axis=2).min(axis=1)
     return bool(np.median(distances / steps) < MAX_MEDIAN_OFFSET)

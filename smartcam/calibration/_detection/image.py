@@ -1,4 +1,4 @@
-"""Make the grey levels, from 0 to 255, that detectors work on."""
+"""Convert images to the grey levels, from 0 to 255, in which targets are searched."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ MAX_SIDE_PX = 20_000
 """An image has at most this width and height, pixels."""
 
 USUAL_SIDE_PX = 1600
-"""OpenCV looks for a grid first in an image whose longest side has this many pixels: in a larger
-one it takes seconds and finds less.
-"""
+"""OpenCV searches a grid first in an image whose longest side has this many pixels: a larger image
+takes seconds, and fewer grids are found."""
 
 
 Level = TypeVar("Level", np.uint8, np.float32)
@@ -37,10 +36,10 @@ class HasGrey(Protocol):
 
 
 class GreyImage(NamedTuple):
-    """An image without its colours."""
+    """The grey levels of an image."""
 
     levels: NDArray[np.float32]  # (H, W), float32, 0 to 255; for refinement
-    bytes: NDArray[np.uint8]  # (H, W), uint8, the same; for OpenCV's detectors
+    bytes: NDArray[np.uint8]  # (H, W), ``levels`` as uint8; for OpenCV's detectors
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,15 +58,15 @@ def grey_image(image: Any) -> GreyImage:
     if isinstance(image, HasGrey):
         image = image.grey()
     shape = np.shape(image) if isinstance(image, np.ndarray) else ()
-    kind = getattr(image, "dtype", None)
-    fits = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
+    dtype = getattr(image, "dtype", None)
+    has_image_shape = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
     if not (
         isinstance(image, np.ndarray)
-        and fits
-        and kind in (np.uint8, np.uint16)
+        and has_image_shape
+        and dtype in (np.uint8, np.uint16)
         and all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in shape[:2])
     ):
-        received = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
+        received = f"{dtype} of shape {shape}" if dtype is not None else type(image).__name__
         raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
             f"{MIN_SIDE_PX} to {MAX_SIDE_PX} pixels wide and high",
@@ -75,15 +74,15 @@ def grey_image(image: Any) -> GreyImage:
             received,
         )
     cv2 = load("cv2")
-    flat = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if len(shape) == 3 else image
-    flat = np.ascontiguousarray(flat)
-    if flat.dtype == np.uint8:
-        return GreyImage(flat.astype(np.float32), flat)
-    levels = flat.astype(np.float32) * np.float32(255 / max(1, int(flat.max())))
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if len(shape) == 3 else image
+    grey = np.ascontiguousarray(grey)
+    if grey.dtype == np.uint8:
+        return GreyImage(grey.astype(np.float32), grey)
+    levels = grey.astype(np.float32) * np.float32(255 / max(1, int(grey.max())))
     return GreyImage(levels, np.rint(levels).astype(np.uint8))
 
 
-def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
+def resize_image(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
     """Return the image ``scale`` times as wide and high.
 
     A place ``p`` in the result is ``(p + 0.5) / scale - 0.5`` in the given image.
@@ -91,20 +90,22 @@ def scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
     if scale == 1.0:
         return image
     cv2 = load("cv2")
-    kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    other: NDArray[np.uint8] = cv2.resize(image, None, fx=scale, fy=scale, interpolation=kind)
-    return other
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    resized: NDArray[np.uint8] = cv2.resize(
+        image, None, fx=scale, fy=scale, interpolation=interpolation
+    )
+    return resized
 
 
-def reduced(levels: NDArray[Level], times: int) -> NDArray[Level]:
-    """Reduce grey levels (H, W): each new one is the mean of ``times`` by ``times`` given ones.
+def reduce_levels(levels: NDArray[Level], factor: int) -> NDArray[Level]:
+    """Return grey levels (H, W) whose pixels are means of ``factor`` by ``factor`` given pixels.
 
-    A place ``p`` in the result is ``(p + 0.5) * times - 0.5`` in the given image.
+    A place ``p`` in the result is ``(p + 0.5) * factor - 0.5`` in the given image.
     """
-    if times == 1:
+    if factor == 1:
         return levels
     cv2 = load("cv2")
-    height, width = (side // times for side in levels.shape)
-    cut = levels[: height * times, : width * times]
-    smaller: NDArray[Level] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
+    height, width = (side // factor for side in levels.shape)
+    cropped = levels[: height * factor, : width * factor]
+    smaller: NDArray[Level] = cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA)
     return smaller

@@ -1,9 +1,8 @@
-"""Solve many small least-squares problems of one kind side by side.
+"""Solve many small least-squares problems of one kind at once.
 
-Levenberg's and Marquardt's method, for fits to the pixels around each of many points: NumPy's cost
-of a call is paid once for all of them, and those that no longer move drop out.
-:mod:`smartcam.calibration._least_squares` is not used here, since it solves one problem after the
-other.
+Levenberg's and Marquardt's method, for fits to the pixels around each of many points: each NumPy
+call handles all points whose fits have not yet converged.
+:mod:`smartcam.calibration._least_squares` is not used here, since it solves single problems.
 
 The models are of blurred edges. Their last three values are the lens' blur, the gain (half the step
 from black to white) and the offset of the grey levels.
@@ -26,20 +25,19 @@ if TYPE_CHECKING:
 BLUR, GAIN, OFFSET = -3, -2, -1
 
 MIN_BLUR_PIXELS = 0.25
-"""Least blur of a fit, pixels: the width of a pixel itself; a drawn image may have less, which no
-fit can measure."""
+"""Least blur of a fit, pixels, about the width of a pixel: no fit can measure less."""
 
 MAX_BLUR_PIXELS = 6.0
-"""Largest blur of a fit, pixels: a larger one is not that of an edge."""
+"""Largest blur of a good fit, pixels: with more, the pixels show no edge."""
 
 MIN_HALF_STEP = 4.0
-"""Half the step from black to white is at least this many grey levels of 255."""
+"""Half the step from black to white of a good fit is more than this many grey levels of 255."""
 
 MAX_STEPS = 20
 """A fit takes at most this many steps; most fits take four to seven."""
 
-MAX_LAST_MOVE_PX = 1e-3
-"""A fit has come to rest when its last step moves the point by at most this many pixels."""
+MAX_FINAL_STEP_PX = 1e-3
+"""A fit has converged when a step moves the point by less than this many pixels."""
 
 DIAGONAL_OFFSET = 1e-6
 """Added to the diagonal, so that a value which no pixel determines stays finite."""
@@ -53,19 +51,21 @@ class Fits(NamedTuple):
     hessian: Array  # (N, M, M), the Jacobian's transpose by the Jacobian
     gradient: Array  # (N, M), the Jacobian's transpose by the residuals
 
-    def put(self, which: NDArray[np.intp], others: Fits, chosen: NDArray[np.bool_]) -> None:
-        """Replace the fits at the indices ``which``, where ``chosen``, by those of others."""
+    def replace_where(
+        self, indices: NDArray[np.intp], others: Fits, mask: NDArray[np.bool_]
+    ) -> None:
+        """Replace the fits at ``indices`` by those of ``others`` where ``mask`` is True."""
         for array, other in zip(self, others, strict=True):
-            array[which[chosen]] = other[chosen]
+            array[indices[mask]] = other[mask]
 
 
-def fits_of(
+def make_fits(
     values: Array, columns: Sequence[Floats], factors: Sequence[Floats], residuals: Floats
 ) -> Fits:
     """Return the normal equations of fits with ``values`` (N, M).
 
     ``columns``: the M columns of the Jacobian, (N, P) each, to be multiplied by ``factors`` (N, 1).
-    ``residuals`` (N, P): measured less modelled. Both are 0 where a pixel does not count.
+    ``residuals`` (N, P): measured minus modelled. Both are 0 where a pixel does not count.
     """
     # J = (f_1 c_1, f_2 c_2, ...): J^T J and J^T r of the columns c, in single precision, are
     # scaled by the factors f afterwards, in double precision.
@@ -77,42 +77,44 @@ def fits_of(
     return Fits(values.copy(), cost, hessian, gradient)
 
 
-def refined(
+def fit_windows(
     evaluate: Callable[[Windows, Array], Fits],
     windows: Windows,
     values: Array,
     *,
-    moving: Sequence[int],
-    worst: float,
+    pixel_values: Sequence[int],
+    max_residual_ratio: float,
 ) -> tuple[Fits, NDArray[np.bool_]]:
     """Return the best fits, and a mask (N,) of the good ones.
 
-    A good fit came to rest, with a blur and a gain that an edge may have.
+    A good fit converged, with a blur and a gain that an edge may have.
 
-    A fit starts from ``values`` (N, M), except that the best gain and offset are solved for.
-    ``moving`` are the indices of the values in pixels, which must come to rest. ``worst`` is the
+    A fit starts from ``values`` (N, M), but with the best gain and offset. ``pixel_values``:
+    indices of the values in pixels, by whose steps convergence is judged. ``max_residual_ratio``:
     largest RMS of a good fit's residuals, as a part of its gain.
     """
     values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
     # The model is linear in gain and offset, so one solution of their normal equations is the best.
-    flat = evaluate(windows, values)
-    linear = flat.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
-    values[:, GAIN:] = np.linalg.solve(linear, flat.gradient[:, GAIN:, None])[:, :, 0]
-    fits, settled = _solve(evaluate, windows, values, moving)
+    level_fits = evaluate(windows, values)
+    linear = level_fits.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
+    values[:, GAIN:] = np.linalg.solve(linear, level_fits.gradient[:, GAIN:, None])[:, :, 0]
+    fits, has_converged = _solve(evaluate, windows, values, pixel_values)
     blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
     rms = np.sqrt(fits.cost / windows.counts)
-    return fits, settled & (blur < MAX_BLUR_PIXELS) & (gain > MIN_HALF_STEP) & (rms < worst * gain)
+    return fits, has_converged & (blur < MAX_BLUR_PIXELS) & (gain > MIN_HALF_STEP) & (
+        rms < max_residual_ratio * gain
+    )
 
 
 def _solve(
     evaluate: Callable[[Windows, Array], Fits],
     windows: Windows,
     values: Array,
-    moving: Sequence[int],
+    pixel_values: Sequence[int],
 ) -> tuple[Fits, NDArray[np.bool_]]:
-    """Return the best fits, none worse than its start, and a mask (N,) of those at rest."""
+    """Return the best fits, none worse than its start, and a mask (N,) of those that converged."""
     best = evaluate(windows, values)
-    settled = np.zeros(len(values), dtype=np.bool_)
+    has_converged = np.zeros(len(values), dtype=np.bool_)
     damping = np.full(len(values), 1e-3)
     active = np.arange(len(values))
     identity = np.eye(values.shape[1])
@@ -124,18 +126,18 @@ def _solve(
         diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + DIAGONAL_OFFSET
         damped = hessian + diagonal[:, :, None] * identity
         step = np.linalg.solve(damped, best.gradient[active, :, None])[:, :, 0]
-        trial = best.values[active] + step
-        trial[:, BLUR] = np.clip(trial[:, BLUR], MIN_BLUR_PIXELS, 2 * MAX_BLUR_PIXELS)
-        tried = evaluate(windows, trial)
-        better = tried.cost <= best.cost[active]
-        best.put(active, tried, better)
-        damping[active] *= np.where(better, 0.1, 10.0)
-        still = np.abs(step[:, moving]).max(axis=1) < MAX_LAST_MOVE_PX
-        settled[active[still]] = True
-        windows, active = windows.selected(~still), active[~still]
+        tried_values = best.values[active] + step
+        tried_values[:, BLUR] = np.clip(tried_values[:, BLUR], MIN_BLUR_PIXELS, 2 * MAX_BLUR_PIXELS)
+        tried_fits = evaluate(windows, tried_values)
+        is_better = tried_fits.cost <= best.cost[active]
+        best.replace_where(active, tried_fits, is_better)
+        damping[active] *= np.where(is_better, 0.1, 10.0)
+        has_stopped = np.abs(step[:, pixel_values]).max(axis=1) < MAX_FINAL_STEP_PX
+        has_converged[active[has_stopped]] = True
+        windows, active = windows.subset(~has_stopped), active[~has_stopped]
         if not len(active):
             break
-    return best, settled
+    return best, has_converged
 
 
 def covariances(fits: Fits, counts: Array) -> Array:

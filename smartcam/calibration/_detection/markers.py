@@ -1,9 +1,9 @@
 """Read square markers in images, and compare their places with those on the board.
 
-A marker that was misread, or that belongs to another board, lies elsewhere than its number says.
-Its neighbours show it. From the corners of a marker follows how the board is turned and scaled
-there; two markers agree if the vector between their centres is then the one on the board. Markers
-that agree form a group; on a board that matches its description there is one group of all.
+A marker that was misread, or that belongs to another board, lies elsewhere than its number says,
+which its neighbours show. The corners of a marker tell how the board is turned and scaled there.
+Two markers agree if the vector between their centres, so turned and scaled, is that on the board.
+Markers that agree form a group; if the board is as described, all markers are in one group.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ MAX_SLOPE_DIFFERENCE = 0.5
 """The turns and scales of two neighbouring markers may differ by this part."""
 
 MAX_PITCHES_OFF = 0.35
-"""A marker without a neighbour may lie this many distances of next neighbours off the place that
-the others predict."""
+"""A marker without neighbours may lie this many distances of next neighbours from its predicted
+place."""
 
 MIN_PITCHES_AGAINST = 0.6
-"""A group of markers contradicts the board's description if it lies at least this many distances of
-next neighbours, plus MAX_VECTOR_DIFFERENCE times its distance from the others, off the place that
-they predict."""
+"""A group of markers contradicts the board's description if its distance from the place that the
+others predict is more than this many distances of next neighbours, plus MAX_VECTOR_DIFFERENCE times
+its distance from the others."""
 
 MIN_CONTRARY_MARKERS = 3
 """A group that contradicts the description of the target has at least this many markers."""
@@ -50,16 +50,16 @@ MAX_NUMBERS_IN_MESSAGE = 8
 """A message lists at most this many marker numbers."""
 
 MIN_AGREEING_MARKERS = 2
-"""At least this many markers must agree: one alone rests on a single reading."""
+"""At least this many markers must agree: a single reading may be wrong."""
 
 
 WINDOWS_PX = (3, 13, 23)
 """Sides of the windows, pixels, whose mean separates dark from light: OpenCV's."""
 
 MAX_OUTLINES_OF_ALL_WINDOWS, MAX_OUTLINES = 1500, 4000
-"""Dark outlines of an image, as the mean over the windows: with more than the first number a single
-window is used, and of that at most the second number is examined. A board of 1,000 markers, the
-most that a dictionary has, shows some 3,000."""
+"""Limits for the dark outlines of an image. If the windows have more than the first number on
+average, a single window is used, and at most the second number of its outlines is examined. A board
+of 1,000 markers, the most that a dictionary has, shows some 3,000."""
 
 
 class Markers(NamedTuple):
@@ -68,20 +68,20 @@ class Markers(NamedTuple):
     quads: Array  # (N, 4, 2), corners in OpenCV's order, pixels
     ids: NDArray[np.intp]  # (N,), numbers of the markers
 
-    def selected(self, which: NDArray[np.bool_]) -> Markers:
-        """Return some of the markers."""
-        return Markers(self.quads[which], self.ids[which])
+    def subset(self, mask: NDArray[np.bool_]) -> Markers:
+        """Return the markers where a mask (N,) is True."""
+        return Markers(self.quads[mask], self.ids[mask])
 
 
 class MarkerAgreement(NamedTuple):
     """The result of comparing markers with a board."""
 
-    good: NDArray[np.bool_]  # indices of the markers that lie as on the board
-    contrary: int  # count of markers that agree with each other at other places
+    mask: NDArray[np.bool_]  # True for each marker that lies as on the board
+    contrary_count: int  # size of the largest group that agrees on other places
 
 
-def marker_dictionary(name: str, needed: int, label: str) -> Any:
-    """Return OpenCV's dictionary of a name, which must have at least ``needed`` markers.
+def marker_dictionary(name: str, min_count: int, label: str) -> Any:
+    """Return OpenCV's dictionary of a name, which must have at least ``min_count`` markers.
 
     ``label`` names the target. Raises SHAPE if the dictionary is unknown or has too few markers.
     """
@@ -96,159 +96,183 @@ def marker_dictionary(name: str, needed: int, label: str) -> Any:
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     count = len(dictionary.bytesList)
-    if needed > count:
+    if min_count > count:
         raise Code.SHAPE.unexpected(
-            f"{label}: expected at least {needed} markers in {name}", needed, count
+            f"{label}: expected at least {min_count} markers in {name}", min_count, count
         )
     return dictionary
 
 
-def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = None) -> Any:
+def marker_finder(image: NDArray[np.uint8], dictionary: Any, parameters: Any = None) -> Any:
     """Return OpenCV's detector for an image, set up so that its time is bounded.
 
     The detector compares each dark outline with each other one. If there are many, one window is
     used instead of three; if there are too many, only the largest outlines are examined.
     """
     cv2 = load("cv2")
-    given = cv2.aruco.DetectorParameters() if parameters is None else parameters
-    lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
+    options = cv2.aruco.DetectorParameters() if parameters is None else parameters
+    lengths = {window: _outlines(image, window, options) for window in WINDOWS_PX}
     if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
         window = sorted(WINDOWS_PX, key=lambda side: len(lengths[side]))[len(WINDOWS_PX) // 2]
-        given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
+        options.adaptiveThreshWinSizeMin = options.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
         if len(longest) > MAX_OUTLINES:
-            given.minMarkerPerimeterRate = float(longest[MAX_OUTLINES] + 1.5) / max(bytes_.shape)
-    return cv2.aruco.ArucoDetector(dictionary, given)
+            options.minMarkerPerimeterRate = float(longest[MAX_OUTLINES] + 1.5) / max(image.shape)
+    return cv2.aruco.ArucoDetector(dictionary, options)
 
 
-def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.intp]:
-    """Return the lengths, pixels, of the outlines that may be a marker's.
+def _outlines(image: NDArray[np.uint8], window: int, options: Any) -> NDArray[np.intp]:
+    """Return the lengths, pixels, of the dark outlines that may be those of markers.
 
     A pixel is dark if it is darker than the mean of a window around it.
     """
     cv2 = load("cv2")
-    mean, kind = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
-    dark = cv2.adaptiveThreshold(bytes_, 255, mean, kind, window, given.adaptiveThreshConstant)
+    method, threshold_type = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
+    dark = cv2.adaptiveThreshold(
+        image, 255, method, threshold_type, window, options.adaptiveThreshConstant
+    )
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     lengths = np.array([len(contour) for contour in contours], dtype=np.intp)
-    low, high = given.minMarkerPerimeterRate, given.maxMarkerPerimeterRate
-    largest = max(bytes_.shape)  # OpenCV takes whole pixels
+    low, high = options.minMarkerPerimeterRate, options.maxMarkerPerimeterRate
+    largest = max(image.shape)  # OpenCV takes whole pixels
     return lengths[(lengths >= int(low * largest)) & (lengths <= int(high * largest))]
 
 
-def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
-    """Compare markers with a board; count each number once.
+def compare_with_board(markers: Markers, board: Array) -> MarkerAgreement:
+    """Find the markers that are arranged as on a board; each number counts once.
 
     ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. If fewer than
-    MIN_AGREEING_MARKERS markers agree, the result has none.
+    MIN_AGREEING_MARKERS markers agree, the mask is False for all.
     """
-    good = np.zeros(len(markers.ids), dtype=np.bool_)
-    known = np.flatnonzero((markers.ids >= 0) & (markers.ids < len(board)))
-    if len(known) < MIN_AGREEING_MARKERS:
-        return MarkerAgreement(good, 0)
-    ids, quads = markers.ids[known], markers.quads[known]
-    flat = board[ids]
-    seen, mapped, slopes = quads.mean(axis=1), flat.mean(axis=1), _slopes(quads, flat)
+    mask = np.zeros(len(markers.ids), dtype=np.bool_)
+    known_indices = np.flatnonzero((markers.ids >= 0) & (markers.ids < len(board)))
+    if len(known_indices) < MIN_AGREEING_MARKERS:
+        return MarkerAgreement(mask, 0)
+    ids, quads = markers.ids[known_indices], markers.quads[known_indices]
+    corners_on_board = board[ids]
+    centres, board_centres, slopes = (
+        quads.mean(axis=1),
+        corners_on_board.mean(axis=1),
+        _slopes(quads, corners_on_board),
+    )
     pitch = _pitch(board.mean(axis=1))
-    groups = _hanging_together(_agreements(slopes, seen, mapped, MAX_NEIGHBOUR_PITCHES * pitch))
-    largest = groups == np.bincount(groups).argmax()
-    matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
-    if largest.sum() < MIN_AGREEING_MARKERS or matrix is None:
-        return MarkerAgreement(good, 0)
-    distances = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
+    groups = _group_numbers(
+        _agreement_mask(slopes, centres, board_centres, MAX_NEIGHBOUR_PITCHES * pitch)
+    )
+    in_largest_group = groups == np.bincount(groups).argmax()
+    matrix = fit_homography(
+        corners_on_board[in_largest_group].reshape(-1, 2), quads[in_largest_group].reshape(-1, 2)
+    )
+    if in_largest_group.sum() < MIN_AGREEING_MARKERS or matrix is None:
+        return MarkerAgreement(mask, 0)
+    distances = np.linalg.norm(apply_homography(matrix, board_centres) - centres, axis=1)
     distances /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
-    away = np.linalg.norm(mapped[:, None] - mapped[largest], axis=2).min(axis=1) / pitch
-    upright = _alike(slopes, derivatives(matrix, mapped))
-    joined = largest | ((distances < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
-    good[known[joined]] = True
-    contrary = ~joined & (distances > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
-    return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
+    group_distances = (
+        np.linalg.norm(board_centres[:, None] - board_centres[in_largest_group], axis=2).min(axis=1)
+        / pitch
+    )
+    has_slope = _have_like_slopes(slopes, derivatives(matrix, board_centres))
+    agrees = in_largest_group | (
+        (distances < MAX_PITCHES_OFF) & has_slope & ~np.isin(ids, ids[in_largest_group])
+    )
+    mask[known_indices[agrees]] = True
+    is_contrary = ~agrees & (
+        distances > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * group_distances
+    )
+    return MarkerAgreement(mask, int(np.bincount(groups[is_contrary], minlength=1).max()))
 
 
-def check_one_board(agreed: int, contrary: int, label: str) -> None:
+def check_one_board(agreeing_count: int, contrary_count: int, label: str) -> None:
     """Raise WRONG_TARGET if markers are arranged as on another board, or as on several.
 
-    ``agreed`` markers are arranged as on the board; ``contrary`` others agree with each other, but
-    not with these. ``label`` names the target.
+    ``agreeing_count``: number of markers arranged as on the board. ``contrary_count``: number of
+    others that agree with each other, but not with these. ``label`` names the target.
     """
-    if contrary >= MIN_CONTRARY_MARKERS and 2 * contrary >= agreed:
+    if contrary_count >= MIN_CONTRARY_MARKERS and 2 * contrary_count >= agreeing_count:
         raise Code.WRONG_TARGET.refusal(
-            f"{label}: expected markers of one such board, got {agreed} that stand to each other "
-            f"as on it and {contrary} others that do so elsewhere: columns and rows are others, or "
-            "several boards with the same numbers are in the picture",
-            f"{agreed + contrary} markers of one board",
-            agreed,
+            f"{label}: expected markers of one such board, got {agreeing_count} that stand to each "
+            f"other as on it and {contrary_count} others that do so elsewhere: columns and rows "
+            "are others, or several boards with the same numbers are in the picture",
+            f"{agreeing_count + contrary_count} markers of one board",
+            agreeing_count,
         )
 
 
-def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Array]:
-    """Predict the pixels of places (N, 2) on a board from the nearest markers, and the scale there.
+def predict_pixels(quads: Array, board_corners: Array, places: Array) -> tuple[Array, Array]:
+    """Predict the pixels of places (N, 2) on a board from the nearest markers, and the scales.
 
-    ``quads`` (M, 4, 2): the corners of markers in the image, ``flat`` on the board.
+    The scales (N,) are pixels per unit of the board. ``quads`` (M, 4, 2): the corners of markers in
+    the image; ``board_corners``: on the board.
     """
-    slopes, seen, mapped = _slopes(quads, flat), quads.mean(axis=1), flat.mean(axis=1)
-    ways = at[:, None] - mapped
-    distances = np.linalg.norm(ways, axis=2)
-    expected = seen + np.einsum("jkl,ijl->ijk", slopes, ways)
-    # a corner of a square lies between the two next markers, and perspective beside one of them
-    # is about the opposite of that beside the other
+    slopes, centres, board_centres = (
+        _slopes(quads, board_corners),
+        quads.mean(axis=1),
+        board_corners.mean(axis=1),
+    )
+    vectors = places[:, None] - board_centres
+    distances = np.linalg.norm(vectors, axis=2)
+    expected = centres + np.einsum("jkl,ijl->ijk", slopes, vectors)
+    # a corner of a square lies between the two nearest markers, whose errors by perspective are
+    # about opposite, so their predictions are averaged
     is_near = distances < 1.1 * distances.min(axis=1, keepdims=True)
     shares = is_near / is_near.sum(axis=1, keepdims=True)
-    places: Array = np.einsum("ij,ijk->ik", shares, expected)
-    return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
+    predicted: Array = np.einsum("ij,ijk->ik", shares, expected)
+    return predicted, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
 
 
-def remarks_on_strays(numbers: Sequence[int]) -> tuple[Remark, ...]:
-    """Return the remark that names the markers left out; nothing without any."""
-    if not numbers:
+def stray_remarks(marker_ids: Sequence[int]) -> tuple[Remark, ...]:
+    """Return the remark that names the markers that were left out, if there are any."""
+    if not marker_ids:
         return ()
-    shown = ", ".join(map(str, numbers[:MAX_NUMBERS_IN_MESSAGE])) + (
-        ", ..." if numbers[MAX_NUMBERS_IN_MESSAGE:] else ""
+    shown = ", ".join(map(str, marker_ids[:MAX_NUMBERS_IN_MESSAGE])) + (
+        ", ..." if marker_ids[MAX_NUMBERS_IN_MESSAGE:] else ""
     )
     text = f"markers left out, which do not stand where the board has them: {shown}"
     return (Code.OUTLIER.remark(text),)
 
 
-def _slopes(quads: Array, flat: Array) -> Array:
+def _slopes(quads: Array, board_corners: Array) -> Array:
     """Return the derivatives of the pixels by the board's x and y at each marker, (N, 2, 2)."""
-    around = flat - flat.mean(axis=1, keepdims=True)
-    seen = quads - quads.mean(axis=1, keepdims=True)
-    squares = (around**2).sum(axis=(1, 2)) / 2  # sums over the corners, equal along x and y
-    slopes: Array = seen.transpose(0, 2, 1) @ around / squares[:, None, None]
+    board_offsets = board_corners - board_corners.mean(axis=1, keepdims=True)
+    pixel_offsets = quads - quads.mean(axis=1, keepdims=True)
+    squares = (board_offsets**2).sum(axis=(1, 2)) / 2  # sums over the corners, equal along x and y
+    slopes: Array = pixel_offsets.transpose(0, 2, 1) @ board_offsets / squares[:, None, None]
     return slopes
 
 
-def _pitch(middles: Array) -> float:
+def _pitch(centres: Array) -> float:
     """Return the distance between a board's markers that are next to each other."""
-    distances = np.linalg.norm(middles - middles[0], axis=1)
-    return float(distances[1:].min()) if len(middles) > 1 else 0.0
+    distances = np.linalg.norm(centres - centres[0], axis=1)
+    return float(distances[1:].min()) if len(centres) > 1 else 0.0
 
 
-def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDArray[np.bool_]:
+def _agreement_mask(
+    slopes: Array, centres: Array, board_centres: Array, max_distance: float
+) -> NDArray[np.bool_]:
     """Return a mask (N, N) that is True for two markers that agree."""
-    ways = mapped[None] - mapped[:, None]
-    distances = np.linalg.norm(ways, axis=2)
+    vectors = board_centres[None] - board_centres[:, None]
+    distances = np.linalg.norm(vectors, axis=2)
     # the mean of both derivatives predicts one marker from the other exactly to second order
-    both = (slopes[:, None] + slopes[None]) / 2
-    expected = np.einsum("ijkl,ijl->ijk", both, ways)
-    apart = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
+    mean_slopes = (slopes[:, None] + slopes[None]) / 2
+    expected = np.einsum("ijkl,ijl->ijk", mean_slopes, vectors)
+    differences = np.linalg.norm(centres[None] - centres[:, None] - expected, axis=2)
     return np.asarray(
         (distances > 0)
-        & (distances <= reach)
-        & (apart < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
-        & _alike(slopes[:, None], slopes[None])
+        & (distances <= max_distance)
+        & (differences < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
+        & _have_like_slopes(slopes[:, None], slopes[None])
     )
 
 
-def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Return True for each pair of slopes (..., 2, 2) with about the same turn and scale."""
-    differ = np.linalg.norm(one - other, axis=(-2, -1))
+def _have_like_slopes(first: Array, second: Array) -> NDArray[np.bool_]:
+    """Return a mask of the pairs of slopes (..., 2, 2) with about the same turn and scale."""
+    differences = np.linalg.norm(first - second, axis=(-2, -1))
     return np.asarray(
-        differ < MAX_SLOPE_DIFFERENCE * np.linalg.norm((one + other) / 2, axis=(-2, -1))
+        differences < MAX_SLOPE_DIFFERENCE * np.linalg.norm((first + second) / 2, axis=(-2, -1))
     )
 
 
-def _hanging_together(agreed: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the number of the group of agreeing markers that each belongs to, (N,)."""
-    _, parts = load("scipy.sparse.csgraph").connected_components(agreed, directed=False)
-    return np.asarray(parts, dtype=np.intp)
+def _group_numbers(agreement: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the number (N,) of the group of agreeing markers to which each marker belongs."""
+    _, groups = load("scipy.sparse.csgraph").connected_components(agreement, directed=False)
+    return np.asarray(groups, dtype=np.intp)

@@ -1,8 +1,8 @@
 """Number the points that were found as the target numbers them.
 
 A detector returns a grid whose first point may be any of its corners. There are only a few ways to
-lay the target's rows and columns over it. Those in which the sheet's front faces the camera are
-``proper``; the others show it mirrored.
+number its points by the target's rows and columns. In some of them the sheet's front faces the
+camera (``is_front``); the others show the sheet mirrored.
 """
 
 from __future__ import annotations
@@ -24,17 +24,15 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_ORIGIN_CONTRAST = 30.0
-"""A marked origin is darker than the next darkest corner by at least this many grey levels of
-255."""
+"""A marked origin is darker than any other corner by at least this many grey levels of 255."""
 
-_TURNS: Final = [
+_STEP_CHANGES: Final = [
     np.array(entries).reshape(2, 2)
     for entries in itertools.product((-1, 0, 1), repeat=4)
     if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
 ]
-"""Matrices from the steps by which a grid was found to the steps to the next column and row:
-turns, mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its
-sides."""
+"""Matrices from the steps by which a grid was found to the steps to the next column and row: turns,
+mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its sides."""
 
 
 class Arrangement(NamedTuple):
@@ -42,48 +40,50 @@ class Arrangement(NamedTuple):
 
     # (rows, columns), index of the found point in each row and column of the target
     order: NDArray[np.intp]
-    proper: bool  # True if the sheet's front is seen, and not its mirror image
+    is_front: bool  # whether the sheet's front is seen; False: its mirror image
     rightward: float  # cosine of the angle between the target's x and the image's u
 
 
-def arrangements(
-    points: Array, places: NDArray[np.intp], target: Checkerboard | CircleGrid
+def find_arrangements(
+    points: Array, grid_positions: NDArray[np.intp], target: Checkerboard | CircleGrid
 ) -> list[Arrangement]:
     """Return all ways in which a grid can be numbered.
 
-    ``points`` (N, 2), pixels, are all points of the target in any order; ``places`` (N, 2) the
-    column and the row of each, with arbitrary origin and directions; in a grid with shifted rows
-    they count the steps along the two diagonals, to the nearest points.
+    ``points`` (N, 2): all points of the target in any order, pixels. ``grid_positions`` (N, 2): the
+    column and the row of each point, with arbitrary origin and directions. In a grid with shifted
+    rows, positions count the steps along the two diagonals, to the nearest points.
     """
-    wanted = _places(target)
-    ways: list[Arrangement] = []
-    if len(points) != len(wanted):
-        return ways
-    for turn in _TURNS:
-        turned = places @ turn
-        index_at = {place: index for index, place in enumerate(_from_zero(turned))}
-        order = [index_at.get(place) for place in wanted]
+    target_positions = _target_positions(target)
+    numberings: list[Arrangement] = []
+    if len(points) != len(target_positions):
+        return numberings
+    for step_change in _STEP_CHANGES:
+        turned_positions = grid_positions @ step_change
+        index_at = {
+            position: index for index, position in enumerate(_shift_to_zero(turned_positions))
+        }
+        order = [index_at.get(position) for position in target_positions]
         if None not in order:
-            shaped = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
-            ways.append(_arrangement(points, shaped))
-    return ways
+            order_by_rows = np.array(order, dtype=np.intp).reshape(target.rows, target.columns)
+            numberings.append(_arrangement(points, order_by_rows))
+    return numberings
 
 
-def _from_zero(places: NDArray[np.intp]) -> list[tuple[int, int]]:
-    return [(x, y) for x, y in (places - places.min(axis=0)).tolist()]
+def _shift_to_zero(grid_positions: NDArray[np.intp]) -> list[tuple[int, int]]:
+    return [(x, y) for x, y in (grid_positions - grid_positions.min(axis=0)).tolist()]
 
 
-def _places(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
-    """Return the columns and rows of a target's points, as :func:`arrangements` takes them."""
+def _target_positions(target: Checkerboard | CircleGrid) -> list[tuple[int, int]]:
+    """Return the columns and rows of a target's points, as :func:`find_arrangements` takes them."""
     row, column = np.divmod(np.arange(target.columns * target.rows), target.columns)
     if isinstance(target, CircleGrid) and target.asymmetric:
         half = 2 * column + row % 2
         column, row = (half + row) // 2, (half - row) // 2
-    return _from_zero(np.stack([column, row], axis=1))
+    return _shift_to_zero(np.stack([column, row], axis=1))
 
 
-def places_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
-    """Return the places (N, 2) of points that come row by row."""
+def positions_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
+    """Return the grid positions (N, 2), column and row, of points in the order of rows."""
     row, column = np.divmod(np.arange(columns * rows), columns)
     return np.stack([column, row], axis=1)
 
@@ -91,37 +91,36 @@ def places_row_by_row(columns: int, rows: int) -> NDArray[np.intp]:
 def _arrangement(points: Array, order: NDArray[np.intp]) -> Arrangement:
     origin, x_end, y_end = points[order[0, 0]], points[order[0, -1]], points[order[-1, 0]]
     x, y = x_end - origin, y_end - origin
-    turn = float(
-        x[0] * y[1] - x[1] * y[0]
-    )  # v points down: negative where y is counter-clockwise of x
-    return Arrangement(order, turn < 0, float(x[0] / np.hypot(*x)))
+    # v points down, so the cross product is negative if y is counter-clockwise of x
+    cross_product = float(x[0] * y[1] - x[1] * y[0])
+    return Arrangement(order, cross_product < 0, float(x[0] / np.hypot(*x)))
 
 
-def most_rightward(ways: Sequence[Arrangement], label: str) -> Arrangement:
-    """Return the proper arrangement whose x points most to the image's right, which is unique.
+def choose_rightward(numberings: Sequence[Arrangement], label: str) -> Arrangement:
+    """Return the arrangement that shows the front and whose x points most to the image's right.
 
-    Raises MIRRORED if no arrangement is proper; ``label`` names the target.
+    Raises MIRRORED if no arrangement shows the front; ``label`` names the target.
     """
-    proper = [arrangement for arrangement in ways if arrangement.proper]
-    if not proper:
+    front_views = [arrangement for arrangement in numberings if arrangement.is_front]
+    if not front_views:
         raise Code.MIRRORED.refusal(
             f"{label}: expected an image of the sheet as one reads it, got one that is mirrored",
             "y to the left of x",
             "y to the right of x",
         )
-    return max(proper, key=lambda arrangement: arrangement.rightward)
+    return max(front_views, key=lambda arrangement: arrangement.rightward)
 
 
-def marked(
-    ways: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], label: str
+def choose_marked(
+    numberings: Sequence[Arrangement], level: Callable[[NDArray[np.intp]], float], label: str
 ) -> tuple[Arrangement, float]:
     """Return the arrangement with a dark mark at its origin, and the mark's margin in grey levels.
 
     ``level`` returns the grey level, of 255, at the place where an arrangement would have its mark.
-    ``label`` are the target and its mark, for messages. Raises AMBIGUOUS_ORIGIN if the mark is too
-    little darker than the next corner, and MIRRORED.
+    ``label``: the target and its mark, for messages. Raises MIRRORED, or AMBIGUOUS_ORIGIN if the
+    darkest corner is not MIN_ORIGIN_CONTRAST darker than the next one.
     """
-    levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in ways}
+    levels = {int(arrangement.order[0, 0]): level(arrangement.order) for arrangement in numberings}
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
     margin = levels[second] - levels[origin]
     if not margin >= MIN_ORIGIN_CONTRAST:
@@ -131,6 +130,6 @@ def marked(
             MIN_ORIGIN_CONTRAST,
             margin,
         )
-    return most_rightward(
-        [arrangement for arrangement in ways if arrangement.order[0, 0] == origin], label
+    return choose_rightward(
+        [arrangement for arrangement in numberings if arrangement.order[0, 0] == origin], label
     ), margin

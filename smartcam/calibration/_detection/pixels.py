@@ -25,7 +25,7 @@ MIN_REACH_PX = 3
 class Windows(NamedTuple):
     """The pixels around each of N points, P for each."""
 
-    middle: NDArray[np.intp]  # (N, 2), the centre pixel of each window
+    centre: NDArray[np.intp]  # (N, 2), the centre pixel of each window
     x: Floats  # (P,), columns from the middle
     y: Floats  # (P,), rows from the middle
     levels: Floats  # (N, P), 0 to 255; 0 where the weight is 0
@@ -37,18 +37,18 @@ class Windows(NamedTuple):
         counts: Array = self.weights.sum(axis=1, dtype=np.float64)
         return counts
 
-    def without(self, points: Array, radius: float) -> Windows:
-        """Return the windows without the pixels within a radius of points (N, 2)."""
-        u, v = (points - self.middle).astype(np.float32).T[:, :, None]
-        outside = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
-        return self._replace(levels=self.levels * outside, weights=self.weights * outside)
+    def without_discs(self, points: Array, radius: float) -> Windows:
+        """Return the windows with weight 0 for the pixels within a radius of points (N, 2)."""
+        u, v = (points - self.centre).astype(np.float32).T[:, :, None]
+        is_outside = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
+        return self._replace(levels=self.levels * is_outside, weights=self.weights * is_outside)
 
-    def selected(self, which: NDArray[np.bool_]) -> Windows:
-        """Return the windows of the selected points."""
-        if which.all():
+    def subset(self, mask: NDArray[np.bool_]) -> Windows:
+        """Return the windows where a mask (N,) is True."""
+        if mask.all():
             return self
         return self._replace(
-            middle=self.middle[which], levels=self.levels[which], weights=self.weights[which]
+            centre=self.centre[mask], levels=self.levels[mask], weights=self.weights[mask]
         )
 
 
@@ -63,34 +63,36 @@ def cut_windows(
 ) -> Windows:
     """Return the pixels around points (N, 2).
 
-    ``half_sides`` (N, 2, 2): vectors from each point along the half sides of the parallelogram
-    whose pixels count, or along the half axes of an ellipse (``round_``). A window reaches at most
+    ``half_sides`` (N, 2, 2): half sides of the parallelogram around each point whose pixels count,
+    or the half axes of an ellipse (``round_``). A window reaches at most
     ``max_reach`` pixels to each side. ``arm_widths`` (N, 2): count only a cross whose arms lie
-    along the half sides, with these shares of them as half widths; None: count all.
+    along the half sides; half widths of the arms, as parts of the half sides. None: count all.
     """
     reach = (
         np.hypot(half_sides[:, 0], half_sides[:, 1]) if round_ else np.abs(half_sides).sum(axis=1)
     )
     half = int(np.clip(np.ceil(reach.max()), MIN_REACH_PX, max_reach))
     span = np.arange(-half, half + 1)
-    y, x = (side.ravel() for side in np.meshgrid(span, span, indexing="ij"))
-    middle = np.rint(points).astype(np.intp)
-    columns, rows = middle[:, :1] + x, middle[:, 1:] + y
+    y, x = (axis_offsets.ravel() for axis_offsets in np.meshgrid(span, span, indexing="ij"))
+    centre = np.rint(points).astype(np.intp)
+    columns, rows = centre[:, :1] + x, centre[:, 1:] + y
     width, height = image.size
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    is_in_image = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     levels = image.levels[rows.clip(0, height - 1), columns.clip(0, width - 1)]
     # coordinates of each pixel along the two half sides
-    parts = np.linalg.inv(half_sides.transpose(0, 2, 1)) @ np.stack([x, y])
-    within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
+    coordinates = np.linalg.inv(half_sides.transpose(0, 2, 1)) @ np.stack([x, y])
+    is_in_shape = (
+        (coordinates**2).sum(axis=1) <= 1 if round_ else (np.abs(coordinates) <= 1).all(axis=1)
+    )
     if arm_widths is not None:
-        within &= (np.abs(parts) <= arm_widths[:, :, None]).any(axis=1)
+        is_in_shape &= (np.abs(coordinates) <= arm_widths[:, :, None]).any(axis=1)
     is_near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH_PX
-    weights = (inside & (within | is_near)).astype(np.float32)
-    return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
+    weights = (is_in_image & (is_in_shape | is_near)).astype(np.float32)
+    return Windows(centre, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
 
 
-def edge(distance: Floats) -> tuple[Floats, Floats]:
-    """Return a blurred edge's ``erf`` and slope; distances are in ``sqrt(2)`` times the blur."""
+def edge_profile(distance: Floats) -> tuple[Floats, Floats]:
+    """Return a blurred edge's ``erf`` and slope; ``distance`` is divided by ``sqrt(2) * blur``."""
     square = distance * distance
     shape = np.tanh(distance * (LINEAR + CUBIC * square))
     return shape, (1 - shape * shape) * (LINEAR + 3 * CUBIC * square)

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
 
 
 def mean_level(image: GreyImage, points: Array) -> float:
-    """Return the mean grey level at points (N, 2); outside of the image its rim is continued."""
+    """Return the mean grey level at points (N, 2); the rim's level is used outside of the image."""
     cv2 = load("cv2")
-    at = points.astype(np.float32)[None]
-    levels = cv2.remap(image.levels, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    coordinates = points.astype(np.float32)[None]
+    levels = cv2.remap(
+        image.levels, coordinates, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return float(levels.mean())

@@ -18,7 +18,7 @@ from smartcam.calibration._lens.comparison import LensComparison
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.calibration._views import label
+from smartcam.calibration._views import view_name
 from smartcam.geometry._inside import IDENTITY, Code
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def draw_views(calibration: FromImages, *, title: str = "") -> str:
     Raises:
         CalibrationError: ``WRONG_KIND``: this is no calibration from images.
     """
-    return draw_bars(_of(calibration, _CHARTS, "draw_views")(calibration), title)
+    return draw_bars(_choose_drawing(calibration, _CHARTS, "draw_views")(calibration), title)
 
 
 @takes(title=check_text)
@@ -60,7 +60,7 @@ def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     base is fixed. Targets are blue, with the views' names; dashed ones were left out. Cameras are
     orange.
     """
-    return _draw_scene(_of(calibration, _SCENES, "draw_scene")(calibration), title)
+    return _draw_scene(_choose_drawing(calibration, _SCENES, "draw_scene")(calibration), title)
 
 
 @takes(distance=or_none(a_number), title=check_text)
@@ -78,14 +78,14 @@ def draw_uncertainty(
     ``distance`` is as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     if isinstance(shown, LensComparison):
-        observed = [
+        maps = [
             Map("difference", _size(shown.pixels), shown.lengths, _figures_text(shown.observed))
         ]
         if shown.expected is not None and shown.predicted is not None:
             expected = np.sqrt(np.trace(shown.expected, axis1=2, axis2=3) / 2)
             caption = _figures_text(shown.predicted)
-            observed.append(Map("expected from noise", _size(shown.pixels), expected, caption))
-        return draw_maps(observed, title, "px")
+            maps.append(Map("expected from noise", _size(shown.pixels), expected, caption))
+        return draw_maps(maps, title, "px")
     points = np.zeros((0, 2))
     if isinstance(shown, IntrinsicCalibration):
         points = np.concatenate([fit.view.points for fit in shown.views if fit.used])
@@ -94,15 +94,17 @@ def draw_uncertainty(
         raise _argument_error(
             "draw_uncertainty", "a calibration of a lens, its map or a comparison", shown
         )
-    where = "infinity" if shown.distance is None else f"{shown.distance:g} m"
-    name = f"standard deviation of the projection of a point at {where}"
+    distance_text = "infinity" if shown.distance is None else f"{shown.distance:g} m"
+    name = f"standard deviation of the projection of a point at {distance_text}"
     caption = _figures_text(shown.figures)
-    if not (reached := np.isfinite(shown.sigma)).all():
-        caption += f"; the model of the lens ends before {1 - reached.mean():.1%} of the image"
+    if not (is_reached := np.isfinite(shown.sigma)).all():
+        caption += f"; the model of the lens ends before {1 - is_reached.mean():.1%} of the image"
     return draw_maps([Map(name, shown.size, shown.sigma, caption, points)], title, "px")
 
 
-def _of(calibration: object, table: Mapping[type, Any], label: str) -> Callable[[Any], Any]:
+def _choose_drawing(
+    calibration: object, table: Mapping[type, Any], label: str
+) -> Callable[[Any], Any]:
     drawing = next(
         (drawing for kind, drawing in table.items() if isinstance(calibration, kind)), None
     )
@@ -110,8 +112,8 @@ def _of(calibration: object, table: Mapping[type, Any], label: str) -> Callable[
         raise _argument_error(
             label, "a calibration of a lens, a pair, or a camera on a robot", calibration
         )
-    chosen: Callable[[Any], Any] = drawing
-    return chosen
+    function: Callable[[Any], Any] = drawing
+    return function
 
 
 def _argument_error(label: str, expected: str, actual: object) -> CalibrationError:
@@ -143,7 +145,7 @@ def _lens_chart(calibration: IntrinsicCalibration) -> list[Chart]:
                     "held out", [fit.held_out for fit in calibration.views], calibration.held_out
                 ),
             ],
-            [label(fit.view, number) for number, fit in enumerate(calibration.views)],
+            [view_name(fit.view, number) for number, fit in enumerate(calibration.views)],
             [not fit.used for fit in calibration.views],
         )
     ]
@@ -169,7 +171,7 @@ def _pair_charts(calibration: StereoCalibration) -> list[Chart]:
 
 
 def _robot_chart(calibration: HandEyeCalibration) -> list[Chart]:
-    together = (
+    overall = (
         math.nan if calibration.held_out_error is None else MILLIMETRES * calibration.held_out_error
     )
     return [
@@ -177,7 +179,7 @@ def _robot_chart(calibration: HandEyeCalibration) -> list[Chart]:
             "mm",
             [
                 Series("on the target", (MILLIMETRES * calibration.errors).tolist()),
-                Series("held out", (MILLIMETRES * calibration.leave_one_out).tolist(), together),
+                Series("held out", (MILLIMETRES * calibration.leave_one_out).tolist(), overall),
             ],
             _robot_names(calibration),
             [not used for used in calibration.used],
@@ -187,12 +189,12 @@ def _robot_chart(calibration: HandEyeCalibration) -> list[Chart]:
 
 def _pair_names(calibration: StereoCalibration) -> list[str]:
     views = [fit.left or fit.right for fit in calibration.pairs]
-    return [label(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
+    return [view_name(view, n) if view else f"pair {n}" for n, view in enumerate(views)]
 
 
 def _robot_names(calibration: HandEyeCalibration) -> list[str]:
     if calibration.views:
-        return [label(view, number) for number, view in enumerate(calibration.views)]
+        return [view_name(view, number) for number, view in enumerate(calibration.views)]
     return [f"pose {number}" for number in range(len(calibration.robot_poses))]
 
 
@@ -218,7 +220,9 @@ def _boards(
 
 
 def _lens_scene(calibration: IntrinsicCalibration) -> DrawnScene:
-    names = short_names([label(fit.view, number) for number, fit in enumerate(calibration.views)])
+    names = short_names(
+        [view_name(fit.view, number) for number, fit in enumerate(calibration.views)]
+    )
     poses, left_out = (
         [fit.transform for fit in calibration.views],
         [not fit.used for fit in calibration.views],
@@ -228,14 +232,14 @@ def _lens_scene(calibration: IntrinsicCalibration) -> DrawnScene:
 
 
 def _pair_scene(calibration: StereoCalibration) -> DrawnScene:
-    shown = next(
+    first_view = next(
         view for fit in calibration.pairs for view in (fit.left, fit.right) if view is not None
     )
     poses, left_out = (
         [fit.transform for fit in calibration.pairs],
         [not any(fit.used) for fit in calibration.pairs],
     )
-    boards = _boards(short_names(_pair_names(calibration)), poses, left_out, shown.target)
+    boards = _boards(short_names(_pair_names(calibration)), poses, left_out, first_view.target)
     right = calibration.transform.rigid.inverse()
     return DrawnScene(
         boards,

@@ -37,25 +37,25 @@ def draw_file(
     calibration's ``load``.
     """
     document = read_document(path)
-    possible = PICTURES.get(document.kind, ())
-    if not possible or picture not in {None, *possible}:
-        wanted = picture or " or ".join(PICTURES)
+    available = PICTURES.get(document.kind, ())
+    if not available or picture not in {None, *available}:
+        expected = picture or " or ".join(PICTURES)
         raise Code.WRONG_KIND.refusal(
             f"{path}: holds {document.kind!r}, of which there is "
-            f"{' and '.join(possible) or 'no picture'}; expected {wanted}",
-            wanted,
+            f"{' and '.join(available) or 'no picture'}; expected {expected}",
+            expected,
             document.kind,
         )
     title, data = str(path), document.data
-    chosen = picture or possible[0]
+    drawn = picture or available[0]
     if document.kind == PlaneCalibration.kind:
         return draw_plane(PlaneCalibration.from_data(data), title=title)
     kinds = (IntrinsicCalibration, StereoCalibration, HandEyeCalibration)
     calibration = next(kind for kind in kinds if kind.kind == document.kind).from_data(data)
-    if isinstance(calibration, IntrinsicCalibration) and chosen == "uncertainty":
+    if isinstance(calibration, IntrinsicCalibration) and drawn == "uncertainty":
         return draw_uncertainty(calibration, distance=distance, title=title)
     return (
         draw_scene(calibration, title=title)
-        if chosen == "scene"
+        if drawn == "scene"
         else draw_views(calibration, title=title)
     )

@@ -18,7 +18,7 @@ WIDTH: Final = 640.0
 """Width of a map, pixels."""
 
 BORDER, HEAD, FOOT = 30.0, 70.0, 84.0
-"""Pixels beside, above and below a map."""
+"""Margins beside, above and below a map, pixels."""
 
 COLOURS: Final = (
     *((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132)),
@@ -33,9 +33,9 @@ COLOUR_COUNT: Final = 24
 """Number of colours of a map; neighbouring cells of one colour become one rectangle."""
 
 MAX_DECADES: Final = 3.0
-"""A map's colours span this many powers of ten at most; smaller values have the first colour."""
+"""Largest number of powers of ten in a map's colours; smaller values have the first colour."""
 
-TICKS: Final = 5
+TICK_COUNT: Final = 5
 
 
 class Map(NamedTuple):
@@ -49,93 +49,99 @@ class Map(NamedTuple):
 
 
 def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
-    """Return maps side by side, with one legend: their colours mean the same."""
-    finite = np.concatenate([drawn.values[np.isfinite(drawn.values)] for drawn in maps])
-    positive = finite[finite > 0.0]
-    most = float(positive.max()) if len(positive) else 1.0
-    least = float(positive.min()) if len(positive) else 0.1
-    least = max(min(least, 0.999 * most), most / 10.0**MAX_DECADES)
+    """Return an SVG document with maps side by side, which share one legend."""
+    values = np.concatenate([drawn.values[np.isfinite(drawn.values)] for drawn in maps])
+    positive_values = values[values > 0.0]
+    largest = float(positive_values.max()) if len(positive_values) else 1.0
+    smallest = float(positive_values.min()) if len(positive_values) else 0.1
+    smallest = max(min(smallest, 0.999 * largest), largest / 10.0**MAX_DECADES)
     height = max(WIDTH * drawn.size[1] / drawn.size[0] for drawn in maps)
-    parts = [text((BORDER, 28), title, "title")] if title else []
+    shapes = [text((BORDER, 28), title, "title")] if title else []
     for number, drawn in enumerate(maps):
-        parts += _map(drawn, BORDER + number * (WIDTH + BORDER), least, most)
-    parts += _legend(HEAD + height + 44, least, most, unit)
-    return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + height + FOOT, parts)
+        shapes += _map_shapes(drawn, BORDER + number * (WIDTH + BORDER), smallest, largest)
+    shapes += _legend(HEAD + height + 44, smallest, largest, unit)
+    return document(len(maps) * (WIDTH + BORDER) + BORDER, HEAD + height + FOOT, shapes)
 
 
-def _map(drawn: Map, left: float, least: float, most: float) -> Iterator[str]:
+def _map_shapes(drawn: Map, left: float, smallest: float, largest: float) -> Iterator[str]:
     height = WIDTH * drawn.size[1] / drawn.size[0]
     rows, columns = drawn.values.shape
     cell = np.array([WIDTH / columns, height / rows])
     yield text((left, HEAD - 12), drawn.title)
-    levels = _levels(drawn.values, least, most)
+    colour_indices = _colour_indices(drawn.values, smallest, largest)
     yield '<g shape-rendering="crispEdges">'
     for row in range(rows):
         # one rectangle for each run of one colour
-        starts = np.flatnonzero(np.diff(levels[row], prepend=-2))
+        starts = np.flatnonzero(np.diff(colour_indices[row], prepend=-2))
         for start, end in zip(starts, [*starts[1:], columns], strict=True):
-            level = int(levels[row, start])
-            fill = 'fill="none"' if level < 0 else f'fill="{_colour(level / (COLOUR_COUNT - 1))}"'
-            place = (left + start * cell[0], HEAD + row * cell[1])
-            yield rectangle(place, ((end - start) * cell[0], cell[1]), fill)
+            colour_index = int(colour_indices[row, start])
+            fill = (
+                'fill="none"'
+                if colour_index < 0
+                else f'fill="{_colour(colour_index / (COLOUR_COUNT - 1))}"'
+            )
+            corner = (left + start * cell[0], HEAD + row * cell[1])
+            yield rectangle(corner, ((end - start) * cell[0], cell[1]), fill)
     yield "</g>"
-    places = [left, HEAD] + (drawn.points + 0.5) * WIDTH / drawn.size[0]
-    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in places.tolist())
+    point_places = [left, HEAD] + (drawn.points + 0.5) * WIDTH / drawn.size[0]
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in point_places.tolist())
     yield f'<path d="{dots}" class="seen"/>'
     yield rectangle((left, HEAD), (WIDTH, height), 'class="axis"')
-    yield from _numbers(drawn.values, left, height)
+    yield from _value_labels(drawn.values, left, height)
     if drawn.caption:
         yield text((left, HEAD + height + 20), drawn.caption)
 
 
-def _numbers(values: Array, left: float, height: float) -> Iterator[str]:
+def _value_labels(values: Array, left: float, height: float) -> Iterator[str]:
     """Yield the values at the corners and the centre, and a cross at the largest value."""
     rows, columns = values.shape
     for row, y in ((0, 20.0), (rows // 2, height / 2 + 5), (rows - 1, height - 10)):
-        ends = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
+        outer_columns = [(0, 8.0, "start"), (columns - 1, WIDTH - 8, "end")]
         for column, x, anchor in (
-            ends if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
+            outer_columns if row != rows // 2 else [(columns // 2, WIDTH / 2, "middle")]
         ):
             value = values[row, column]
             label = f"{value:.2g}" if math.isfinite(value) else "beyond the model"
             yield text((left + x, HEAD + y), label, "on-map", f' text-anchor="{anchor}"')
     if np.isfinite(values).any():
         row, column = np.unravel_index(np.nanargmax(values), values.shape)
-        at = np.array([left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * height / rows])
+        centre = np.array(
+            [left + (column + 0.5) * WIDTH / columns, HEAD + (row + 0.5) * height / rows]
+        )
         # the cross must not cover a number
         if row not in {0, rows - 1} or column not in {0, columns - 1}:
-            for kind in ("mark-rim", "mark"):
+            for css_class in ("mark-rim", "mark"):
                 for arm in np.array([[6.0, 0.0], [0.0, 6.0]]):
-                    yield line(at - arm, at + arm, kind)
+                    yield line(centre - arm, centre + arm, css_class)
 
 
-def _levels(values: Array, least: float, most: float) -> Array:
-    """Return the number of each value's colour, by its logarithm; -1 for none."""
-    safe = np.where(np.isfinite(values), np.clip(values, least, most), least)
-    parts = np.log(safe / least) / math.log(most / least)
-    levels = np.clip(np.round(parts * (COLOUR_COUNT - 1)), 0, COLOUR_COUNT - 1)
-    numbers: Array = np.where(np.isfinite(values), levels, -1)
-    return numbers
+def _colour_indices(values: Array, smallest: float, largest: float) -> Array:
+    """Return the index of each value's colour, by its logarithm; -1 for NaN and infinity."""
+    clipped = np.where(np.isfinite(values), np.clip(values, smallest, largest), smallest)
+    fractions = np.log(clipped / smallest) / math.log(largest / smallest)
+    levels = np.clip(np.round(fractions * (COLOUR_COUNT - 1)), 0, COLOUR_COUNT - 1)
+    indices: Array = np.where(np.isfinite(values), levels, -1)
+    return indices
 
 
-def _colour(part: float) -> str:
-    at = part * (len(COLOURS) - 1)
-    low = min(math.floor(at), len(COLOURS) - 2)
+def _colour(fraction: float) -> str:
+    position = fraction * (len(COLOURS) - 1)
+    low = min(math.floor(position), len(COLOURS) - 2)
     pairs = zip(COLOURS[low], COLOURS[low + 1], strict=True)
-    channels = (round(a + (at - low) * (b - a)) for a, b in pairs)
+    channels = (round(a + (position - low) * (b - a)) for a, b in pairs)
     return "#" + "".join(f"{channel:02x}" for channel in channels)
 
 
-def _legend(y: float, least: float, most: float, unit: str) -> Iterator[str]:
+def _legend(y: float, smallest: float, largest: float, unit: str) -> Iterator[str]:
     width = WIDTH / COLOUR_COUNT
     yield '<g shape-rendering="crispEdges">'
     for step in range(COLOUR_COUNT):
         fill = f'fill="{_colour(step / (COLOUR_COUNT - 1))}"'
         yield rectangle((BORDER + step * width, y - 12), (width, 12), fill)
     yield "</g>"
-    for tick in range(TICKS):
-        part = tick / (TICKS - 1)
-        value = least * (most / least) ** part
-        anchor = "start" if tick == 0 else "end" if tick == TICKS - 1 else "middle"
-        label = f"{value:.2g}{f' {unit}' if tick == TICKS - 1 else ''}"
-        yield text((BORDER + part * WIDTH, y + 16), label, "", f' text-anchor="{anchor}"')
+    for tick in range(TICK_COUNT):
+        fraction = tick / (TICK_COUNT - 1)
+        value = smallest * (largest / smallest) ** fraction
+        anchor = "start" if tick == 0 else "end" if tick == TICK_COUNT - 1 else "middle"
+        label = f"{value:.2g}{f' {unit}' if tick == TICK_COUNT - 1 else ''}"
+        yield text((BORDER + fraction * WIDTH, y + 16), label, "", f' text-anchor="{anchor}"')

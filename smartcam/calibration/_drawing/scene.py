@@ -23,16 +23,16 @@ WIDTH, HEIGHT = 900.0, 560.0
 """Largest width and height of a scene, pixels."""
 
 BORDER, HEAD, FOOT = 40.0, 56.0, 50.0
-"""Pixels beside, above and below the scene."""
+"""Margins beside, above and below the scene, pixels."""
 
 AZIMUTH, ELEVATION = math.radians(-38.0), math.radians(24.0)
 """Direction of the viewer: angle about the vertical, and angle above the ground."""
 
-FRUSTUM: Final = 0.16
+FRUSTUM_RATIO: Final = 0.16
 """Length of a camera's frustum, as a part of the scene's extent; with many cameras it is
 shorter."""
 
-ARROW: Final = 0.12
+AXIS_RATIO: Final = 0.12
 """Length of the axes of a frame, as a part of the scene's extent."""
 
 LETTER_PX: Final = (7.5, 15.0)
@@ -46,7 +46,7 @@ LABEL_TRIAL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
 ]
-"""Further offsets of a label, pixels; the first free one is used."""
+"""Offsets of a label that are tried, pixels; the first free place is used."""
 
 
 class DrawnBoard(NamedTuple):
@@ -54,7 +54,7 @@ class DrawnBoard(NamedTuple):
 
     name: str
     corners: Array  # (4, 3), metres
-    off: bool = False  # True if it was left out of the calibration
+    is_left_out: bool = False  # True if it was left out of the calibration
 
 
 class DrawnCamera(NamedTuple):
@@ -73,7 +73,7 @@ class Axes(NamedTuple):
 
 
 class DrawnScene(NamedTuple):
-    """The objects of one drawing, in a frame of the drawing's own."""
+    """The objects of one drawing, in a common frame."""
 
     boards: Sequence[DrawnBoard]
     cameras: Sequence[DrawnCamera]
@@ -82,11 +82,11 @@ class DrawnScene(NamedTuple):
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
 
 
-class _Drawn(NamedTuple):
+class _DrawnObject(NamedTuple):
     depth: float
     svg: str
     label: str
-    at: Array  # (2,), pixels
+    label_place: Array  # (2,), pixels
 
 
 class _ViewerProjection:
@@ -95,28 +95,30 @@ class _ViewerProjection:
     def __init__(self, scene: DrawnScene, points: Array) -> None:
         # make the scene upright (z up), turn it about the vertical, and tilt it towards the viewer
         up = np.array(scene.up)
-        ahead = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
-        side = np.cross(ahead, up)
-        upright = np.array([side, ahead, up])
+        forward = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
+        side = np.cross(forward, up)
+        upright = np.array([side, forward, up])
         turn, rise = (
             (math.cos(AZIMUTH), math.sin(AZIMUTH)),
             (math.cos(ELEVATION), math.sin(ELEVATION)),
         )
-        around = np.array([[turn[0], -turn[1], 0.0], [turn[1], turn[0], 0.0], [0.0, 0.0, 1.0]])
-        tilted = np.array([[1.0, 0.0, 0.0], [0.0, rise[0], -rise[1]], [0.0, rise[1], rise[0]]])
-        self.axes: Array = tilted @ around @ upright  # axes of the viewer: right, away, up
-        seen = points @ self.axes.T
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        about_vertical = np.array(
+            [[turn[0], -turn[1], 0.0], [turn[1], turn[0], 0.0], [0.0, 0.0, 1.0]]
+        )
+        tilt = np.array([[1.0, 0.0, 0.0], [0.0, rise[0], -rise[1]], [0.0, rise[1], rise[0]]])
+        self.axes: Array = tilt @ about_vertical @ upright  # axes of the viewer: right, away, up
+        viewer_points = points @ self.axes.T
+        low, high = viewer_points.min(axis=0), viewer_points.max(axis=0)
         span = np.maximum(high - low, 1e-9)
         self.zoom = float(min(WIDTH / span[0], HEIGHT / span[2]))
-        self.middle: Array = (low + high) / 2
+        self.centre: Array = (low + high) / 2
 
     def pixels(self, points: Array) -> Array:
         """Project points (..., 3) to pixels (..., 2)."""
-        seen = points @ self.axes.T - self.middle
-        centre = np.array([BORDER + WIDTH / 2, HEAD + HEIGHT / 2])
-        places: Array = centre + seen[..., [0, 2]] * [self.zoom, -self.zoom]
-        return places
+        viewer_points = points @ self.axes.T - self.centre
+        image_centre = np.array([BORDER + WIDTH / 2, HEAD + HEIGHT / 2])
+        projected: Array = image_centre + viewer_points[..., [0, 2]] * [self.zoom, -self.zoom]
+        return projected
 
     def depth(self, points: Array) -> float:
         """Return the mean depth of points along the line of sight."""
@@ -125,42 +127,49 @@ class _ViewerProjection:
 
 def draw_scene(scene: DrawnScene, title: str) -> str:
     """Draw a scene: cameras in orange, boards in blue, dashed if they were left out."""
-    places = np.concatenate(
+    points = np.concatenate(
         [
             *(board.corners for board in scene.boards),
             *(np.atleast_2d(camera.pose.translation) for camera in scene.cameras),
             *(np.atleast_2d(axes.pose.translation) for axes in scene.axes),
         ]
     )
-    extent = float(np.ptp(places, axis=0).max()) or 1.0
-    length = extent * FRUSTUM / (1.0 if len(scene.cameras) < 4 else 2.0)
-    shapes = [_frustum(camera, length) for camera in scene.cameras]
-    ends = [axes.pose.apply(ARROW * extent * np.eye(3)) for axes in scene.axes]
-    sight = _ViewerProjection(scene, np.concatenate([places, *shapes, *ends]))
-    items = [
-        _Drawn(
-            sight.depth(board.corners),
-            polygon(sight.pixels(board.corners), "board-off" if board.off else "board", board.name),
+    extent = float(np.ptp(points, axis=0).max()) or 1.0
+    length = extent * FRUSTUM_RATIO / (1.0 if len(scene.cameras) < 4 else 2.0)
+    frustums = [_frustum(camera, length) for camera in scene.cameras]
+    axis_tips = [axes.pose.apply(AXIS_RATIO * extent * np.eye(3)) for axes in scene.axes]
+    projection = _ViewerProjection(scene, np.concatenate([points, *frustums, *axis_tips]))
+    objects = [
+        _DrawnObject(
+            projection.depth(board.corners),
+            polygon(
+                projection.pixels(board.corners),
+                "board-off" if board.is_left_out else "board",
+                board.name,
+            ),
             board.name,
-            sight.pixels(board.corners.mean(axis=0)),
+            projection.pixels(board.corners.mean(axis=0)),
         )
         for board in scene.boards
     ]
-    items += [
-        _camera(sight, camera, shape) for camera, shape in zip(scene.cameras, shapes, strict=True)
+    objects += [
+        _draw_camera(projection, camera, frustum)
+        for camera, frustum in zip(scene.cameras, frustums, strict=True)
     ]
-    items.sort(key=lambda item: -item.depth)  # draw far objects first
-    parts = [text((BORDER, 28), title, "title")] if title else []
-    parts += [item.svg for item in items]
-    for axes, tips in zip(scene.axes, ends, strict=True):
-        start = sight.pixels(axes.pose.translation)
-        for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
-            parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
-            items.append(_Drawn(0.0, "", axis, tip))
-        items.append(_Drawn(0.0, "", axes.name, start + LABEL_OFFSET_PX))
-    parts += _labels([(item.label, item.at) for item in items[::-1] if item.label])
-    parts += _scale(sight)
-    return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
+    objects.sort(key=lambda object_: -object_.depth)  # draw far objects first
+    elements = [text((BORDER, 28), title, "title")] if title else []
+    elements += [object_.svg for object_ in objects]
+    for axes, tips in zip(scene.axes, axis_tips, strict=True):
+        start = projection.pixels(axes.pose.translation)
+        for tip, axis in zip(projection.pixels(tips), "xyz", strict=True):
+            elements.append(line(start, tip, "axis", ' stroke-width="1.5"'))
+            objects.append(_DrawnObject(0.0, "", axis, tip))
+        objects.append(_DrawnObject(0.0, "", axes.name, start + LABEL_OFFSET_PX))
+    elements += _labels(
+        [(object_.label, object_.label_place) for object_ in objects[::-1] if object_.label]
+    )
+    elements += _scale_bar(projection)
+    return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, elements)
 
 
 def _frustum(camera: DrawnCamera, length: float) -> Array:
@@ -168,43 +177,50 @@ def _frustum(camera: DrawnCamera, length: float) -> Array:
     x, y = 0.5, 0.375  # coordinates of a corner at depth 1
     if camera.model is not None:
         x, y = (math.tan(min(view_angle, 2.0) / 2) for view_angle in camera.model.field_of_view)
-    rim = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
-    return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *rim]))
+    corners = [[-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
+    return camera.pose.apply(length * np.array([[0.0, 0.0, 0.0], *corners]))
 
 
-def _camera(sight: _ViewerProjection, camera: DrawnCamera, shape: Array) -> _Drawn:
-    centre, *rim = sight.pixels(shape)
-    sides = [line(centre, corner, "camera") for corner in rim]
-    svg = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
-    return _Drawn(sight.depth(shape), svg, camera.name, centre + LABEL_OFFSET_PX)
+def _draw_camera(
+    projection: _ViewerProjection, camera: DrawnCamera, frustum: Array
+) -> _DrawnObject:
+    centre, *corners = projection.pixels(frustum)
+    sides = [line(centre, corner, "camera") for corner in corners]
+    svg = "".join([polygon(np.array(corners), "camera", camera.name), *sides])
+    return _DrawnObject(projection.depth(frustum), svg, camera.name, centre + LABEL_OFFSET_PX)
 
 
-def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
-    """Yield labels that cover no other label; those without room are left out."""
-    occupied: list[tuple[float, float, float, float]] = []
+def _labels(labels: Sequence[tuple[str, Array]]) -> Iterator[str]:
+    """Yield labels that do not cover each other; labels without room are left out."""
+    boxes: list[tuple[float, float, float, float]] = []
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
-    for label, at in wanted:
+    for label, place in labels:
         width, height = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
         for offset in LABEL_TRIAL_OFFSETS_PX:
-            x, y = at + offset
+            x, y = place + offset
             box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-            outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
-            if not outside and not any(_overlap(box, placed) for placed in occupied):
-                occupied.append(box)
+            is_outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]
+            if not is_outside and not any(_overlap(box, other) for other in boxes):
+                boxes.append(box)
                 if math.hypot(*offset) > 25:
-                    yield line(at, (x, y), "axis", ' stroke-opacity="0.6"')
+                    yield line(place, (x, y), "axis", ' stroke-opacity="0.6"')
                 yield text((x, y + 5), label, "halo", ' text-anchor="middle"')
                 break
 
 
-def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+def _overlap(first: Sequence[float], second: Sequence[float]) -> bool:
+    return (
+        first[0] < second[2]
+        and second[0] < first[2]
+        and first[1] < second[3]
+        and second[1] < first[3]
+    )
 
 
-def _scale(sight: _ViewerProjection) -> Iterator[str]:
-    metres = round_down(0.2 * WIDTH / sight.zoom)
+def _scale_bar(projection: _ViewerProjection) -> Iterator[str]:
+    metres = round_down(0.2 * WIDTH / projection.zoom)
     start = np.array([BORDER, HEAD + HEIGHT + 30])
-    end = start + np.array([metres * sight.zoom, 0.0])
+    end = start + np.array([metres * projection.zoom, 0.0])
     yield line(start, end, "axis", ' stroke-width="2"')
     yield text((end[0] + 10, end[1] + 5), f"{1e3 * metres:g} mm")

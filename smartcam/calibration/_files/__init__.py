@@ -1,1 +1,1 @@
-"""Keep calibrations in files: written whole or not at all, and never misread."""
+"""Keep calibrations in files, which are written whole or not at all and checked by a hash."""

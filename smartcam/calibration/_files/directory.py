@@ -1,7 +1,7 @@
 """Map the names of calibrations, which clients choose, to files in one folder.
 
-A name never leads out of the folder. A name with other letters is refused before anything is
-opened, and so is a symbolic link inside the folder.
+A name never leads out of the folder: names with characters beyond :data:`NAME`, and symbolic links
+inside of the folder, are refused before anything is opened.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
 
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
-"""Pattern of a name: no dot, no slash, and no other letter with a meaning to a file system."""
+"""Pattern of a name: no dot, no slash, and no other character with a meaning to a file system."""
 
 MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""
@@ -36,13 +36,13 @@ class Folder:
     """A folder of calibrations, which is created if it does not exist.
 
     Args:
-        path: the folder. It is the user's own choice, so it may be a symbolic link.
+        path: the folder; it may be a symbolic link, since the user chooses it.
 
     Attributes:
         path: the folder, absolute.
 
     Raises:
-        ConfigurationError: the path is no path.
+        ConfigurationError: ``path`` is no path.
         OSError: the folder cannot be created.
     """
 
@@ -58,15 +58,15 @@ class Folder:
         return sorted(file.stem for file in files if _is_name(file.stem))
 
     def calibration(self, name: str) -> Path:
-        """Return the file of a calibration.
+        """Return the path of a calibration's file.
 
         Raises:
             CalibrationError: ``BAD_NAME``.
         """
-        return self._within(f"{_checked(name)}.json")
+        return self._safe_path(f"{_check_name(name)}.json")
 
     def journal(self, name: str, wizard: str = "") -> Path:
-        """Return the journal of a wizard.
+        """Return the path of a wizard's journal.
 
         Args:
             name: name of the calibration.
@@ -75,19 +75,19 @@ class Folder:
         Raises:
             CalibrationError: ``BAD_NAME``.
         """
-        of = f"{_checked(name)}.{_checked(wizard)}" if wizard else _checked(name)
-        return self._within(f"{of}.journal")
+        stem = f"{_check_name(name)}.{_check_name(wizard)}" if wizard else _check_name(name)
+        return self._safe_path(f"{stem}.journal")
 
     def checks(self, name: str) -> Path:
-        """Return the file of a calibration's checks.
+        """Return the path of the file of a calibration's checks.
 
         Raises:
             CalibrationError: ``BAD_NAME``.
         """
-        return self._within(f"{_checked(name)}.checks.jsonl")
+        return self._safe_path(f"{_check_name(name)}.checks.jsonl")
 
     def export(self, target: str) -> Path:
-        """Return the file that an export is written to; create its folder.
+        """Return the path that an export is written to; create its folder.
 
         Args:
             target: name of the file, with the suffix ``.json`` or ``.yaml``.
@@ -100,12 +100,12 @@ class Folder:
         stem, dot, suffix = target.rpartition(".")
         if f"{dot}{suffix}" not in _SUFFIXES:
             raise _bad_name_error(target, f"a name that ends in one of {', '.join(_SUFFIXES)}")
-        path = self._within(EXPORTS, f"{_checked(stem)}.{suffix}")
+        path = self._safe_path(EXPORTS, f"{_check_name(stem)}.{suffix}")
         path.parent.mkdir(exist_ok=True)
         return path
 
     def find(self, name_or_path: str) -> Path:
-        """Return the file of a calibration by its name, or an exported one by its path.
+        """Return the path of a calibration, by its name, or of an exported file.
 
         Args:
             name_or_path: ``NAME``, or ``exports/NAME.json``.
@@ -126,7 +126,8 @@ class Folder:
             )
         return path
 
-    def _within(self, *parts: str) -> Path:
+    def _safe_path(self, *parts: str) -> Path:
+        """Return a path inside the folder; raise BAD_NAME if it leads through a symbolic link."""
         path = self.path
         for part in parts:
             path /= part
@@ -141,7 +142,8 @@ def _is_name(text: str) -> bool:
     )
 
 
-def _checked(name: str) -> str:
+def _check_name(name: str) -> str:
+    """Return the name; raise BAD_NAME for one that is not allowed."""
     if not _is_name(name):
         raise _bad_name_error(name, f"1 to {MAX_NAME_LENGTH} letters, digits, '-' and '_'")
     return name

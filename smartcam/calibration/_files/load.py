@@ -9,7 +9,7 @@ from smartcam._arguments import check_path
 from smartcam.calibration._files.store import Document, read_document
 from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.calibration._verdict import warn
+from smartcam.calibration._verdict import warn_unless_good
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def of_document(document: Document, name: str) -> AnyCalibration:
     """
     if document.kind in KINDS:
         calibration = KINDS[document.kind].from_data(document.data)
-        warn(calibration, name)
+        warn_unless_good(calibration, name)
         return calibration
     expected = " or ".join(map(repr, KINDS))
     raise Code.WRONG_KIND.refusal(

@@ -1,7 +1,7 @@
-"""Write calibrations to files of their own, and name the forms of their fields.
+"""Save calibrations to files, and list the forms in which their fields are stored.
 
-The forms are those of ``smartcam/geometry/_stored.py``, which explains them. This module repeats
-their names, since ``storage.rows`` reads better in a list of fields than ``rows``.
+The forms are those of ``smartcam/geometry/_stored.py``, which explains them. They are imported here
+only so that ``storage.rows`` can be written instead of ``rows``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from smartcam.calibration._files import store
 from smartcam.calibration._targets import Target, target_from_data, target_to_data
-from smartcam.calibration._verdict import warn
+from smartcam.calibration._verdict import warn_unless_good
 from smartcam.geometry._inside import (
     AsList as AsList,
 )
@@ -108,13 +108,13 @@ if TYPE_CHECKING:
 
 
 class SavedCalibration(Stored):
-    """A calibration that has files of its own."""
+    """A calibration that can be saved to a file."""
 
     kind: ClassVar[str]
-    """Name of the calibration's kind of file in the store."""
+    """Kind of the calibration, as its file names it."""
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration to a file, whole or not at all, as the store does."""
+        """Write the calibration to a file, whole or not at all."""
         store.write(path, self.kind, self.to_data())
 
     @classmethod
@@ -126,7 +126,7 @@ class SavedCalibration(Stored):
             OSError: the file does not exist, or cannot be read.
         """
         calibration = cls.from_data(store.read(path, cls.kind))
-        warn(calibration, str(path))
+        warn_unless_good(calibration, str(path))
         return calibration
 
 

@@ -1,8 +1,8 @@
 """Write files of calibrations whole or not at all, and never misread one.
 
 A file is JSON: ``schema``, ``schema_version``, ``kind``, ``written_at``, ``units``, ``software``,
-``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with as many
-digits as it takes to read the same bits again; NaN and infinity, which JSON lacks, are refused.
+``context``, ``data`` and ``sha256``, the hash of all the rest. Floats are written with so
+many digits that reading gives the same bits; NaN and infinity, which JSON lacks, are refused.
 
 :mod:`smartcam._whole_files` replaces files and keeps earlier ones.
 """
@@ -32,10 +32,10 @@ SCHEMA = "smartcam.calibration"
 """Value of ``schema`` in every file."""
 
 SCHEMA_VERSION = (1, 0)
-"""Major and minor; a file of a newer major is refused, one of a newer minor is read."""
+"""Major and minor version: files of a newer major version are refused, newer minor ones read."""
 
 UNITS: Mapping[str, str] = {"length": "m", "angle": "rad", "time": "s"}
-"""Units of everything in a file, unless the name of a field says otherwise."""
+"""Units of the numbers in a file, unless the name of a field ends in another unit."""
 
 BACKUPS = 3
 """Number of earlier versions of a file that are kept."""
@@ -44,7 +44,7 @@ MAX_FILE_BYTES = 1 << 24
 """A file has at most this many bytes: a calibration of 10,000 touches needs a quarter of them."""
 
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
-"""Functions, by major version, that make a file's content that of the next major version."""
+"""Functions that convert a file's content to the next major version, by major version."""
 
 _PACKAGES = ("smartcam", "numpy", "scipy", "opencv-python-headless")
 
@@ -82,10 +82,10 @@ def write(
 ) -> None:
     """Write a file, and keep the previous one as a backup.
 
-    The folder of ``path`` must exist. ``data`` must be possible as JSON, with finite numbers in SI
-    units; ``context`` is stored with them: frames, tool, raw samples. Raises ``NOT_STORABLE`` if
-    the data are not possible as JSON or too large; ``NOT_WRITTEN`` or ``IN_USE``, which leave the
-    previous file in place.
+    The folder of ``path`` must exist. ``data`` must be JSON data with finite numbers in SI units;
+    ``context`` is stored with them: frames, tool, raw samples. Raises ``NOT_STORABLE`` if the data
+    are no JSON data, or too large; ``NOT_WRITTEN`` or ``IN_USE``, which leave the previous file in
+    place.
     """
     content = {
         "schema": SCHEMA,
@@ -147,8 +147,8 @@ def read_document(path: StrPath) -> Document:
     if content.get("schema") != SCHEMA:
         raise _broken_file_error(path, f"schema {content.get('schema')!r}, expected {SCHEMA!r}")
     version = _version(path, content.get("schema_version"))
-    stated = content.pop("sha256", None)
-    if stated != _digest(content):
+    stored_hash = content.pop("sha256", None)
+    if stored_hash != _digest(content):
         raise _broken_file_error(
             path, "its hash does not match: it was damaged, or changed by hand"
         )
@@ -205,27 +205,27 @@ def _software() -> dict[str, str]:
 
 
 def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
-    """Put a file in the place of another, whole or not at all; a symbolic link is replaced.
+    """Write a file, in place of one of that name, whole or not at all; replace a symbolic link.
 
     Raises ``NOT_WRITTEN`` if the file cannot be written, or ``IN_USE`` if another process keeps
     writing in the folder. Either leaves the previous file in place.
     """
-    with _written(path):
+    with _calibration_errors(path):
         _whole_files.replace_file(path, body, backups=backups)
 
 
 def keep_backup(path: Path, count: int) -> None:
-    """Copy a file to ``NAME.1``, and move the one before to ``NAME.2``, up to ``count``.
+    """Copy a file to ``NAME.1``; move earlier copies to ``NAME.2`` and so on, up to ``count``.
 
     Does nothing if the file does not exist. Raises the errors of :func:`replace_file`.
     """
-    with _written(path):
+    with _calibration_errors(path):
         _whole_files.keep_backup(path, count)
 
 
 @contextlib.contextmanager
-def _written(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into a CalibrationError."""
+def _calibration_errors(path: Path) -> Iterator[None]:
+    """Raise an error of the file system as a CalibrationError."""
     try:
         yield
     except _whole_files.FolderInUseError as exc:

@@ -1,4 +1,4 @@
-"""Calibrate the pose of a camera on a robot's hand, or of one beside the robot.
+"""Calibrate the pose of a camera on a robot's hand, or of a fixed camera beside the robot.
 
 ::
 
@@ -25,42 +25,42 @@ from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
     MIN_POSES,
     check_motion,
-    of_one_place,
-    scale_of,
-    second_turns,
+    estimate_scale,
+    left_out_second_axis_turns,
+    same_place_indices,
 )
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     PoseObservations,
     RobotPoses,
     RobotSigmas,
-    bends,
+    bend_heights,
+    derivatives_by_parameters,
     is_in_hand,
-    pull,
 )
 from smartcam.calibration._hand_eye.model_selection import (
     MAX_FOLDS,
     METHODS,
     NOTHING,
     Problem,
-    candidates,
+    fit_candidates,
 )
 from smartcam.calibration._hand_eye.result import HandEyeCalibration, as_transform
 from smartcam.calibration._hand_eye.validation import (
+    as_target_poses,
     check_poses,
     expected_error,
+    find_other_numbering,
     max_plausible_error,
-    other_numbering,
     poor_fit_error,
-    seen_poses,
 )
-from smartcam.calibration._jackknife import jackknife, weighed_jackknife
+from smartcam.calibration._jackknife import jackknife, weighted_jackknife
 from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.poses import CAMERA, TARGET, half_turn, half_turned, locate
-from smartcam.calibration._lens.projection import excess, whitening
-from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, Sheet
-from smartcam.calibration._lens.suspicions import without_strays
+from smartcam.calibration._lens.projection import excess_variance, whitening
+from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, SheetOption
+from smartcam.calibration._lens.suspicions import remove_strays
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.validation import check_positive
 from smartcam.calibration._statistics import common_move
@@ -83,29 +83,28 @@ if TYPE_CHECKING:
     from smartcam.models import Pose
 
 POSES_PER_EXTRA_REMOVAL = 100
-"""One bad pose, and one more for each of this many poses, is left out before the others are solved
-again."""
+"""Before each new solution one bad pose is left out, and one more for each of this many poses."""
 
 MIN_ADVISED_POSES = 8
 """With fewer poses than this, the residuals say little about the error."""
 
 MIN_ADVISED_TURN_RADIANS = math.radians(8.0)
-"""Least RMS turn of the poses about the second of their axes without a remark; leaving out some of
-eight poses changes it by two or three degrees."""
+"""A smaller RMS turn of the poses about the second of their axes is remarked on; leaving out some
+of eight poses changes it by two or three degrees."""
 
 MAX_SCALE_ERROR = 0.2
-"""A target's size may be off by this part unless the user gives another."""
+"""Default of the part by which a target's size may be off."""
 
 REMARKED_SCALE_ERROR = 0.005
 """A target's size that differs from the nominal one by more than this part is remarked on."""
 
 REMARKED_SCALE_SIGMAS = 5.0
-"""A target's size is remarked on, if it is not adjusted, when it differs by this many standard
+"""A target's size that is not adjusted is remarked on if it differs by this many standard
 deviations."""
 
 BAD_POSE_RATIO = 4.0
-"""A pose is bad if its held-out error is more than this many times the median: of normal errors
-along two axes, one in 60000 is."""
+"""A pose is bad if its held-out error is more than this many times the median, as one in 60000
+normal errors along two axes is."""
 
 ROUNDING_ERROR_M = 1e-7
 """Errors below this length, metres, may be rounding errors."""
@@ -114,17 +113,17 @@ MAX_BAD_POSE_SHARE = 1 / 3
 """At most this part of the poses may be left out."""
 
 MIN_GOOD_POSES = 5
-"""At least this many poses must be left after leaving out those that belong to other views."""
+"""At least this many poses must remain after those that belong to other views are left out."""
 
 MIN_POSES_FOR_ERROR = 5
-"""The scatter of at least this many poses gives an expected error."""
+"""The covariance is estimated from the scatter of at least this many poses."""
 
 WEIGHT_POWER = 1 / 2
 """Power of a pose's weight in the covariance: errors of poses are independent of each other."""
 
 POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
 """Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
-beyond what they cause is remarked on."""
+that is larger than they cause is remarked on."""
 
 ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Standard deviations (rad, m) of target poses without a covariance: only their ratio counts."""
@@ -197,61 +196,65 @@ def calibrate_hand_eye(
     views = as_views(views, "hand-eye")
     check_positive(allowed_error, "allowed_error", "metres")
     check_positive(most_scale, "most_scale", "parts of its size")
-    transforms, order, robot = _robot(robot_poses, len(views), "views", setup)
+    transforms, order, robot = _check_robot_poses(robot_poses, len(views), "views", setup)
     if any(view.target != views[0].target for view in views):
         raise Code.DIFFERENT_TARGETS.refusal(
             "hand-eye: expected views of one target, got views of several", views[0].target
         )
     ordered = [views[i] for i in order]
-    lens, lens_calibration, of_sheet = camera, None, list[Remark]()
+    lens, lens_calibration, sheet_remarks = camera, None, list[Remark]()
     if lens is None:
-        # A sheet bent by a tenth of a millimetre, which views cannot show, makes cameras 1.7 mm off
-        # where 0.7 mm are expected, if the views alone tell the lens (measured in simulation).
-        few = len(ordered[0].target.points) <= MAX_FREE_POINTS
-        alone: Sheet = "free" if few else "exact"
+        # If the views alone determine the lens, a sheet bent by 0.1 mm, which views cannot show,
+        # makes the camera's error 1.7 mm where 0.7 mm are expected (simulated).
+        can_adjust_sheet = len(ordered[0].target.points) <= MAX_FREE_POINTS
+        sheet_option: SheetOption = "free" if can_adjust_sheet else "exact"
         lens_calibration = calibrate_intrinsics(
-            ordered, sheet="auto" if adjust == "auto" else alone
+            ordered, sheet="auto" if adjust == "auto" else sheet_option
         )
         lens = lens_calibration.camera
-        of_sheet = [
+        sheet_remarks = [
             warning for warning in lens_calibration.warnings if warning.code == Code.SHEET_NOT_EXACT
         ]
     located = [locate(view, lens) for view in ordered]
     if ordered[0].target.half_turn_symmetric:
-        ordered = _numbered_alike(ordered, robot, located)
+        ordered = _renumber_views(ordered, robot, located)
         located = [locate(view, lens) for view in ordered]
         views = [ordered[i] for i in np.argsort(order)]
-    ordered, strays = without_strays(ordered, located, lens, given=camera is not None)
-    located = [locate(view, lens) for view in ordered] if strays else located
+    ordered, stray_remarks = remove_strays(ordered, located, lens, is_lens_given=camera is not None)
+    located = [locate(view, lens) for view in ordered] if stray_remarks else located
     poses = Rigid.stacked(view.transform.rigid for view in located)
-    seen = _observations(ordered, located, lens)
+    observations = _pixel_observations(ordered, located, lens)
     problem = Problem(
         robot=robot,
-        seen=seen,
-        poses=poses,
-        given=_given_points(ordered),
-        sigmas=_positive(robot_sigmas),
-        lens=None if lens_calibration is None else lens_calibration.covariance,
+        observations=observations,
+        target_poses=poses,
+        point_mask=_point_mask(ordered),
+        robot_sigmas=_check_sigmas(robot_sigmas),
+        lens_covariance=None if lens_calibration is None else lens_calibration.covariance,
     )
-    named = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
-    bend_places = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
+    names = [view.name or f"pose {i}" for i, view in zip(order, ordered, strict=True)]
+    distortion_numbers = [5 + i for i in np.flatnonzero(lens.distortion).tolist()]
     if lens_calibration is not None:
         # a sheet bent by 0.15 mm would bend a lens that takes it as flat
-        bend_places += [5 + len(lens.distortion) + i for i in range(seen.heights.shape[2])]
-    free = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *bend_places)}
-    free["scale and camera"] = (0, *free["camera"])
+        distortion_numbers += [
+            5 + len(lens.distortion) + i for i in range(observations.heights.shape[2])
+        ]
+    parameter_choices = {NOTHING: (), "scale": (0,), "camera": (1, 2, 3, 4, *distortion_numbers)}
+    parameter_choices["scale and camera"] = (0, *parameter_choices["camera"])
     if lens_calibration is not None and adjust == "auto":
-        # The robot's motions tell a lens better than views of a bent sheet do: where it bends anew
-        # by 0.5 mm, cameras are 0.9 mm off instead of 1.8 (simulated).
-        del free[NOTHING], free["scale"]
-    request = _Asked(_allowed(free, adjust), method, drop_bad, order, most_scale)
-    result = _without_bad(problem, request, named, transforms, ordered)
+        # The robot's motions determine a lens better than views of a bent sheet: if the sheet bends
+        # anew by 0.5 mm, cameras are 0.9 mm off instead of 1.8 mm (simulated).
+        del parameter_choices[NOTHING], parameter_choices["scale"]
+    options = _HandEyeOptions(
+        _choices_of(parameter_choices, adjust), method, drop_bad, order, most_scale
+    )
+    result = _calibrate_without_bad(problem, options, names, transforms, ordered)
     remarks = [] if camera is None else _lens_remarks(camera, result.camera)
     if remarks:
-        strays = [outlier for outlier in strays if outlier.code != Code.WRONG_LENS]
+        stray_remarks = [remark for remark in stray_remarks if remark.code != Code.WRONG_LENS]
     return dataclasses.replace(
         result,
-        warnings=(*result.warnings, *remarks, *of_sheet, *strays),
+        warnings=(*result.warnings, *remarks, *sheet_remarks, *stray_remarks),
         views=tuple(views),
         target_poses=tuple(located[i].transform for i in np.argsort(order)),
         allowed_error=allowed_error,
@@ -300,31 +303,33 @@ def calibrate_hand_eye_from_poses(
     Raises:
         CalibrationError: as for :func:`calibrate_hand_eye`.
     """
-    target_poses = seen_poses(target_poses)
+    target_poses = as_target_poses(target_poses)
     check_positive(allowed_error, "allowed_error", "metres")
     check_positive(most_scale, "most_scale", "parts of its size")
-    transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
-    seen = [target_poses[i] for i in order]
-    poses = Rigid.stacked(pose.rigid for pose in seen)
+    transforms, order, robot = _check_robot_poses(
+        robot_poses, len(target_poses), "poses of the target", setup
+    )
+    ordered = [target_poses[i] for i in order]
+    poses = Rigid.stacked(pose.rigid for pose in ordered)
     scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
-    white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
+    whitening = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
         robot=robot,
-        seen=PoseObservations(white, poses),
-        poses=poses,
-        sigmas=_positive(robot_sigmas),
+        observations=PoseObservations(whitening, poses),
+        target_poses=poses,
+        robot_sigmas=_check_sigmas(robot_sigmas),
     )
-    named = [f"pose {i}" for i in order]
-    free = _allowed({NOTHING: (), "scale": (0,)}, adjust)
-    request = _Asked(free, method, drop_bad, order, most_scale)
+    names = [f"pose {i}" for i in order]
+    parameter_choices = _choices_of({NOTHING: (), "scale": (0,)}, adjust)
+    options = _HandEyeOptions(parameter_choices, method, drop_bad, order, most_scale)
     return dataclasses.replace(
-        _without_bad(problem, request, named, transforms, seen),
+        _calibrate_without_bad(problem, options, names, transforms, ordered),
         target_poses=tuple(Transform(CAMERA, TARGET, *pose.rigid) for pose in target_poses),
         allowed_error=allowed_error,
     )
 
 
-def _robot(
+def _check_robot_poses(
     robot_poses: Sequence[Transform | Pose], count: int, label: str, setup: str
 ) -> tuple[list[Transform], list[int], RobotPoses]:
     """Return the robot's poses, an order that depends only on their values, and the sorted poses.
@@ -358,185 +363,193 @@ def _robot(
     return transforms, order, robot
 
 
-def _positive(sigmas: RobotSigmas | None) -> RobotSigmas | None:
+def _check_sigmas(sigmas: RobotSigmas | None) -> RobotSigmas | None:
     if sigmas is None:
         return None
-    given = as_vector(sigmas, 2, "robot_sigmas")
-    if not (given > 0).all():
+    values = as_vector(sigmas, 2, "robot_sigmas")
+    if not (values > 0).all():
         raise Code.NOT_FINITE.unexpected(
             "robot_sigmas: expected two positive numbers, radians and metres",
             "two positive numbers",
-            tuple(given.tolist()),
+            tuple(values.tolist()),
         )
-    return RobotSigmas(*given.tolist())
+    return RobotSigmas(*values.tolist())
 
 
-def _numbered_alike(
+def _renumber_views(
     views: Sequence[TargetView], robot: RobotPoses, located: Sequence[TargetPose]
 ) -> list[TargetView]:
-    """Return views with one origin, for a target that looks the same after half a turn."""
+    """Return the views of a target that looks the same after half a turn, numbered from one end."""
     target = views[0].target
     poses = Rigid.stacked(view.transform.rigid for view in located)
     lever = float(np.ptp(target.points, axis=0).max())
-    other = other_numbering(robot, poses, half_turn(target), lever).tolist()
+    turned_mask = find_other_numbering(robot, poses, half_turn(target), lever).tolist()
     return [
-        half_turned(view) if turned else view for view, turned in zip(views, other, strict=True)
+        half_turned(view) if is_turned else view
+        for view, is_turned in zip(views, turned_mask, strict=True)
     ]
 
 
-def _given_points(views: Sequence[TargetView]) -> Any:
+def _point_mask(views: Sequence[TargetView]) -> Any:
     counts = np.array([len(view.ids) for view in views])
     return np.arange(counts.max())[None] < counts[:, None]
 
 
-def _observations(
+def _pixel_observations(
     views: Sequence[TargetView], located: Sequence[TargetPose], camera: CameraModel
 ) -> PixelObservations:
-    """Return the views' points, with noise as large as the views themselves show."""
+    """Return the views' points, weighted by the noise that the views show."""
     residuals = np.concatenate([view.residuals for view in located])
     noise = np.concatenate([view.covariance for view in views])
-    more = excess(residuals, noise, residuals.size - 6 * len(views))
-    given = _given_points(views)
-    points, pixels = np.zeros((*given.shape, 3)), np.zeros((*given.shape, 2))
-    white = np.zeros((*given.shape, 2, 2))
+    extra_variance = excess_variance(residuals, noise, residuals.size - 6 * len(views))
+    point_mask = _point_mask(views)
+    points, pixels = np.zeros((*point_mask.shape, 3)), np.zeros((*point_mask.shape, 2))
+    whitening_matrices = np.zeros((*point_mask.shape, 2, 2))
     for index, view in enumerate(views):
         points[index], pixels[index] = view.object_points[0], view.points[0]
-        mask = given[index]
-        points[index, mask], pixels[index, mask] = view.object_points, view.points
-        white[index, mask] = whitening(view.covariance, more)
-    return PixelObservations(white, camera, points, pixels, bends(points, given))
+        seen_points = point_mask[index]
+        points[index, seen_points], pixels[index, seen_points] = view.object_points, view.points
+        whitening_matrices[index, seen_points] = whitening(view.covariance, extra_variance)
+    return PixelObservations(
+        whitening_matrices, camera, points, pixels, bend_heights(points, point_mask)
+    )
 
 
-def _allowed(free: Mapping[str, tuple[int, ...]], adjust: str) -> dict[str, tuple[int, ...]]:
-    check_choice(adjust, ["auto", *free], "adjust")
-    return dict(free) if adjust == "auto" else {adjust: free[adjust]}
+def _choices_of(
+    parameter_choices: Mapping[str, tuple[int, ...]], adjust: str
+) -> dict[str, tuple[int, ...]]:
+    check_choice(adjust, ["auto", *parameter_choices], "adjust")
+    return dict(parameter_choices) if adjust == "auto" else {adjust: parameter_choices[adjust]}
 
 
-class _Asked(NamedTuple):
+class _HandEyeOptions(NamedTuple):
     """The options that the user gave."""
 
-    # values that may be adjusted, with the numbers of their parameters
-    free: Mapping[str, tuple[int, ...]]
+    # values that may be adjusted, such as ``scale``, with the numbers of their parameters
+    parameter_choices: Mapping[str, tuple[int, ...]]
     method: str  # name of the method, or ``auto``
     drop_bad: bool  # whether bad poses are left out
-    order: list[int]  # numbers of the given poses in the order of their values
+    order: list[int]  # indices of the given poses, sorted by the values of the poses
     most_scale: float  # part by which the target's size may be off
 
 
-def _without_bad(
+def _calibrate_without_bad(
     problem: Problem,
-    request: _Asked,
-    named: Sequence[str],
+    options: _HandEyeOptions,
+    names: Sequence[str],
     transforms: Sequence[Transform],
-    seen: Sequence[TargetView | Transform],
+    views: Sequence[TargetView | Transform],
 ) -> HandEyeCalibration:
     """Return the calibration from the poses that are not bad, with the errors of all poses.
 
-    ``transforms`` are the robot's poses as given, all else is in the order of their values. Raises
-    ``SCALE_MISMATCH``, besides the errors of poses that do not fit.
+    ``transforms`` are the robot's poses as given; all other arguments are in ``options.order``.
+    Raises ``SCALE_MISMATCH``, and the errors of poses that do not fit.
     """
-    robot_poses = [transforms[i] for i in request.order]
-    used, remarks = _start_poses(problem, request, named)
-    result = _solved(problem.subset(used), request, robot_poses[0])
-    while len(bad := _bad(result)) and request.drop_bad:
-        worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
-        worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
-        fewer = np.delete(used, worst)
-        most = MAX_BAD_POSE_SHARE * problem.count
-        if len(fewer) < MIN_ADVISED_POSES or problem.count - len(fewer) > most:
+    robot_poses = [transforms[i] for i in options.order]
+    used, remarks = _start_poses(problem, options, names)
+    result = _solve(problem.subset(used), options, robot_poses[0])
+    while len(bad := _bad_indices(result)) and options.drop_bad:
+        worst_indices = sorted(bad, key=lambda index: -result.leave_one_out[index])
+        worst_indices = worst_indices[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
+        remaining = np.delete(used, worst_indices)
+        max_removed = MAX_BAD_POSE_SHARE * problem.count
+        if len(remaining) < MIN_ADVISED_POSES or problem.count - len(remaining) > max_removed:
             break
         try:
-            check_motion(problem.robot.subset(fewer))
-        except CalibrationError:  # too few are left without it
+            check_motion(problem.robot.subset(remaining))
+        except CalibrationError:  # the remaining poses do not determine the camera
             break
-        for index in worst:
+        for index in worst_indices:
             number = int(used[index])
-            remarks[number] = _bad_view(result, index, named[number], "was not used")
-        used, result = fewer, _solved(problem.subset(fewer), request, robot_poses[0])
+            remarks[number] = _bad_pose_remark(result, index, names[number], "was not used")
+        used, result = remaining, _solve(problem.subset(remaining), options, robot_poses[0])
     for index in bad:
         number = int(used[index])
-        remark = _bad_view(result, index, named[number], "is used all the same")
+        remark = _bad_pose_remark(result, index, names[number], "is used all the same")
         remarks.setdefault(number, remark)
-    errors, left_out = np.full((2, problem.count), np.nan)
+    errors, held_out_errors = np.full((2, problem.count), np.nan)
     unused = np.setdiff1d(np.arange(problem.count), used)
-    left: list[int] = unused.tolist()
-    for number in left:
-        (errors_of_pose,) = result.point_errors([robot_poses[number]], [seen[number]])
+    unused_list: list[int] = unused.tolist()
+    for number in unused_list:
+        (errors_of_pose,) = result.point_errors([robot_poses[number]], [views[number]])
         if np.isfinite(errors_of_pose).all():
-            errors[number] = left_out[number] = math.sqrt(float((errors_of_pose**2).mean()))
-    errors[used], left_out[used] = result.errors, result.leave_one_out
-    sampled, back = problem.subset(used), np.argsort(request.order)
-    _check_fit(sampled, result)
-    _check_scale(result.target_scale, request.most_scale)
+            errors[number] = held_out_errors[number] = math.sqrt(float((errors_of_pose**2).mean()))
+    errors[used], held_out_errors[used] = result.errors, result.leave_one_out
+    used_problem, given_order = problem.subset(used), np.argsort(options.order)
+    _check_fit(used_problem, result)
+    _check_scale(result.target_scale, options.most_scale)
     return dataclasses.replace(
         result,
-        errors=errors[back],
-        leave_one_out=left_out[back],
+        errors=errors[given_order],
+        leave_one_out=held_out_errors[given_order],
         robot_poses=tuple(transforms),
-        used=tuple(np.isin(back, used).tolist()),
+        used=tuple(np.isin(given_order, used).tolist()),
         warnings=(
-            *_size_remark(sampled, request),
-            *_remarks(sampled, result),
-            *_moved_remark(problem.subset(unused), result, [named[i] for i in left]),
+            *_size_remarks(used_problem, options),
+            *_remarks(used_problem, result),
+            *_move_remarks(problem.subset(unused), result, [names[i] for i in unused_list]),
             *remarks.values(),
         ),
     )
 
 
-def _moved_remark(
-    unused: Problem, result: HandEyeCalibration, named: Sequence[str]
+def _move_remarks(
+    unused: Problem, result: HandEyeCalibration, names: Sequence[str]
 ) -> Iterator[Remark]:
-    """Yield a remark if the poses that were left out agree on another place of camera or target."""
-    if not named:
+    """Yield a remark if the left-out poses agree on another place of the camera or the target."""
+    if not names:
         return
-    between, seen = unused.robot.between, unused.poses.scaled(result.target_scale)
+    motion, target_poses = (
+        unused.robot.carrier_motion,
+        unused.target_poses.scaled(result.target_scale),
+    )
     camera, target = result.camera_pose.rigid, result.target_pose.rigid
-    lever = float(np.linalg.norm(seen.translation, axis=1).mean())
-    places = {"target": target.before(between.inverse() @ (camera @ seen))}
-    places["camera"] = camera.before(between @ (target @ seen.inverse()))
-    for thing, steps in places.items():
-        if (move := common_move(steps * np.repeat([lever, 1.0], 3))) is not None:
+    lever = float(np.linalg.norm(target_poses.translation, axis=1).mean())
+    steps_by_object = {"target": target.before(motion.inverse() @ (camera @ target_poses))}
+    steps_by_object["camera"] = camera.before(motion @ (target @ target_poses.inverse()))
+    for name, steps in steps_by_object.items():
+        if (shift := common_move(steps * np.repeat([lever, 1.0], 3))) is not None:
             yield Code.POOR_FIT.remark(
-                f"the {thing} seems to have moved by {1e3 * np.linalg.norm(move[3:]):.3g} mm: "
-                f"{', '.join(named)} were left out, and agree on another place of it than all "
+                f"the {name} seems to have moved by {1e3 * np.linalg.norm(shift[3:]):.3g} mm: "
+                f"{', '.join(names)} were left out, and agree on another place of it than all "
                 "others; which of both holds now, they cannot tell"
             )
             return
 
 
 def _start_poses(
-    problem: Problem, request: _Asked, named: Sequence[str]
+    problem: Problem, options: _HandEyeOptions, names: Sequence[str]
 ) -> tuple[NDArray[np.intp], dict[int, Remark]]:
-    """Return the poses to begin with, and remarks, by number, on those that belong to other views.
+    """Return the indices of the poses to start with, and remarks on poses of other views.
 
     Raises ``WRONG_FRAME`` or ``POOR_FIT``.
     """
-    agreed, everything = check_poses(problem), np.arange(problem.count)
-    gross = agreed.gross(max_plausible_error(problem))
-    left = problem.count - len(gross)
-    drop = (
-        request.drop_bad
-        and left >= MIN_GOOD_POSES
-        and len(gross) <= MAX_BAD_POSE_SHARE * problem.count
+    agreement, all_indices = check_poses(problem), np.arange(problem.count)
+    gross_indices = agreement.gross_error_indices(max_plausible_error(problem))
+    remaining_count = problem.count - len(gross_indices)
+    can_drop = (
+        options.drop_bad
+        and remaining_count >= MIN_GOOD_POSES
+        and len(gross_indices) <= MAX_BAD_POSE_SHARE * problem.count
     )
-    used = np.setdiff1d(everything, gross) if drop else everything
+    used = np.setdiff1d(all_indices, gross_indices) if can_drop else all_indices
     try:
         check_motion(problem.robot.subset(used))
-    except CalibrationError:  # too few are left without them
-        drop, used = False, everything
-    done = "was not used" if drop else "is used all the same"
+    except CalibrationError:  # the remaining poses do not determine the camera
+        can_drop, used = False, all_indices
+    outcome = "was not used" if can_drop else "is used all the same"
     return used, {
         index: Code.BAD_VIEW.remark(
-            f"{named[index]} is {1e3 * agreed.off[index]:.3g} mm off what most poses agree with to "
-            f"{1e3 * agreed.median:.3g} mm: it belongs to another view, or numbers the target from "
-            f"its other end; it {done}"
+            f"{names[index]} is {1e3 * agreement.errors[index]:.3g} mm off what most poses agree "
+            f"with to {1e3 * agreement.median:.3g} mm: it belongs to another view, or numbers the "
+            f"target from its other end; it {outcome}"
         )
-        for index in gross.tolist()
+        for index in gross_indices.tolist()
     }
 
 
-def _bad(result: HandEyeCalibration) -> list[int]:
-    """Return the indices of poses that the others do not predict."""
+def _bad_indices(result: HandEyeCalibration) -> list[int]:
+    """Return the indices of poses that the other poses do not predict."""
     if result.held_out_error is None:
         return []
     errors = result.leave_one_out
@@ -546,127 +559,146 @@ def _bad(result: HandEyeCalibration) -> list[int]:
     return bad
 
 
-def _bad_view(result: HandEyeCalibration, index: int, name: str, done: str) -> Remark:
+def _bad_pose_remark(result: HandEyeCalibration, index: int, name: str, outcome: str) -> Remark:
     errors = 1e3 * result.leave_one_out
     return Code.BAD_VIEW.remark(
         f"{name} is {errors[index]:.3g} mm off what the others say of it, half of them are "
         f"{np.median(errors):.3g} mm or less: its pose of the robot or its image is wrong; it "
-        f"{done}"
+        f"{outcome}"
     )
 
 
-def _solved(problem: Problem, request: _Asked, pose: Transform) -> HandEyeCalibration:
-    check_choice(request.method, ["auto", *METHODS], "method")
-    chosen, candidates_ = candidates(problem, request.free, request.method)
-    if chosen is None:
+def _solve(problem: Problem, options: _HandEyeOptions, pose: Transform) -> HandEyeCalibration:
+    check_choice(options.method, ["auto", *METHODS], "method")
+    best, all_candidates = fit_candidates(problem, options.parameter_choices, options.method)
+    if best is None:
         raise poor_fit_error(f"none at all {problem.count} poses", None)
-    return _result(problem, chosen, candidates_, pose)
+    return _build_calibration(problem, best, all_candidates, pose)
 
 
 def _check_fit(problem: Problem, result: HandEyeCalibration) -> None:
     """Raise ``POOR_FIT`` if poses and views do not belong together."""
     errors = result.errors if result.held_out_error is None else result.leave_one_out
-    error, most = float(np.median(errors)), max_plausible_error(problem)
-    if error > most:
+    error, max_error = float(np.median(errors)), max_plausible_error(problem)
+    if error > max_error:
         raise poor_fit_error(
-            f"one {1e3 * error:.3g} mm off, {1e3 * most:.3g} mm at most expected", error
+            f"one {1e3 * error:.3g} mm off, {1e3 * max_error:.3g} mm at most expected", error
         )
 
 
-def _result(
+def _build_calibration(
     problem: Problem,
-    chosen: Candidate,
-    considered: Sequence[Candidate],
+    best: Candidate,
+    all_candidates: Sequence[Candidate],
     pose: Transform,
 ) -> HandEyeCalibration:
-    in_hand, solution = problem.robot.in_hand, chosen.solution
+    in_hand, solution = problem.robot.in_hand, best.solution
     hand, base = pose.source, pose.target
-    seen = chosen.problem.seen
-    errors = chosen.problem.errors(solution)
-    held_out = np.where(np.isfinite(chosen.errors), chosen.errors, np.nan)
-    camera = seen.camera(solution.change) if isinstance(seen, PixelObservations) else None
+    observations = best.problem.observations
+    errors = best.problem.errors(solution)
+    held_out = np.where(np.isfinite(best.errors), best.errors, np.nan)
+    camera = (
+        observations.camera(solution.change)
+        if isinstance(observations, PixelObservations)
+        else None
+    )
     return HandEyeCalibration(
         setup="eye-in-hand" if in_hand else "eye-to-hand",
         camera_pose=Transform(hand if in_hand else base, CAMERA, *solution.camera),
         target_pose=Transform(base if in_hand else hand, TARGET, *solution.target),
         camera=camera,
-        target_scale=seen.scale(solution.change),
-        method=chosen.name,
+        target_scale=observations.scale(solution.change),
+        method=best.name,
         candidates={
             candidate.name: candidate.held_out if math.isfinite(candidate.held_out) else None
-            for candidate in considered
+            for candidate in all_candidates
         },
         errors=np.array([math.sqrt(float((error**2).mean())) for error in errors]),
         mean_error=float(np.concatenate(errors).mean()),
         leave_one_out=held_out,
-        held_out_error=chosen.held_out if math.isfinite(chosen.held_out) else None,
-        covariance=_covariance(chosen),
+        held_out_error=best.held_out if math.isfinite(best.held_out) else None,
+        covariance=_covariance(best),
         robot_sigmas=None if solution.noise is None else solution.noise.robot,
         robot_poses=(),
         used=(True,) * problem.count,
     )
 
 
-def _check_scale(scale: float, most: float) -> None:
+def _check_scale(scale: float, max_error: float) -> None:
     """Raise ``SCALE_MISMATCH`` if the target's size is off by more than is allowed."""
-    if abs(scale - 1.0) > most:
+    if abs(scale - 1.0) > max_error:
         raise Code.SCALE_MISMATCH.refusal(
-            f"hand-eye: expected the target as large as it was said, to {100 * most:g} %, got one "
-            f"{scale:.3f} times as large by the robot's motions: measure the print, and say how "
-            "large it is; or allow more by most_scale",
-            most,
+            f"hand-eye: expected the target as large as it was said, to {100 * max_error:g} %, got "
+            f"one {scale:.3f} times as large by the robot's motions: measure the print, and say "
+            "how large it is; or allow more by most_scale",
+            max_error,
             scale,
         )
 
 
-def _covariance(chosen: Candidate) -> Array:
+def _covariance(candidate: Candidate) -> Array:
     """Return the covariance of steps of camera and target (12, 12), from the scatter between poses.
 
-    The differences to solutions that may be right as well are included. If the lens was calibrated
-    from the same views and not adjusted since, its own error is, too. NaN if there are too few
-    poses.
+    The differences to rival solutions are included, and the error of a lens that was calibrated
+    from the same views and not adjusted since. NaN if there are too few poses.
     """
-    solution, others = chosen.solution, chosen.others
-    if others is None or chosen.problem.count < MIN_POSES_FOR_ERROR:
+    solution, left_out = candidate.solution, candidate.left_out_solutions
+    if left_out is None or candidate.problem.count < MIN_POSES_FOR_ERROR:
         return np.full((12, 12), np.nan)
-    cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
+    cameras, targets = (
+        solution.camera.before(left_out.camera),
+        solution.target.before(left_out.target),
+    )
     steps = np.concatenate([cameras, targets], axis=1)
-    information, left = solution.information, others.information
-    if information is None or left is None:  # solved without a part of the poses, not without each
+    information, left_out_information = solution.information, left_out.information
+    if information is None or left_out_information is None:
+        # a closed form was solved without groups of poses, not without each pose
         return jackknife(steps[:MAX_FOLDS])
     if len(information) > 12:
-        steps = np.concatenate([steps, others.change - solution.change], axis=1)
-    places = of_one_place(chosen.problem.robot.poses)
-    # poses of one place are left out together
-    alike = [places == place for place in np.unique(places)]
-    steps = np.array([steps[mask].sum(axis=0) for mask in alike])  # correct to first order
-    left = np.array([information - (information - left[mask]).sum(axis=0) for mask in alike])
-    spreads = np.array([inverse_scaled(information_left) for information_left in left])
-    full = inverse_scaled(information)
-    scatter = weighed_jackknife(steps, spreads, full, WEIGHT_POWER)[:12, :12]
-    for rival in chosen.rivals:
-        both = solution.camera.before(rival.camera), solution.target.before(rival.target)
-        scatter += np.outer(step := np.concatenate(both), step)
-    lens, seen = chosen.problem.lens, chosen.problem.seen
-    if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
+        steps = np.concatenate([steps, left_out.change - solution.change], axis=1)
+    place_indices = same_place_indices(candidate.problem.robot.poses)
+    # poses at the same place are left out together; the sum of steps is correct to first order
+    masks = [place_indices == index for index in np.unique(place_indices)]
+    steps = np.array([steps[mask].sum(axis=0) for mask in masks])
+    left_out_information = np.array(
+        [information - (information - left_out_information[mask]).sum(axis=0) for mask in masks]
+    )
+    left_out_covariances = np.array(
+        [inverse_scaled(information_left) for information_left in left_out_information]
+    )
+    covariance_of_all = inverse_scaled(information)
+    scatter = weighted_jackknife(steps, left_out_covariances, covariance_of_all, WEIGHT_POWER)[
+        :12, :12
+    ]
+    for rival in candidate.rivals:
+        differences = solution.camera.before(rival.camera), solution.target.before(rival.target)
+        scatter += np.outer(step := np.concatenate(differences), step)
+    lens, observations = candidate.problem.lens_covariance, candidate.problem.observations
+    if (
+        lens is None
+        or not isinstance(observations, PixelObservations)
+        or any(observations.free_parameters)
+    ):
         return scatter
-    numbers = tuple(range(1, 5 + len(seen.model.distortion)))
-    slopes = pull(chosen.problem.robot, seen, solution, numbers)
-    joint: Array = scatter + slopes @ lens @ slopes.T
-    return joint
+    numbers = tuple(range(1, 5 + len(observations.model.distortion)))
+    slopes = derivatives_by_parameters(candidate.problem.robot, observations, solution, numbers)
+    covariance: Array = scatter + slopes @ lens @ slopes.T
+    return covariance
 
 
-def _size_remark(problem: Problem, request: _Asked) -> Iterator[Remark]:
-    """Return a remark if the target has another size, and that was not to be adjusted."""
-    if request.method not in LINEAR and any(0 in freed for freed in request.free.values()):
+def _size_remarks(problem: Problem, options: _HandEyeOptions) -> Iterator[Remark]:
+    """Yield a remark if the target has another size, but the size was not to be adjusted."""
+    if options.method not in LINEAR and any(
+        0 in numbers for numbers in options.parameter_choices.values()
+    ):
         return
-    numbers = np.arange(problem.count)
-    scale = scale_of(problem.robot, problem.poses)
-    parts = [problem.subset(numbers[numbers != i]) for i in numbers if problem.count > MIN_POSES]
-    others = [scale_of(part.robot, part.poses) for part in parts]
-    if scale is None or not others or None in others:
+    indices = np.arange(problem.count)
+    scale = estimate_scale(problem.robot, problem.target_poses)
+    subsets = [problem.subset(indices[indices != i]) for i in indices if problem.count > MIN_POSES]
+    left_out_scales = [estimate_scale(subset.robot, subset.target_poses) for subset in subsets]
+    if scale is None or not left_out_scales or None in left_out_scales:
         return
-    sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
+    sigma = math.sqrt(float(jackknife(np.array(left_out_scales, dtype=np.float64)[:, None])[0, 0]))
     if abs(scale - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {scale:.4f} times that by the "
@@ -682,15 +714,15 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             "that by the robot's motions: measure the print; poses and errors are those of a "
             "target of that size"
         )
-    places = len(np.unique(of_one_place(problem.robot.poses)))
-    if places < MIN_ADVISED_POSES:
-        alike = f" that are different, of {problem.count}" if places < problem.count else ""
+    place_count = len(np.unique(same_place_indices(problem.robot.poses)))
+    if place_count < MIN_ADVISED_POSES:
+        suffix = f" that are different, of {problem.count}" if place_count < problem.count else ""
         yield Code.TOO_FEW.remark(
             f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
-            f"{places}{alike}"
+            f"{place_count}{suffix}"
         )
-    # a remark that depends on a single pose is of no use
-    turn = float(second_turns(problem.robot).max())
+    # the largest value without any one pose, so that no single pose decides
+    turn = float(left_out_second_axis_turns(problem.robot).max())
     if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(
             f"expected the robot to turn by {math.degrees(MIN_ADVISED_TURN_RADIANS):g} deg rms "
@@ -699,22 +731,23 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
         )
     if result.held_out_error is None:
         yield Code.NOT_HELD_OUT.remark("too few poses to leave one out: no held-out error")
-    elif result.held_out_error > (most := expected_error(problem, POOR_ROBOT)):
+    elif result.held_out_error > (max_error := expected_error(problem, POOR_ROBOT)):
         yield Code.POOR_FIT.remark(
-            f"expected a held-out error of {1e3 * most:.3g} mm at most, as of a robot that is "
+            f"expected a held-out error of {1e3 * max_error:.3g} mm at most, as of a robot that is "
             f"{1e3 * POOR_ROBOT.translation:g} mm and {math.degrees(POOR_ROBOT.rotation):g} deg "
             f"off, got {1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the "
             "target or the camera slip, is a pose one of another view?"
         )
 
 
-def _lens_remarks(given: CameraModel, adjusted: CameraModel | None) -> list[Remark]:
-    if adjusted is None or np.array_equal(given.matrix, adjusted.matrix):
+def _lens_remarks(given_camera: CameraModel, adjusted_camera: CameraModel | None) -> list[Remark]:
+    if adjusted_camera is None or np.array_equal(given_camera.matrix, adjusted_camera.matrix):
         return []
-    before, after = given.matrix[0, 0], adjusted.matrix[0, 0]
+    given_focal, adjusted_focal = given_camera.matrix[0, 0], adjusted_camera.matrix[0, 0]
     return [
         Code.WRONG_LENS.remark(
-            f"expected the lens as it was given, got one that fits far better: fx {after:.1f} px "
-            f"instead of {before:.1f} px; the calibration's camera is that one"
+            f"expected the lens as it was given, got one that fits far better: fx "
+            f"{adjusted_focal:.1f} px instead of {given_focal:.1f} px; the calibration's camera is "
+            "that one"
         )
     ]

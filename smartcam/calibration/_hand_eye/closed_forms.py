@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MIN_POSES = 3
-"""Least number of poses: two motions about different axes determine the camera."""
+"""Least number of poses: two motions about different axes determine the camera's pose."""
 
 SAME_TURN_RADIANS = math.radians(0.5)
-"""Poses that are turned by less than this against each other count as one."""
+"""Poses that differ by less than this angle count as one orientation."""
 
 SAME_PLACE_M = 0.001
-"""Metres: poses that are less apart and turned by less than that are of one place."""
+"""Poses are at the same place if they are nearer than this, metres, and turned by less than
+SAME_TURN_RADIANS."""
 
 MAX_POSES_PAIRED = 40
-"""With at most this many poses, each pair of them is used: the time grows with the square of their
-number."""
+"""OpenCV's methods that use each pair of poses get at most this many poses: the time grows with the
+square of their number."""
 
 MAX_POSES_COMPARED = 200
-"""At most this many poses are compared with each other; of more, a part shows their turns as
-well."""
+"""At most this many poses are compared with each other; if there are more, a part of them is."""
 
 MIN_TURN_RADIANS = math.radians(2.0)
 """Least RMS turn of the poses about the second of their axes; turns about a single axis do not
@@ -42,17 +42,19 @@ determine the camera."""
 # A motion of the robot between two poses, A, and the motion that the camera sees, B, are the same:
 # A X = X B, so R_A R_X = R_X R_B and (R_A - I) t_X = R_X t_B - t_A. Each pair of poses gives one
 # such equation; two of them about different axes determine X. Tsai, Park and Horaud find the
-# rotation first, and then the translation, which is linear; the other two find both at once: -
-# tsai: with P = 2 sin(angle / 2) axis, [P_A + P_B]x P' = P_B - P_A is linear, and P' gives R_X.
-# Tsai and Lenz, A New Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration
-# (1989). - park: log R_A = R_X log R_B, so R_X = (M^T M)^(-1/2) M^T with M = sum log(R_B)
-# log(R_A)^T. Park and Martin, Robot Sensor Calibration: Solving AX = XB on the Euclidean Group
-# (1994). - horaud: of quaternions q_A q_X = q_X q_B, an eigenvector of a 4 x 4 matrix. Horaud and
-# Dornaika, Hand-Eye Calibration (1995). - andreff: (I - R_A (x) R_B) vec(R_X) = 0 with Kronecker's
-# product, and t_X in the same equations. Andreff, Horaud and Espiau, On-line Hand-Eye Calibration
-# (1999). - daniilidis: of dual quaternions a q = q b, both parts at once; q is of the last two
-# right singular vectors of a 6 N x 8 matrix. Daniilidis, Hand-Eye Calibration Using Dual
-# Quaternions (1999).
+# rotation first, and then the translation, which is linear; the other two find both at once:
+# - tsai: with P = 2 sin(angle / 2) axis, [P_A + P_B]x P' = P_B - P_A is linear, and P' gives R_X.
+#   Tsai and Lenz, A New Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye
+#   Calibration (1989).
+# - park: log R_A = R_X log R_B, so R_X = (M^T M)^(-1/2) M^T with M = sum log(R_B) log(R_A)^T.
+#   Park and Martin, Robot Sensor Calibration: Solving AX = XB on the Euclidean Group (1994).
+# - horaud: quaternions satisfy q_A q_X = q_X q_B; q_X is an eigenvector of a 4 x 4 matrix.
+#   Horaud and Dornaika, Hand-Eye Calibration (1995).
+# - andreff: (I - R_A (x) R_B) vec(R_X) = 0 with Kronecker's product, and t_X in the same
+#   equations. Andreff, Horaud and Espiau, On-line Hand-Eye Calibration (1999).
+# - daniilidis: dual quaternions satisfy a q = q b; q is a combination of the last two right
+#   singular vectors of a 6 N x 8 matrix. Daniilidis, Hand-Eye Calibration Using Dual Quaternions
+#   (1999).
 HAND_EYE = {
     "tsai": "CALIB_HAND_EYE_TSAI",
     "park": "CALIB_HAND_EYE_PARK",
@@ -80,16 +82,16 @@ def check_motion(robot: RobotPoses) -> None:
     Raises ``TOO_FEW`` for fewer than three poses; ``POSES_TOO_SIMILAR`` if fewer than three differ
     in orientation; ``INSUFFICIENT_ROTATION`` if they are turned about one axis only.
     """
-    turns = _some_turns(robot)
-    if len(turns) < MIN_POSES:
+    rotations = _sampled_rotations(robot)
+    if len(rotations) < MIN_POSES:
         raise Code.TOO_FEW.unexpected(
-            f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(turns)
+            f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(rotations)
         )
-    against = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
-    apart = np.linalg.norm(against, axis=-1) > SAME_TURN_RADIANS
+    turns_between = log_rotation(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
+    is_apart = np.linalg.norm(turns_between, axis=-1) > SAME_TURN_RADIANS
     distinct: list[int] = []
-    for index in range(len(turns)):
-        if apart[index, distinct].all():
+    for index in range(len(rotations)):
+        if is_apart[index, distinct].all():
             distinct.append(index)
     if len(distinct) < MIN_POSES:
         raise Code.POSES_TOO_SIMILAR.refusal(
@@ -99,7 +101,7 @@ def check_motion(robot: RobotPoses) -> None:
             MIN_POSES,
             len(distinct),
         )
-    second = second_turn(robot)
+    second = second_axis_turn(robot)
     if not second > MIN_TURN_RADIANS:
         raise Code.INSUFFICIENT_ROTATION.refusal(
             "hand-eye: expected turns about two axes or more, "
@@ -110,98 +112,103 @@ def check_motion(robot: RobotPoses) -> None:
         )
 
 
-def of_one_place(poses: Rigid) -> NDArray[np.intp]:
-    """Return for each pose (V,) the number of the first one that is about the same.
+def same_place_indices(poses: Rigid) -> NDArray[np.intp]:
+    """Return for each pose (V,) the index of the first pose that is about the same.
 
-    Errors of a robot are the same at each visit of a place, so its views tell no more than one.
+    A robot has the same error at each visit of a place, so several views there tell no more than
+    one.
     """
-    numbers = np.arange(poses.size)
-    for index in numbers[1:]:
-        turned = log_rotation(poses.rotation[:index].swapaxes(1, 2) @ poses.rotation[index])
-        moved = poses.translation[:index] - poses.translation[index]
-        is_near = np.linalg.norm(turned, axis=1) < SAME_TURN_RADIANS
-        is_near &= np.linalg.norm(moved, axis=1) < SAME_PLACE_M
+    indices = np.arange(poses.size)
+    for index in indices[1:]:
+        turns = log_rotation(poses.rotation[:index].swapaxes(1, 2) @ poses.rotation[index])
+        shifts = poses.translation[:index] - poses.translation[index]
+        is_near = np.linalg.norm(turns, axis=1) < SAME_TURN_RADIANS
+        is_near &= np.linalg.norm(shifts, axis=1) < SAME_PLACE_M
         if is_near.any():
-            numbers[index] = numbers[int(np.argmax(is_near))]
-    return numbers
+            indices[index] = indices[int(np.argmax(is_near))]
+    return indices
 
 
-def _some_turns(robot: RobotPoses) -> Array:
-    """Return the rotations of the poses, or of a part of them if there are many."""
-    turns, count = robot.poses.rotation, robot.poses.size
+def _sampled_rotations(robot: RobotPoses) -> Array:
+    """Return the rotations of the poses, or of a part of the poses if there are many."""
+    rotations, count = robot.poses.rotation, robot.poses.size
     if count <= MAX_POSES_COMPARED:
-        return turns
-    sampled: Array = turns[np.linspace(0, count - 1, MAX_POSES_COMPARED).round().astype(np.intp)]
+        return rotations
+    sampled: Array = rotations[
+        np.linspace(0, count - 1, MAX_POSES_COMPARED).round().astype(np.intp)
+    ]
     return sampled
 
 
-def second_turn(robot: RobotPoses) -> float:
-    """Return the rms turn of the poses against each other about the second of their axes, rad."""
-    products = _turns(robot)
-    return float(_second(products.sum(axis=(0, 1)), len(products)))
+def second_axis_turn(robot: RobotPoses) -> float:
+    """Return the RMS turn between the poses about the second of their axes, radians."""
+    products = _turn_products(robot)
+    return float(_second_axis_rms(products.sum(axis=(0, 1)), len(products)))
 
 
-def second_turns(robot: RobotPoses) -> Array:
-    """Return the second turn without each pose (V,), or that of all poses if they are few."""
-    products = _turns(robot)
+def left_out_second_axis_turns(robot: RobotPoses) -> Array:
+    """Return :func:`second_axis_turn` without each pose (V,), or of all poses if there are few."""
+    products = _turn_products(robot)
     total, count = products.sum(axis=(0, 1)), len(products)
     if count <= MIN_POSES:
-        return np.full(count, _second(total, count))
-    return _second(total - 2.0 * products.sum(axis=1), count - 1)
+        return np.full(count, _second_axis_rms(total, count))
+    return _second_axis_rms(total - 2.0 * products.sum(axis=1), count - 1)
 
 
-def _turns(robot: RobotPoses) -> Array:
-    """Return the products b b^T of the turns b from each pose to each other, (V, V, 3, 3)."""
-    turns = _some_turns(robot)
-    between = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
-    products: Array = between[..., None] * between[..., None, :]
+def _turn_products(robot: RobotPoses) -> Array:
+    """Return the products b b^T (V, V, 3, 3) of the turns b from each pose to each other pose."""
+    rotations = _sampled_rotations(robot)
+    turns_between = log_rotation(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
+    products: Array = turns_between[..., None] * turns_between[..., None, :]
     return products
 
 
-def _second(products: Array, count: int) -> Array:
+def _second_axis_rms(products: Array, count: int) -> Array:
     # Rotation vectors of one axis are multiples of each other, so the second eigenvalue of the sum
-    # of their products is 0. Divided by their number it is a mean square.
+    # of their products is 0. The second eigenvalue divided by their number is a mean square.
     roots: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(products)[..., 1], 0.0))
     return roots / math.sqrt(count * (count - 1))
 
 
 def solve_linear(
-    name: str, robot: RobotPoses, seen: Rigid, *, exactly: bool = False
+    name: str, robot: RobotPoses, target_poses: Rigid, *, use_all_views: bool = False
 ) -> tuple[Rigid, Rigid] | None:
     """Return ``X`` and ``Z`` by one of OpenCV's methods (:data:`LINEAR`); None if it fails.
 
-    ``seen``: ``T_camera_target`` of each view. ``exactly``: use all views, however many; otherwise
-    a method that works with pairs gets a part of them, which is enough for a start.
+    ``target_poses``: ``T_camera_target`` of each view. ``use_all_views``: False gives methods that
+    use pairs of views only a part of many views, which is enough for a start.
     """
-    if name in HAND_EYE and not exactly and seen.size > MAX_POSES_PAIRED:
-        sampled = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
-        robot, seen = robot.subset(sampled), seen.subset(sampled)
+    if name in HAND_EYE and not use_all_views and target_poses.size > MAX_POSES_PAIRED:
+        sampled = np.linspace(0, target_poses.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
+        robot, target_poses = robot.subset(sampled), target_poses.subset(sampled)
     try:
-        solution = LINEAR[name](name, robot, seen)
+        solution = LINEAR[name](name, robot, target_poses)
     except (load("cv2").error, np.linalg.LinAlgError):
         return None
-    return solution if _sound(solution) else None
+    return solution if _is_valid(solution) else None
 
 
-def _hand_eye(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
-    cv2, carrier = load("cv2"), robot.between.inverse()
+def _hand_eye(name: str, robot: RobotPoses, target_poses: Rigid) -> tuple[Rigid, Rigid]:
+    cv2, inverse_motion = load("cv2"), robot.carrier_motion.inverse()
     # the fifth argument is an output: a method without its name would be ignored
     solution = cv2.calibrateHandEye(
-        *_lists(carrier), *_lists(seen), method=getattr(cv2, HAND_EYE[name])
+        *_as_lists(inverse_motion), *_as_lists(target_poses), method=getattr(cv2, HAND_EYE[name])
     )
-    camera = _rigid(*solution)
-    return camera, mean_target(camera, robot, seen)
+    camera = _as_rigid(*solution)
+    return camera, mean_target(camera, robot, target_poses)
 
 
-def _robot_world(name: str, robot: RobotPoses, seen: Rigid) -> tuple[Rigid, Rigid]:
+def _robot_world(name: str, robot: RobotPoses, target_poses: Rigid) -> tuple[Rigid, Rigid]:
     cv2 = load("cv2")
     solution = cv2.calibrateRobotWorldHandEye(
-        *_lists(seen), *_lists(robot.between), method=getattr(cv2, ROBOT_WORLD[name])
+        *_as_lists(target_poses),
+        *_as_lists(robot.carrier_motion),
+        method=getattr(cv2, ROBOT_WORLD[name]),
     )
-    return _rigid(*solution[2:]).inverse(), _rigid(*solution[:2]).inverse()
+    return _as_rigid(*solution[2:]).inverse(), _as_rigid(*solution[:2]).inverse()
 
 
-def _rigid(turn: Any, shift: Any) -> Rigid:
+def _as_rigid(turn: Any, shift: Any) -> Rigid:
     motion = Rigid(np.asarray(turn, dtype=np.float64), np.ravel(shift).astype(np.float64))
     if not np.isfinite(motion.rotation).all():
         raise np.linalg.LinAlgError("no rotation")
@@ -215,38 +222,40 @@ LINEAR: dict[str, Callable[[str, RobotPoses, Rigid], tuple[Rigid, Rigid]]] = {
 """Functions for OpenCV's methods, by their authors."""
 
 
-def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
-    """Return the mean ``Z`` of the target's poses by each view alone."""
+def mean_target(camera: Rigid, robot: RobotPoses, target_poses: Rigid) -> Rigid:
+    """Return the mean of the target's poses ``Z`` that each view alone shows."""
     # S = X^-1 A Z, so each view alone says Z = A^-1 X S.
-    each = robot.between.inverse() @ (camera @ seen)
+    poses = robot.carrier_motion.inverse() @ (camera @ target_poses)
     # The rotation nearest to the mean matrix, in the sum of squared elements: U diag(1, 1, +-1) V^T
     # of U S V^T. SciPy's Rotation.mean is the same, but refuses reflections, which a closed form
     # may give; these are sorted out later. Source: Hartley, Trumpf, Dai and Li, Rotation Averaging
     # (2013), on the chordal L2 mean.
-    left, _, right = np.linalg.svd(each.rotation.mean(axis=0))
+    left, _, right = np.linalg.svd(poses.rotation.mean(axis=0))
     proper = np.diag([1.0, 1.0, float(np.linalg.det(left @ right))])
-    return Rigid(left @ proper @ right, each.translation.mean(axis=0))
+    return Rigid(left @ proper @ right, poses.translation.mean(axis=0))
 
 
-def scale_of(robot: RobotPoses, seen: Rigid) -> float | None:
-    """Return the target's size over the nominal one, as the robot's motions show it."""
-    solution = solve_linear("park", robot, seen)  # the camera's rotation does not depend on lengths
+def estimate_scale(robot: RobotPoses, target_poses: Rigid) -> float | None:
+    """Return the target's size that the robot's motions show, relative to the nominal size."""
+    solution = solve_linear(
+        "park", robot, target_poses
+    )  # the camera's rotation does not depend on lengths
     if solution is None:
         return None
     # S = X^-1 A Z with all of the camera's lengths times s: R_A t_Z - t_X - s R_X t_S = -t_A.
-    between, count = robot.between, seen.size
+    between, count = robot.carrier_motion, target_poses.size
     rows = np.zeros((count, 3, 7))
     rows[:, :, :3], rows[:, :, 3:6] = between.rotation, -np.eye(3)
-    rows[:, :, 6] = -seen.translation @ solution[0].rotation.T
+    rows[:, :, 6] = -target_poses.translation @ solution[0].rotation.T
     right = -between.translation.reshape(-1)
     return float(np.linalg.lstsq(rows.reshape(-1, 7), right, rcond=None)[0][6])
 
 
-def _lists(motions: Rigid) -> tuple[list[Array], list[Array]]:
+def _as_lists(motions: Rigid) -> tuple[list[Array], list[Array]]:
     return list(np.ascontiguousarray(motions.rotation)), list(motions.translation)
 
 
-def _sound(motions: tuple[Rigid, Rigid]) -> bool:
+def _is_valid(motions: tuple[Rigid, Rigid]) -> bool:
     for motion in motions:
         if not all(np.isfinite(part).all() for part in motion):
             return False

@@ -5,15 +5,15 @@ where the robot's only error is noise. ``reprojection`` takes the robot's poses 
 minimizes the error on the target. It is best where a robot has other errors (joints with offsets,
 gears with play, a sheet of another size), which corrections of single poses do not describe.
 
-The poses decide between the two: each method is solved again without one pose, and predicts from
-the robot's given pose where the camera would see the target. The distance from where the target was
-seen is the held-out error, in metres on the target, as it matters for picking. ``reprojection`` is
-taken where its errors are smaller by more than chance. Blends of the two predict no better: 0.2 %
-worse over 26 kinds of simulated robots, up to 9 % worse on recorded ones (measured).
+Left-out poses decide between the two: each method is solved again without one pose, and predicts
+from the robot's pose where the camera would see the target. The distance to where the target was
+seen, in metres on the target as it matters for picking, is the held-out error. ``reprojection`` is
+chosen if its errors are smaller by more than chance. Mixtures of the two methods predict no better:
+0.2 % worse over 26 kinds of simulated robots, up to 9 % worse on recorded ones (measured).
 
-The camera's parameters and the target's scale are adjusted as well where two things hold: the
-held-out error is smaller with them, and noise alone would hardly ever change them by as much. An
-unneeded scale costs much: the camera's place is known two to five times worse.
+The camera's lens and the target's scale are adjusted as well if two conditions hold: the held-out
+error is then smaller, and noise alone would hardly ever change them by as much. An unneeded scale
+makes the error of the camera's position two to five times as large.
 """
 
 from __future__ import annotations
@@ -26,18 +26,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._hand_eye.closed_forms import LINEAR, MIN_POSES, scale_of, solve_linear
+from smartcam.calibration._hand_eye.closed_forms import (
+    LINEAR,
+    MIN_POSES,
+    estimate_scale,
+    solve_linear,
+)
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     PoseObservations,
     RobotNoise,
     Solution,
     adjust,
+    derivatives_by_parameters,
+    leave_each_out,
     predicted_views,
-    pull,
-    without_each,
 )
-from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
+from smartcam.calibration._hand_eye.robot_noise import adjust_with_noise
 from smartcam.calibration._least_squares import solve_scaled
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
@@ -52,15 +57,15 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
     from smartcam.geometry._inside import Array
 
-    Seen = PixelObservations | PoseObservations
+    AnyObservations = PixelObservations | PoseObservations
 
 SIGNIFICANCE_LEVEL = 1e-4
-"""Further parameters are adjusted only if noise alone would change them by as much with less than
-this probability: a scale that is not needed puts the camera up to eight times as far off."""
+"""Parameters are adjusted only if the probability that noise alone changes them by as much is below
+this value: an unneeded scale makes the camera's error up to eight times as large."""
 
 SURE_GAIN = 2.0
-"""A choice is open until poses are predicted better by this many standard errors: simulated robots
-that err by noise alone reach 1.9 by chance."""
+"""A choice is sure if it predicts poses better by this many standard errors: simulated robots whose
+only error is noise reach 1.9 by chance."""
 
 MAX_SIZE_ERROR_RATIO = 0.05
 """Largest error of a target's stated size, as a part of it, from which the fit still converges."""
@@ -74,45 +79,45 @@ MAX_FOLDS = 20
 """A closed form is solved again without each of at most this many groups of poses."""
 
 NOTHING = "nothing"
-"""Word for a candidate in which only the poses are adjusted."""
+"""Name of the choice to adjust only the poses."""
 
 ADJUSTABLE = (NOTHING, "scale", "camera", "scale and camera")
-"""Choices of values to adjust besides the poses: the target's scale, the camera's parameters."""
+"""Values that may be adjusted in addition to the poses: the target's scale, the camera's lens."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Poses of a robot, with the camera's observations at each."""
+    """The input of a calibration: the robot's poses, and the camera's observations at each."""
 
     robot: RobotPoses  # V poses
-    seen: Seen  # V views, or poses of the target without views
-    poses: Rigid  # V times ``T_camera_target``, each from its own view
-    # (V, N), True for points that exist; None without views
-    given: NDArray[np.bool_] | None = None
-    sigmas: RobotSigmas | None = None  # noise of the robot's poses, if it is known
+    observations: AnyObservations  # V views, or poses of the target without views
+    target_poses: Rigid  # V times ``T_camera_target``, each from its own view
+    # (V, N), True for points that exist, False for padding; None without views
+    point_mask: NDArray[np.bool_] | None = None
+    robot_sigmas: RobotSigmas | None = None  # noise of the robot's poses; None: to be estimated
     # (4 + K, 4 + K), covariance of a lens from the same views; None for an exact one
-    lens: Array | None = None
+    lens_covariance: Array | None = None
 
     @property
     def count(self) -> int:
         """Number V of poses."""
-        return self.poses.size
+        return self.target_poses.size
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """True for points with an error, (V, N); without views, for the target's origin."""
-        return np.ones((self.count, 1), dtype=bool) if self.given is None else self.given
+        """(V, N), True for points with an error; without views (V, 1), for the target's origin."""
+        return np.ones((self.count, 1), dtype=bool) if self.point_mask is None else self.point_mask
 
     def subset(self, index: NDArray[np.intp]) -> Problem:
         """Return some of the poses."""
-        given = None if self.given is None else self.given[index]
+        point_mask = None if self.point_mask is None else self.point_mask[index]
         return Problem(
             self.robot.subset(index),
-            self.seen.subset(index),
-            self.poses.subset(index),
-            given,
-            self.sigmas,
-            self.lens,
+            self.observations.subset(index),
+            self.target_poses.subset(index),
+            point_mask,
+            self.robot_sigmas,
+            self.lens_covariance,
         )
 
     def errors(self, solution: Solution) -> list[Array]:
@@ -121,49 +126,58 @@ class Problem:
         The error of a point in a view is the distance, in the target's plane, between its ray and
         the point. Without views it is the distance of the target's origin.
         """
-        errors = np.linalg.norm(self.off(solution), axis=2)
+        errors = np.linalg.norm(self.error_vectors(solution), axis=2)
         return [view_errors[mask] for view_errors, mask in zip(errors, self.mask, strict=True)]
 
-    def off(self, solution: Solution) -> Array:
-        """Return the errors as vectors, (V, N, 3), metres; 0 for points that do not exist.
+    def error_vectors(self, solution: Solution) -> Array:
+        """Return the errors as vectors, (V, N, 3), metres; 0 for padding.
 
-        ``solution`` is one, or one for each view.
+        ``solution``: one solution for all views, or stacked solutions, one for each view.
         """
         expected = predicted_views(solution.camera, self.robot, solution.target)
         change = solution.change
-        each = change.ndim > 1
-        scales = [self.seen.scale(step) for step in (change if each else change[None])]
-        if self.given is None or not isinstance(self.seen, PixelObservations):
-            away = expected.translation - np.reshape(scales, (-1, 1)) * self.poses.translation
-            return np.asarray(away[:, None], dtype=np.float64)
-        points = np.reshape(scales, (-1, 1, 1)) * self.seen.points
-        if each and any(self.seen.free):
-            one_each = zip(change, self.seen.pixels, strict=True)
-            rays = np.stack([self.seen.camera(step).directions(seen) for step, seen in one_each])
+        has_one_each = change.ndim > 1
+        scales = [
+            self.observations.scale(step) for step in (change if has_one_each else change[None])
+        ]
+        if self.point_mask is None or not isinstance(self.observations, PixelObservations):
+            offsets = (
+                expected.translation - np.reshape(scales, (-1, 1)) * self.target_poses.translation
+            )
+            return np.asarray(offsets[:, None], dtype=np.float64)
+        points = np.reshape(scales, (-1, 1, 1)) * self.observations.points
+        if has_one_each and any(self.observations.free_parameters):
+            changes_and_pixels = zip(change, self.observations.pixels, strict=True)
+            rays = np.stack(
+                [
+                    self.observations.camera(step).directions(pixels)
+                    for step, pixels in changes_and_pixels
+                ]
+            )
         else:
-            camera = self.seen.camera(change[0] if each else change)
-            rays = camera.directions(self.seen.pixels.reshape(-1, 2)).reshape(
-                self.seen.pixels.shape
+            camera = self.observations.camera(change[0] if has_one_each else change)
+            rays = camera.directions(self.observations.pixels.reshape(-1, 2)).reshape(
+                self.observations.pixels.shape
             )
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
-        residuals: Array = on_plane(rays, *expected) - points
-        residuals[~self.given] = 0.0
+        residuals: Array = intersect_plane(rays, *expected) - points
+        residuals[~self.point_mask] = 0.0
         return residuals
 
 
-def point_errors(camera: CameraModel, seen: Rigid, pixels: Array, points: Array) -> Array:
+def point_errors(camera: CameraModel, target_pose: Rigid, pixels: Array, points: Array) -> Array:
     """Return the distances (N,), metres, in a target's plane between rays and its points.
 
-    They are infinite for a ray that does not meet the plane in front of the camera. ``seen``:
-    ``T_camera_target``. ``pixels`` (N, 2) define the rays, ``points`` (N, 3) are on the target,
-    metres.
+    They are infinite for a ray that does not meet the plane in front of the camera.
+    ``target_pose``: ``T_camera_target``. ``pixels`` (N, 2) define the rays; ``points`` (N, 3),
+    metres, are on the target.
     """
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
-    errors: Array = np.linalg.norm(on_plane(rays, *seen) - points, axis=1)
+    errors: Array = np.linalg.norm(intersect_plane(rays, *target_pose) - points, axis=1)
     return errors
 
 
-def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
+def intersect_plane(rays: Array, turn: Array, shift: Array) -> Array:
     """Return the points at which rays (..., N, 3) from the origin meet a plane, in its frame.
 
     The result is (..., N, 3), infinite if a ray does not meet the plane. ``turn`` (..., 3, 3) is
@@ -172,223 +186,267 @@ def on_plane(rays: Array, turn: Array, shift: Array) -> Array:
     """
     # s r is in the plane where n (s r - o) = 0: s = n o / n r; then R^T (s r - o) is in its frame.
     normal = turn[..., 2]
-    along = (rays @ normal[..., None])[..., 0]
+    components = (rays @ normal[..., None])[..., 0]
     with np.errstate(all="ignore"):
-        reach = (shift * normal).sum(axis=-1)[..., None] / along
-        points: Array = (rays * reach[..., None] - shift[..., None, :]) @ turn
-    points[~(np.isfinite(reach) & (reach > 0))] = np.inf
+        factors = (shift * normal).sum(axis=-1)[..., None] / components
+        points: Array = (rays * factors[..., None] - shift[..., None, :]) @ turn
+    points[~(np.isfinite(factors) & (factors > 0))] = np.inf
     return points
 
 
 @dataclass(slots=True)
 class Candidate:
-    """One method with its solution, and how well it predicts."""
+    """A method with its solution, and the errors of its predictions."""
 
     method: str
-    besides: str  # values that are adjusted, one of :data:`ADJUSTABLE`
-    problem: Problem  # problem with these values free
+    adjusted_values: str  # values that are adjusted, one of :data:`ADJUSTABLE`
+    problem: Problem  # problem with these parameters free
     solution: Solution  # solution from all poses
     # solutions without each pose, stacked (V, ...); None with too few poses
-    others: Solution | None = None
+    left_out_solutions: Solution | None = None
     # (V, N, 3), held-out errors on the target, metres
-    off: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    # solutions that may be the right ones as well
+    held_out_vectors: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    # other solutions that are as likely
     rivals: list[Solution] = field(default_factory=list[Solution])
 
     @property
     def name(self) -> str:
         """Method, and the values that are adjusted besides the poses."""
-        return self.method if self.besides == NOTHING else f"{self.method}, {self.besides}"
+        return (
+            self.method
+            if self.adjusted_values == NOTHING
+            else f"{self.method}, {self.adjusted_values}"
+        )
 
     @property
     def errors(self) -> Array:
-        """RMS held-out error of each pose, (V,), metres; infinite if it has none."""
-        if self.others is None:
+        """RMS held-out error of each pose, (V,), metres; infinite for a pose without one."""
+        if self.left_out_solutions is None:
             return np.full(self.problem.count, np.inf)
-        squares = (self.off**2).sum(axis=(1, 2)) / self.problem.mask.sum(axis=1)
+        squares = (self.held_out_vectors**2).sum(axis=(1, 2)) / self.problem.mask.sum(axis=1)
         errors: Array = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
         return errors
 
     @property
     def held_out(self) -> float:
-        """RMS held-out error of all points, metres; infinite if a pose has none."""
+        """RMS held-out error of all points, metres; infinite if a pose has no held-out error."""
         points = self.problem.mask.sum(axis=1)
         return math.sqrt(float((points * self.errors**2).sum() / points.sum()))
 
-    def chance(self, beside: int) -> float:
+    def chance_of_change(self, always_free_count: int) -> float:
         """Return the probability that noise alone changes the additional parameters by as much.
 
-        ``beside``: how many of them, the last ones, are adjusted in any case.
+        ``always_free_count``: number of the last parameters, which are adjusted in any case.
         """
         change, information = self.solution.change, self.solution.information
-        count = len(change) - beside
+        count = len(change) - always_free_count
         if information is None or count <= 0:
             return 1.0
-        # Wald's test: without an error beside noise, x^T C^-1 x of the K parameters x is chi-square
+        # Wald's test: if all errors are noise, x^T C^-1 x of the K parameters x is chi-square
         # with K degrees of freedom; C^-1 is Schur's complement of the part of X and Z in the
         # information. If noise was estimated from few equations, it follows an F distribution (over
         # K). Source: Wald, Tests of Statistical Hypotheses Concerning Several Parameters When the
         # Number of Observations is Large (1943).
-        mixed = information[:12, 12:]
-        reduced = information[12:, 12:] - mixed.T @ solve_scaled(information[:12, :12], mixed)
-        if beside:
-            across = reduced[:count, count:]
-            reduced = reduced[:count, :count] - across @ solve_scaled(
-                reduced[count:, count:], across.T
+        coupling_to_poses = information[:12, 12:]
+        reduced = information[12:, 12:] - coupling_to_poses.T @ solve_scaled(
+            information[:12, :12], coupling_to_poses
+        )
+        if always_free_count:
+            coupling = reduced[:count, count:]
+            reduced = reduced[:count, :count] - coupling @ solve_scaled(
+                reduced[count:, count:], coupling.T
             )
         squares = float(change[:count] @ reduced @ change[:count])
         if not math.isfinite(squares):
             return 1.0
         # half of the equations each determine one of the robot's two sigmas
-        freedom = None if self.problem.sigmas else max(1, 3 * self.problem.count - 6)
+        freedom = None if self.problem.robot_sigmas else max(1, 3 * self.problem.count - 6)
         return Noise(1.0, freedom).chance(max(squares, 0.0), count)
 
 
-def candidates(
-    problem: Problem, free: Mapping[str, tuple[int, ...]], method: str = "auto"
+def fit_candidates(
+    problem: Problem, parameter_choices: Mapping[str, tuple[int, ...]], method: str = "auto"
 ) -> tuple[Candidate | None, list[Candidate]]:
     """Return the best candidate, or None if nothing fits, and all candidates.
 
-    ``free``: numbers of the parameters of each of :data:`ADJUSTABLE` that may be adjusted.
-    ``method``: ``auto``, or one of :data:`METHODS`.
+    ``parameter_choices``: numbers of the parameters of each of :data:`ADJUSTABLE` that may be
+    adjusted. ``method``: ``auto``, or one of :data:`METHODS`.
     """
-    begin = _closed(problem, method) if method in LINEAR else _begin(problem)
-    if begin is None:
+    start = _closed_form(problem, method) if method in LINEAR else _best_start(problem)
+    if start is None:
         return None, []
     if method in LINEAR:
-        only = _by_closed_form(problem, method, begin)
-        return only, [only]
-    if method == REPROJECTION and len(free) == 1:
-        ((besides, numbers),) = free.items()
-        plain = _reprojection(besides, _freed(problem, numbers), begin)
-        return plain, [plain] if plain else []
-    judges = _robots(problem, free, begin)
-    judge = _best_candidate(judges)
-    if judge is None or method == ROBOT:
-        return judge, judges
-    plain = _reprojection_beside(judge)
-    if method == REPROJECTION or plain is None:
-        return (plain if method == REPROJECTION else judge), [*judges, *([plain] if plain else [])]
-    return _likelier(judge, plain), [*judges, plain]
+        candidate = _closed_form_candidate(problem, method, start)
+        return candidate, [candidate]
+    if method == REPROJECTION and len(parameter_choices) == 1:
+        ((adjusted_values, numbers),) = parameter_choices.items()
+        reprojection = _reprojection_candidate(
+            adjusted_values, _with_free_parameters(problem, numbers), start
+        )
+        return reprojection, [reprojection] if reprojection else []
+    robot_candidates = _robot_candidates(problem, parameter_choices, start)
+    robot_candidate = _choose_values(robot_candidates)
+    if robot_candidate is None or method == ROBOT:
+        return robot_candidate, robot_candidates
+    reprojection = _reprojection_like(robot_candidate)
+    if method == REPROJECTION or reprojection is None:
+        return (reprojection if method == REPROJECTION else robot_candidate), [
+            *robot_candidates,
+            *([reprojection] if reprojection else []),
+        ]
+    return _choose_method(robot_candidate, reprojection), [*robot_candidates, reprojection]
 
 
-def _reprojection(besides: str, problem: Problem, begin: Solution) -> Candidate | None:
+def _reprojection_candidate(
+    adjusted_values: str, problem: Problem, start_solution: Solution
+) -> Candidate | None:
     """Return the candidate that takes the robot's poses as exact."""
-    start = dataclasses.replace(begin, noise=None)
-    return _candidate(REPROJECTION, besides, problem, adjust(problem.robot, problem.seen, start))
+    start = dataclasses.replace(start_solution, noise=None)
+    return _make_candidate(
+        REPROJECTION, adjusted_values, problem, adjust(problem.robot, problem.observations, start)
+    )
 
 
-def _reprojection_beside(robot: Candidate) -> Candidate | None:
-    """Return the candidate ``reprojection`` with the scale and the lens from another candidate.
+def _reprojection_like(robot: Candidate) -> Candidate | None:
+    """Return the candidate ``reprojection`` with the scale and the lens of a candidate ``robot``.
 
-    The size of a target determines its distance, which pixels alone hardly do.
+    The scale is not adjusted anew, since pixels alone hardly determine the target's distance.
     """
-    change, freed = robot.solution.change, robot.problem
-    known = dataclasses.replace(freed, seen=freed.seen.settled(change))
+    change, problem = robot.solution.change, robot.problem
+    fixed_problem = dataclasses.replace(
+        problem, observations=problem.observations.with_change(change)
+    )
     start = dataclasses.replace(robot.solution, change=np.zeros(0))
-    reprojection = _reprojection(robot.besides, known, start)
+    reprojection = _reprojection_candidate(robot.adjusted_values, fixed_problem, start)
     if reprojection is None or not len(change):
         return reprojection
-    slopes = pull(known.robot, known.seen, reprojection.solution, freed.seen.free)
+    slopes = derivatives_by_parameters(
+        fixed_problem.robot,
+        fixed_problem.observations,
+        reprojection.solution,
+        problem.observations.free_parameters,
+    )
     reprojection.problem, reprojection.solution = (
-        freed,
+        problem,
         dataclasses.replace(reprojection.solution, change=change),
     )
-    if reprojection.others is not None and robot.others is not None:
-        # without a view these values differ, too, and pull camera and target with them
-        steps = (robot.others.change - change) @ slopes.T
-        reprojection.others = dataclasses.replace(
-            reprojection.others,
-            camera=reprojection.others.camera.turned_before(steps[:, :6]),
-            target=reprojection.others.target.turned_before(steps[:, 6:]),
-            change=robot.others.change,
+    if reprojection.left_out_solutions is not None and robot.left_out_solutions is not None:
+        # without a view, scale and lens differ as well, and so do camera and target
+        steps = (robot.left_out_solutions.change - change) @ slopes.T
+        reprojection.left_out_solutions = dataclasses.replace(
+            reprojection.left_out_solutions,
+            camera=reprojection.left_out_solutions.camera.turned_before(steps[:, :6]),
+            target=reprojection.left_out_solutions.target.turned_before(steps[:, 6:]),
+            change=robot.left_out_solutions.change,
         )
-        reprojection.off = freed.off(reprojection.others)
+        reprojection.held_out_vectors = problem.error_vectors(reprojection.left_out_solutions)
     return reprojection
 
 
-def _robots(
-    problem: Problem, free: Mapping[str, tuple[int, ...]], begin: Solution
+def _robot_candidates(
+    problem: Problem, parameter_choices: Mapping[str, tuple[int, ...]], start_solution: Solution
 ) -> list[Candidate]:
-    """Return candidates that correct the robot's poses, one for each choice of free values."""
-    tried: list[Candidate] = []
-    any_size = any(0 in numbers for numbers in free.values())
-    elsewhere = _begin_of_another_size(problem) if any_size else None
-    for besides, numbers in free.items():
-        freed = _freed(problem, numbers)
-        start = tried[0].solution if tried and tried[0].besides == NOTHING else begin
-        if elsewhere is not None and 0 in numbers:
-            change = np.concatenate([elsewhere.change, np.zeros(len(numbers) - 1)])
-            start = dataclasses.replace(elsewhere, change=change)
-        if problem.sigmas is None:
-            solution = adjust_noisy(freed.robot, freed.seen, start)
+    """Return candidates that correct the robot's poses, one for each choice of parameters."""
+    candidates: list[Candidate] = []
+    is_scale_free = any(0 in numbers for numbers in parameter_choices.values())
+    other_size_start = _start_of_other_size(problem) if is_scale_free else None
+    for adjusted_values, numbers in parameter_choices.items():
+        freed_problem = _with_free_parameters(problem, numbers)
+        start = (
+            candidates[0].solution
+            if candidates and candidates[0].adjusted_values == NOTHING
+            else start_solution
+        )
+        if other_size_start is not None and 0 in numbers:
+            change = np.concatenate([other_size_start.change, np.zeros(len(numbers) - 1)])
+            start = dataclasses.replace(other_size_start, change=change)
+        if problem.robot_sigmas is None:
+            solution = adjust_with_noise(freed_problem.robot, freed_problem.observations, start)
         else:
-            solution = adjust(freed.robot, freed.seen, start, RobotNoise(problem.sigmas))
-        if (candidate := _candidate(ROBOT, besides, freed, solution)) is not None:
-            tried.append(candidate)
-    return tried
+            solution = adjust(
+                freed_problem.robot,
+                freed_problem.observations,
+                start,
+                RobotNoise(problem.robot_sigmas),
+            )
+        if (
+            candidate := _make_candidate(ROBOT, adjusted_values, freed_problem, solution)
+        ) is not None:
+            candidates.append(candidate)
+    return candidates
 
 
-def _best_candidate(judges: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate with the right choice of adjusted values.
+def _choose_values(candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the candidate that adjusts the right values.
 
-    Values that cannot be right by chance, but predict no better, or hardly, leave the choice open:
-    random halves of a recorded robot that hardly turned its camera choose differently, and lie 17
-    mm apart where 6 mm are expected of each choice alone.
+    If adjusted values are significant but hardly predict better, the choice stays open, and the
+    other solution becomes a rival. Random halves of the poses of a recorded robot that hardly
+    turned its camera choose differently: their results differ by 17 mm, while each choice alone
+    predicts a difference of 6 mm.
     """
-    if not judges:
+    if not candidates:
         return None
-    plain, *others = judges
-    beside, by_error = len(plain.solution.change), operator.attrgetter("held_out")
-    significant = [judge for judge in others if judge.chance(beside) < SIGNIFICANCE_LEVEL]
-    best, *rest = sorted([plain, *significant], key=by_error)
-    if rest and (best is plain or _gain(best, plain) < SURE_GAIN):
-        best.rivals = [rest[0].solution if best is plain else plain.solution]
+    simplest, *others = candidates
+    always_free_count, by_error = len(simplest.solution.change), operator.attrgetter("held_out")
+    significant = [
+        candidate
+        for candidate in others
+        if candidate.chance_of_change(always_free_count) < SIGNIFICANCE_LEVEL
+    ]
+    best, *runners_up = sorted([simplest, *significant], key=by_error)
+    if runners_up and (best is simplest or _gain_in_sigmas(best, simplest) < SURE_GAIN):
+        best.rivals = [runners_up[0].solution if best is simplest else simplest.solution]
     return best
 
 
-def _likelier(robot: Candidate, plain: Candidate) -> Candidate:
-    """Return ``plain`` if it predicts poses better by more than chance, else ``robot``.
+def _choose_method(robot: Candidate, reprojection: Candidate) -> Candidate:
+    """Return ``reprojection`` if it predicts poses better by more than chance, else ``robot``.
 
-    With robots that have no error but noise, ``plain`` looks better by chance, and it puts their
-    cameras up to five times as far off. By chance it is taken for two of 140 such robots, so
-    the difference of both is an error to expect until the gain is sure.
+    For robots whose only error is noise, ``reprojection`` may look better by chance, but its
+    cameras are up to five times as far off; it is chosen for two of 140 such robots. So, unless the
+    gain is sure, ``robot`` becomes a rival, whose difference is included in the covariance.
     """
-    gain = _gain(plain, robot)
+    gain = _gain_in_sigmas(reprojection, robot)
     if gain <= 1.0:
         return robot
-    plain.rivals = [*robot.rivals, *([robot.solution] if gain < SURE_GAIN else [])]
-    return plain
+    reprojection.rivals = [*robot.rivals, *([robot.solution] if gain < SURE_GAIN else [])]
+    return reprojection
 
 
-def _gain(one: Candidate, other: Candidate) -> float:
+def _gain_in_sigmas(candidate: Candidate, other: Candidate) -> float:
     """Return by how many standard errors a candidate predicts poses better than another one.
 
     Poses are independent of each other, unlike their points.
     """
-    after, before = one.errors, other.errors
-    if not (np.isfinite(before).all() and np.isfinite(after).all()):
-        return math.inf if one.held_out < other.held_out else -math.inf
-    gain = one.problem.mask.sum(axis=1) * (before**2 - after**2)
+    errors, other_errors = candidate.errors, other.errors
+    if not (np.isfinite(other_errors).all() and np.isfinite(errors).all()):
+        return math.inf if candidate.held_out < other.held_out else -math.inf
+    gain = candidate.problem.mask.sum(axis=1) * (other_errors**2 - errors**2)
     return float(gain.sum()) / max(math.sqrt(float((gain**2).sum())), 1e-300)
 
 
-def _freed(problem: Problem, numbers: tuple[int, ...]) -> Problem:
+def _with_free_parameters(problem: Problem, numbers: tuple[int, ...]) -> Problem:
     if not numbers:
         return problem
-    return dataclasses.replace(problem, seen=dataclasses.replace(problem.seen, free=numbers))
+    return dataclasses.replace(
+        problem, observations=dataclasses.replace(problem.observations, free_parameters=numbers)
+    )
 
 
-def _closed(problem: Problem, name: str, *, exactly: bool = True) -> Solution | None:
-    solution = solve_linear(name, problem.robot, problem.poses, exactly=exactly)
-    return None if solution is None else Solution(*solution, np.zeros(problem.seen.extra_count))
+def _closed_form(problem: Problem, name: str, *, use_all_views: bool = True) -> Solution | None:
+    solution = solve_linear(name, problem.robot, problem.target_poses, use_all_views=use_all_views)
+    return (
+        None
+        if solution is None
+        else Solution(*solution, np.zeros(problem.observations.extra_count))
+    )
 
 
-def _begin(problem: Problem) -> Solution | None:
-    """Return the closed form that fits best."""
+def _best_start(problem: Problem) -> Solution | None:
+    """Return the solution of the closed form that fits best; None if none fits."""
     ranked = []
     for number, name in enumerate(LINEAR):
-        solution = _closed(problem, name, exactly=False)
+        solution = _closed_form(problem, name, use_all_views=False)
         if solution is not None:
             errors = np.concatenate(problem.errors(solution))
             ranked.append((float(np.median(errors)), number, solution))
@@ -396,49 +454,57 @@ def _begin(problem: Problem) -> Solution | None:
     return min(ranked)[2] if ranked else None
 
 
-def _begin_of_another_size(problem: Problem) -> Solution | None:
-    """Return the closed form for a target of the size that the robot's motions show.
+def _start_of_other_size(problem: Problem) -> Solution | None:
+    """Return the best closed form for a target of the size that the robot's motions show.
 
-    None if that is near the nominal size, or not known.
+    None if that size is near the nominal one, or not known.
     """
-    scale = scale_of(problem.robot, problem.poses)
+    scale = estimate_scale(problem.robot, problem.target_poses)
     if scale is None or scale <= 0.0 or abs(scale - 1.0) < MAX_SIZE_ERROR_RATIO:
         return None
     change = np.array([scale - 1.0])
-    settled = _freed(problem, (0,)).seen.settled(change)
-    poses = problem.poses.scaled(scale)
-    begin = _begin(dataclasses.replace(problem, seen=settled, poses=poses))
-    return None if begin is None else dataclasses.replace(begin, change=change)
+    scaled_observations = _with_free_parameters(problem, (0,)).observations.with_change(change)
+    poses = problem.target_poses.scaled(scale)
+    start = _best_start(
+        dataclasses.replace(problem, observations=scaled_observations, target_poses=poses)
+    )
+    return None if start is None else dataclasses.replace(start, change=change)
 
 
-def _candidate(method: str, besides: str, problem: Problem, solution: Solution) -> Candidate | None:
+def _make_candidate(
+    method: str, adjusted_values: str, problem: Problem, solution: Solution
+) -> Candidate | None:
     """Return a candidate with its held-out errors; None if it does not fit."""
     if not math.isfinite(solution.cost):
         return None
-    candidate = Candidate(method, besides, problem, solution)
+    candidate = Candidate(method, adjusted_values, problem, solution)
     if problem.count > MIN_POSES:
-        candidate.others = without_each(problem.robot, problem.seen, solution)
+        candidate.left_out_solutions = leave_each_out(problem.robot, problem.observations, solution)
         try:
-            candidate.off = problem.off(candidate.others)
+            candidate.held_out_vectors = problem.error_vectors(candidate.left_out_solutions)
         except CalibrationError:  # without one of the views no lens is left
             return None
     return candidate
 
 
-def _by_closed_form(problem: Problem, name: str, solution: Solution) -> Candidate:
-    """Return a closed form with its held-out errors."""
+def _closed_form_candidate(problem: Problem, name: str, solution: Solution) -> Candidate:
+    """Return the candidate of a closed form, with its held-out errors if there are enough poses."""
     candidate, count = Candidate(name, NOTHING, problem, solution), problem.count
     if count <= MIN_POSES:
         return candidate
     numbers = np.arange(count)
-    part, others = numbers % MAX_FOLDS, [solution] * count
+    fold_of_pose, solutions = numbers % MAX_FOLDS, [solution] * count
     for fold in range(min(count, MAX_FOLDS)):
-        other = _closed(problem.subset(numbers[part != fold]), name)
-        if other is None:
+        left_out_solution = _closed_form(problem.subset(numbers[fold_of_pose != fold]), name)
+        if left_out_solution is None:
             return candidate
-        others = [other if part[i] == fold else before for i, before in enumerate(others)]
-    candidate.others = Solution(
-        Rigid.stacked(left.camera for left in others), Rigid.stacked(left.target for left in others)
+        solutions = [
+            left_out_solution if fold_of_pose[i] == fold else previous
+            for i, previous in enumerate(solutions)
+        ]
+    candidate.left_out_solutions = Solution(
+        Rigid.stacked(solution.camera for solution in solutions),
+        Rigid.stacked(solution.target for solution in solutions),
     )
-    candidate.off = problem.off(candidate.others)
+    candidate.held_out_vectors = problem.error_vectors(candidate.left_out_solutions)
     return candidate

@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam.calibration._files import storage
 from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
-from smartcam.calibration._hand_eye.model_selection import on_plane, point_errors
+from smartcam.calibration._hand_eye.model_selection import intersect_plane, point_errors
 from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view, half_turned
 from smartcam.calibration._targets import resized
 from smartcam.calibration._verdict import (
@@ -33,23 +33,23 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
 
 KIND = "hand-eye"
-"""Name of these calibrations' files in the store."""
+"""Kind of these calibrations, as their files name it."""
 
 
-def _frames(context: storage.Context, of: str) -> tuple[str, str]:
-    """Return the target frame and source frame for the pose of flange, camera or target."""
+def _frames(context: storage.Context, subject: str) -> tuple[str, str]:
+    """Return the names of the two frames of the pose of a flange, camera or target."""
     base, flange = context.get("frames", ("", ""))
-    on_flange = (of == CAMERA) == (context.get("setup") == "eye-in-hand")
-    return (base, flange) if of == "flange" else (flange if on_flange else base, of)
+    on_flange = (subject == CAMERA) == (context.get("setup") == "eye-in-hand")
+    return (base, flange) if subject == "flange" else (flange if on_flange else base, subject)
 
 
 FlangePose = Annotated[Transform, storage.motion(lambda known: _frames(known, "flange"))]
 CameraPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, CAMERA))]
 TargetPlace = Annotated[Transform, storage.motion(lambda known: _frames(known, TARGET))]
-OpenNumbers = Annotated[Array, storage.rows(storage.Number | None, least=3, nulls=True)]
-FRAMES = Annotated[tuple[str, str], storage.row(tuple[str, str])]
-SIGMAS = storage.row(tuple[storage.Number, storage.Number], RobotSigmas._make)
-COVARIANCE = storage.Form(
+NullableNumbers = Annotated[Array, storage.rows(storage.Number | None, least=3, nulls=True)]
+FrameNames = Annotated[tuple[str, str], storage.row(tuple[str, str])]
+SIGMAS_FORM = storage.row(tuple[storage.Number, storage.Number], RobotSigmas._make)
+COVARIANCE_FORM = storage.Form(
     list[list[storage.Number]] | None,
     lambda rows, _: np.full((12, 12), np.nan) if rows is None else storage.as_array(rows),
     lambda rows: rows.tolist() if np.isfinite(rows).all() else None,
@@ -104,7 +104,7 @@ class HandEyeCalibration(storage.SavedCalibration):
     _called: ClassVar[str] = "hand-eye calibration"
     _extra_keys: ClassVar[storage.ExtraKeys] = {
         "frames": (
-            FRAMES,
+            FrameNames,
             lambda result: (result.robot_poses[0].target, result.robot_poses[0].source),
         ),
         "target": (
@@ -122,12 +122,12 @@ class HandEyeCalibration(storage.SavedCalibration):
     target_scale: storage.Positive
     method: str
     candidates: dict[str, storage.Number | None]
-    errors: OpenNumbers
+    errors: NullableNumbers
     mean_error: storage.NonNegative
-    leave_one_out: OpenNumbers
+    leave_one_out: NullableNumbers
     held_out_error: storage.Number | None
-    covariance: Annotated[Array, COVARIANCE]
-    robot_sigmas: Annotated[RobotSigmas, SIGMAS] | None
+    covariance: Annotated[Array, COVARIANCE_FORM]
+    robot_sigmas: Annotated[RobotSigmas, SIGMAS_FORM] | None
     robot_poses: Annotated[tuple[FlangePose, ...], storage.AsList(3)]
     used: Annotated[tuple[bool, ...], storage.AsList(3)]
     views: Annotated[tuple[TargetView, ...], storage.AsList()] = ()
@@ -168,10 +168,10 @@ class HandEyeCalibration(storage.SavedCalibration):
         return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
 
     def judged(self) -> Judgement:
-        """Return the verdict and the advice; with few poses the error says nothing."""
+        """Return the verdict and the advice; unknown with few poses, whose error says nothing."""
         held_out, codes = self.held_out_error, {warning.code for warning in self.warnings}
         left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
-        several = "s" * (len(left_out) > 1)
+        plural = "s" * (len(left_out) > 1)
         judgement = judge(
             None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
             [
@@ -182,8 +182,8 @@ class HandEyeCalibration(storage.SavedCalibration):
             worst=1 + self.worst,
             allowed=self.allowed,
             cures=VIEW_CURES,
-            more="take more views",
-            where=f" without view{several} {', '.join(left_out)}" if left_out else "",
+            advice="take more views",
+            where=f" without view{plural} {', '.join(left_out)}" if left_out else "",
         )
         if judgement.verdict.level != "good":
             return judgement
@@ -193,12 +193,12 @@ class HandEyeCalibration(storage.SavedCalibration):
                 "moved: take more views"
             )
             return Judgement(CalibrationVerdict("unknown", text), option="more")
-        place = 1e3 * self.translation_error
-        if place > self.allowed.error:
+        position_error = 1e3 * self.translation_error
+        if position_error > self.allowed.error:
             text = (
                 f"{judgement.verdict.text}. Only while the hand is turned as in these views: the "
-                f"camera's place is known to {place:.2g} mm, so points seen at other orientations "
-                "may be that far off; views with larger turns show the place better"
+                f"camera's place is known to {position_error:.2g} mm, so points seen at other "
+                "orientations may be that far off; views with larger turns show the place better"
             )
             return judgement._replace(verdict=CalibrationVerdict("good", text))
         return judgement
@@ -215,7 +215,7 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     @property
     def worst(self) -> int:
-        """Index of the pose with the largest held-out error, or error if it has none."""
+        """Index of the pose with the largest held-out error, or error if one has none."""
         errors = self.errors if np.isnan(self.leave_one_out).any() else self.leave_one_out
         return int(np.argmax(errors))
 
@@ -262,8 +262,10 @@ class HandEyeCalibration(storage.SavedCalibration):
             CalibrationError: SHAPE or NOT_FINITE; WRONG_FRAME; OUT_OF_FIELD: a ray does not meet
                 the plane in front of the camera; NO_CALIBRATION: the calibration has no lens.
         """
-        lens, seen = self._lens("to_plane"), as_points(pixels, 2, "pixels")
-        mapped = _met(lens, seen, self.camera_at(robot_pose).inverse() @ plane, height)
+        lens, pixel_array = self._lens("to_plane"), as_points(pixels, 2, "pixels")
+        mapped = _intersect_rays(
+            lens, pixel_array, self.camera_at(robot_pose).inverse() @ plane, height
+        )
         places = plane.apply(mapped)
         check_finite(places, "to_plane: points")
         return places
@@ -301,16 +303,16 @@ class HandEyeCalibration(storage.SavedCalibration):
                 len(views),
             )
         return tuple(
-            self._errors(as_transform(pose, self._flange).undated(), view)
+            self._view_errors(as_transform(pose, self._flange_frame).undated(), view)
             for pose, view in zip(robot_poses, views, strict=True)
         )
 
-    def _errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:
+    def _view_errors(self, robot_pose: Transform, view: TargetView | Transform) -> Array:
         in_hand = self.setup == "eye-in-hand"
-        between = robot_pose.inverse() if in_hand else robot_pose
-        seen = self.camera_pose.inverse() @ between @ self.target_pose
+        carrier_motion = robot_pose.inverse() if in_hand else robot_pose
+        target_pose = self.camera_pose.inverse() @ carrier_motion @ self.target_pose
         if isinstance(view, Transform):
-            offset = seen.translation - self.target_scale * view.translation
+            offset = target_pose.translation - self.target_scale * view.translation
             return np.array([float(np.linalg.norm(offset))])
         lens = self._lens("point_errors")
         check_view(view, lens.size)
@@ -320,16 +322,21 @@ class HandEyeCalibration(storage.SavedCalibration):
                 self.views[0].target,
                 view.target,
             )
-        ways = (view, half_turned(view)) if view.target.half_turn_symmetric else (view,)
-        both = [
-            point_errors(lens, seen.rigid, shown.points, self.target_scale * shown.object_points)
-            for shown in ways
+        numberings = (view, half_turned(view)) if view.target.half_turn_symmetric else (view,)
+        errors_of_numberings = [
+            point_errors(
+                lens,
+                target_pose.rigid,
+                numbered_view.points,
+                self.target_scale * numbered_view.object_points,
+            )
+            for numbered_view in numberings
         ]
-        errors = min(both, key=lambda view_errors: float(np.median(view_errors)))
-        return errors if errors is both[0] else errors[::-1]
+        errors = min(errors_of_numberings, key=lambda view_errors: float(np.median(view_errors)))
+        return errors if errors is errors_of_numberings[0] else errors[::-1]
 
     @property
-    def _flange(self) -> str:
+    def _flange_frame(self) -> str:
         return (self.camera_pose if self.setup == "eye-in-hand" else self.target_pose).target
 
     def predicted_error(
@@ -355,17 +362,21 @@ class HandEyeCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: as for :meth:`to_plane`.
         """
-        lens, seen = self._lens("predicted_error"), as_points(pixels, 2, "pixels")
-        behind = self.camera_at(robot_pose) @ self.camera_pose.inverse()
+        lens, pixel_array = self._lens("predicted_error"), as_points(pixels, 2, "pixels")
+        carrier_pose = self.camera_at(robot_pose) @ self.camera_pose.inverse()
         # J by central differences over steps of the camera's pose; the covariance is J C J^T.
-        slopes, small = [], 1e-6
+        slopes, step = [], 1e-6
         for axis in range(6):
-            ends = []
-            for sign in (-small, small):
-                moved = self.camera_pose.rigid.turned_before(sign * np.eye(6)[axis])
-                at = behind @ Transform(self.camera_pose.target, self.camera_pose.source, *moved)
-                ends.append(_met(lens, seen, at.inverse() @ plane, 0.0))
-            slopes.append((ends[1] - ends[0]) / (2 * small))
+            shifted_points = []
+            for shift in (-step, step):
+                moved_pose = self.camera_pose.rigid.turned_before(shift * np.eye(6)[axis])
+                camera_pose = carrier_pose @ Transform(
+                    self.camera_pose.target, self.camera_pose.source, *moved_pose
+                )
+                shifted_points.append(
+                    _intersect_rays(lens, pixel_array, camera_pose.inverse() @ plane, 0.0)
+                )
+            slopes.append((shifted_points[1] - shifted_points[0]) / (2 * step))
         by_step = np.stack(slopes, axis=-1)
         joint = by_step @ self.covariance[:6, :6] @ np.swapaxes(by_step, 1, 2)
         error: Array = np.sqrt(np.trace(joint, axis1=1, axis2=2))
@@ -381,21 +392,24 @@ class HandEyeCalibration(storage.SavedCalibration):
         return self.camera
 
 
-def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
-    """Return the points at which pixels' rays meet a camera's plane; raise OUT_OF_FIELD."""
+def _intersect_rays(camera: CameraModel, pixels: Array, plane: Transform, height: float) -> Array:
+    """Return the points at which pixels' rays meet a plane, in its frame; raise OUT_OF_FIELD.
+
+    ``plane``: ``T_camera_plane``; the rays meet it at ``height`` above its z = 0, metres.
+    """
     rays = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
-    raised = plane.rotation[:, 2] * height + plane.translation
-    points = on_plane(rays, plane.rotation, raised)
-    missed = ~np.isfinite(points).all(axis=1)
-    if missed.any():
-        row = int(np.argmax(missed))
+    raised_origin = plane.rotation[:, 2] * height + plane.translation
+    points = intersect_plane(rays, plane.rotation, raised_origin)
+    is_missed = ~np.isfinite(points).all(axis=1)
+    if is_missed.any():
+        row = int(np.argmax(is_missed))
         raise Code.OUT_OF_FIELD.refusal(
             "to_plane: expected pixels whose rays meet the plane before the camera, got "
             f"{pixels[row].tolist()} in row {row}, whose ray does not",
             got=pixels[row].tolist(),
         )
-    above: Array = points + np.array([0.0, 0.0, height])
-    return above
+    in_plane: Array = points + np.array([0.0, 0.0, height])
+    return in_plane
 
 
 def as_transform(pose: Transform | Pose, flange: str) -> Transform:

@@ -20,7 +20,7 @@ from smartcam.calibration._hand_eye.equations import (
     RobotNoise,
     RobotSigmas,
     adjust,
-    sums,
+    view_products,
 )
 from smartcam.calibration._least_squares import solve_scaled
 
@@ -32,7 +32,7 @@ FIRST_SIGMAS = RobotSigmas(1e-3, 5e-4)
 """Noise of the robot that the first adjustment assumes: 0.06 degrees and half a millimetre."""
 
 MIN_SIGMAS = RobotSigmas(1e-7, 1e-8)
-"""Least noise that is considered for a robot: a hundredth of a micrometre."""
+"""Least noise that is considered for a robot: 0.1 microradian and a hundredth of a micrometre."""
 
 MAX_SIGMAS = RobotSigmas(0.3, 0.1)
 """Largest noise that is considered for a robot: 0.3 rad and 100 mm."""
@@ -42,37 +42,43 @@ FIRST_SHARED_FACTOR = 5.0
 estimated."""
 
 MAX_SHARED_FACTOR = 300.0
-"""Largest factor of the views' shared errors: with it, 100 points known to 0.1 pixels would carry
-no information."""
+"""Largest factor of the views' shared errors: 100 points known to 0.1 pixels would then carry no
+information."""
 
 COARSE_VALUES = 5
 """Each standard deviation is first tried at this many values."""
 
-MAX_ROUNDS = 4
-"""Adjusting and estimating alternate at most this many times; the estimate hardly changes after
-two."""
+MAX_ITERATIONS = 4
+"""Limit of the alternations between adjusting and estimating the noise; two are usually enough."""
 
-SETTLED_RATIO = 0.02
-"""Another round follows only if the last one changed the estimates by more than this part."""
+CONVERGED_RATIO = 0.02
+"""The alternation ends when the estimates change by less than this part."""
 
 
-def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solution:
+def adjust_with_noise(robot: RobotPoses, observations: Observations, start: Solution) -> Solution:
     """Return the adjustment with the noise that makes the observations most likely.
 
-    ``seen`` is whitened. The adjustment begins at ``start``, and with its noise if it has one.
+    ``observations`` is whitened. The adjustment begins at ``start``, and with its noise if it has
+    one.
     """
     noise = start.noise or RobotNoise(FIRST_SIGMAS, FIRST_SHARED_FACTOR)
-    adjusted = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
-    for number in range(MAX_ROUNDS):
+    adjusted = adjust(robot, observations, start, noise, min_gain=ROUGH_GAIN)
+    for iteration in range(MAX_ITERATIONS):
         if not math.isfinite(adjusted.cost):
             break
-        before = noise
-        noise = _estimate(robot, seen, adjusted, noise, search=not number and start.noise is None)
-        settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED_RATIO)
-        adjusted = adjust(robot, seen, adjusted, noise, gain=ROUGH_GAIN)
-        if settled:
+        previous = noise
+        noise = _estimate_noise(
+            robot,
+            observations,
+            adjusted,
+            noise,
+            search_everywhere=not iteration and start.noise is None,
+        )
+        has_converged = bool(np.abs(_logs(noise) - _logs(previous)).max() < CONVERGED_RATIO)
+        adjusted = adjust(robot, observations, adjusted, noise, min_gain=ROUGH_GAIN)
+        if has_converged:
             break
-    return adjust(robot, seen, adjusted, noise)
+    return adjust(robot, observations, adjusted, noise)
 
 
 def _logs(noise: RobotNoise) -> Array:
@@ -80,23 +86,29 @@ def _logs(noise: RobotNoise) -> Array:
     return logs
 
 
-def _estimate(
-    robot: RobotPoses, seen: Observations, at: Solution, noise: RobotNoise, *, search: bool
+def _estimate_noise(
+    robot: RobotPoses,
+    observations: Observations,
+    solution: Solution,
+    noise: RobotNoise,
+    *,
+    search_everywhere: bool,
 ) -> RobotNoise:
     """Return the standard deviations whose restricted likelihood is largest.
 
-    ``search``: look everywhere, not only from ``noise`` on.
+    ``search_everywhere``: search the whole range, not only from ``noise`` on.
     """
-    total = sums(robot, seen, at, poses_only=True)[0]
+    products = view_products(robot, observations, solution, poses_only=True)[0]
     low, high = np.log([*MIN_SIGMAS, 1.0]), np.log([*MAX_SIGMAS, MAX_SHARED_FACTOR])
 
     def cost(logs: Array) -> float:
-        inside = np.clip(logs, low, high)
-        beyond = float(((logs - inside) ** 2).sum())
-        return _unlikely(total, np.exp(inside)) + 1e3 * beyond
+        clipped = np.clip(logs, low, high)
+        excess = float(((logs - clipped) ** 2).sum())
+        return _likelihood_cost(products, np.exp(clipped)) + 1e3 * excess
 
     axes = [
-        np.linspace(a, b, COARSE_VALUES if search else 0) for a, b in zip(low, high, strict=True)
+        np.linspace(a, b, COARSE_VALUES if search_everywhere else 0)
+        for a, b in zip(low, high, strict=True)
     ]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
     start = min([_logs(noise), *grid], key=cost)
@@ -106,11 +118,11 @@ def _estimate(
     return RobotNoise(RobotSigmas(values[0], values[1]), values[2])
 
 
-def _unlikely(total: Array, values: Array) -> float:
+def _likelihood_cost(products: Array, values: Array) -> float:
     """Return -2 log of the restricted likelihood, without its constants.
 
-    ``total`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives by the robot's correction, by
-    the P other unknowns, and of the residuals without corrections. ``values`` (3,): sigmas of
+    ``products`` (V, 6 + P + 1, 6 + P + 1): products of the derivatives by the robot's correction,
+    by the P other unknowns, and of the residuals without corrections. ``values`` (3,): sigmas of
     rotation and translation, and the shared errors' factor.
     """
     # Residuals r = J x + B c + e, with corrections c of covariance D = diag(sigma^2) and noise e of
@@ -123,16 +135,20 @@ def _unlikely(total: Array, values: Array) -> float:
     # Source: Patterson and Thompson, Recovery of inter-block information when block sizes are
     # unequal (1971); Harville, Bayesian inference for variance components using only error
     # contrasts (1974), for the form with determinants.
-    spread = np.repeat(values[:2], 3)
-    scaled = total / values[2] ** 2
-    determinants = 12.0 * len(total) * math.log(values[2])
+    sigmas = np.repeat(values[:2], 3)
+    scaled = products / values[2] ** 2
+    determinants = 12.0 * len(products) * math.log(values[2])
     # in units of its sigma a correction has a variance of 1
-    scaled[:, :6] *= spread[:, None]
-    scaled[:, :, :6] *= spread
-    inner = scaled[:, :6, :6] + np.eye(6)
-    left = scaled[:, 6:, 6:] - scaled[:, 6:, :6] @ np.linalg.solve(inner, scaled[:, :6, 6:])
-    reduced = left.sum(axis=0)
-    outer, right = reduced[:-1, :-1], reduced[:-1, -1]
-    squares = float(reduced[-1, -1] - right @ solve_scaled(outer, right))
-    determinants += float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(outer)[1])
+    scaled[:, :6] *= sigmas[:, None]
+    scaled[:, :, :6] *= sigmas
+    correction_matrix = scaled[:, :6, :6] + np.eye(6)
+    complements = scaled[:, 6:, 6:] - scaled[:, 6:, :6] @ np.linalg.solve(
+        correction_matrix, scaled[:, :6, 6:]
+    )
+    reduced = complements.sum(axis=0)
+    matrix, right = reduced[:-1, :-1], reduced[:-1, -1]
+    squares = float(reduced[-1, -1] - right @ solve_scaled(matrix, right))
+    determinants += float(
+        np.linalg.slogdet(correction_matrix)[1].sum() + np.linalg.slogdet(matrix)[1]
+    )
     return squares + determinants

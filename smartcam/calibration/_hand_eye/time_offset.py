@@ -1,8 +1,8 @@
 """Estimate the offset between the clocks of a robot and a camera from a robot that moves.
 
-A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on it, or one that watches
-the target on its hand, sees where it really was. The right offset is the one with which poses and
-views agree best on one place of the camera.
+A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on the robot, or one
+that watches the target on its hand, sees where the robot really was. With the right offset, poses
+and views agree best on one place of the camera.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from smartcam._argument_checks import a_number, of_class, takes
 from smartcam._extras import load
 from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
 from smartcam.calibration._hand_eye.equations import RobotPoses, is_in_hand, predicted_views
-from smartcam.calibration._hand_eye.validation import seen_poses
+from smartcam.calibration._hand_eye.validation import as_target_poses
 from smartcam.calibration._jackknife import jackknife
 from smartcam.calibration._plane.validation import check_positive
 from smartcam.geometry._inside import Code, Rigid
@@ -33,15 +33,14 @@ if TYPE_CHECKING:
 COARSE_STEPS = 41
 """The whole range is first searched at this many offsets."""
 
-LEFT_OUT_PARTS = 20
-"""The offset is estimated again without each of this many parts of the views, for its sigma."""
+MAX_FOLDS = 20
+"""For its sigma, the offset is estimated again without each of this many groups of views."""
 
 MIN_VIEWS_FOR_OFFSET = 10
-"""An offset needs at least this many views: it is one more unknown, about which each view says
-little."""
+"""An offset needs at least this many views, since each view says little about it."""
 
 MAX_SIGMA_SHARE = 0.25
-"""An offset is returned only if its sigma is at most this part of the range."""
+"""An offset is returned only if its sigma is at most this part of the largest offset."""
 
 
 class TimeOffset(NamedTuple):
@@ -84,21 +83,23 @@ def estimate_time_offset(
             still; and the errors of ``calibrate_hand_eye`` about poses.
     """
     check_positive(most, "most", "seconds")
-    views = seen_poses(target_poses)
+    views = as_target_poses(target_poses)
     if len(views) < MIN_VIEWS_FOR_OFFSET:
         raise Code.TOO_FEW.unexpected(
             f"time offset: expected {MIN_VIEWS_FOR_OFFSET} views or more",
             MIN_VIEWS_FOR_OFFSET,
             len(views),
         )
-    fit = _Moving(history, views, setup, most)
-    everything = np.arange(len(views))
-    offset = fit.best(everything)
-    part = everything % LEFT_OUT_PARTS
-    folds = np.unique(part)
-    others = [fit.refined(everything[part != fold], offset) for fold in folds]
-    scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
-    sigma = max(scatter, fit.least_sigma(offset, everything))
+    fit = _OffsetFit(history, views, setup, most)
+    all_views = np.arange(len(views))
+    offset = fit.find_offset(all_views)
+    fold_of_view = all_views % MAX_FOLDS
+    folds = np.unique(fold_of_view)
+    left_out_offsets = [
+        fit.refine_offset(all_views[fold_of_view != fold], offset) for fold in folds
+    ]
+    scatter = math.sqrt(float(jackknife(np.array(left_out_offsets)[:, None])[0, 0]))
+    sigma = max(scatter, fit.noise_sigma(offset, all_views))
     if abs(offset) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
         raise Code.BAD_TIME.refusal(
             f"time offset: expected views that tell one within {most:g} s, got {offset:.3g} s with "
@@ -106,16 +107,16 @@ def estimate_time_offset(
             most,
             offset,
         )
-    return TimeOffset(offset, sigma, fit.error(0.0, everything), fit.error(offset, everything))
+    return TimeOffset(offset, sigma, fit.error(0.0, all_views), fit.error(offset, all_views))
 
 
-class _Moving:
-    """A moving robot and the views of its camera, to be compared at different offsets."""
+class _OffsetFit:
+    """The fit of an offset to a moving robot's poses and the views of its camera."""
 
     def __init__(
-        self, history: PoseHistory, views: Sequence[Transform], setup: str, most: float
+        self, history: PoseHistory, views: Sequence[Transform], setup: str, max_offset: float
     ) -> None:
-        self._history, self._most = history, most
+        self._history, self._max_offset = history, max_offset
         self._in_hand = is_in_hand(setup, "time offset")
         self._views = Rigid.stacked(view.rigid for view in views)
         for number, view in enumerate(views):
@@ -124,43 +125,47 @@ class _Moving:
                     f"time offset: expected view {number} with a time, got none", got=None
                 )
         self._times = [view.at for view in views if view.at is not None]
-        self._arm = float(np.median(np.linalg.norm(self._views.translation, axis=1)))
+        self._lever = float(np.median(np.linalg.norm(self._views.translation, axis=1)))
         check_motion(self._robot(0.0, np.arange(len(views))))
 
     def _robot(self, offset: float, index: NDArray[np.intp]) -> RobotPoses:
-        step = timedelta(seconds=offset)
-        poses = [self._history.at(self._times[i] + step).rigid for i in index.tolist()]
+        shift = timedelta(seconds=offset)
+        poses = [self._history.at(self._times[i] + shift).rigid for i in index.tolist()]
         return RobotPoses(Rigid.stacked(poses), self._in_hand)
 
     def error(self, offset: float, index: NDArray[np.intp]) -> float:
         """Return the RMS difference between poses and views at some indices, metres."""
-        robot, seen = self._robot(offset, index), self._views.subset(index)
-        solution = solve_linear("shah", robot, seen)
+        robot, target_poses = self._robot(offset, index), self._views.subset(index)
+        solution = solve_linear("shah", robot, target_poses)
         if solution is None:
             return math.inf
         turn, shift = np.split(
-            seen.steps_to(predicted_views(solution[0], robot, solution[1])), 2, axis=1
+            target_poses.steps_to(predicted_views(solution[0], robot, solution[1])), 2, axis=1
         )
-        squares = (shift**2).sum(axis=1) + self._arm**2 * (turn**2).sum(axis=1)
+        squares = (shift**2).sum(axis=1) + self._lever**2 * (turn**2).sum(axis=1)
         return math.sqrt(float(squares.mean()))
 
-    def least_sigma(self, offset: float, index: NDArray[np.intp]) -> float:
-        """Return the sigma of an offset if all errors were noise; infinite if none is better."""
+    def noise_sigma(self, offset: float, index: NDArray[np.intp]) -> float:
+        """Return the sigma of an offset if all errors are noise; infinite if it is not the best."""
         # The minimum x of a mean square m + c x^2 of n values with noise m has the variance m/cn.
-        step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -offset)
-        least, beside = (self.error(lag, index) ** 2 for lag in (offset, offset + step))
-        rise = (beside - least) / step**2
-        return math.sqrt(least / (rise * 6 * len(index))) if rise > 0 else math.inf
+        step = math.copysign(4.0 * self._max_offset / (COARSE_STEPS - 1), -offset)
+        square, next_square = (self.error(tried, index) ** 2 for tried in (offset, offset + step))
+        curvature = (next_square - square) / step**2
+        return math.sqrt(square / (curvature * 6 * len(index))) if curvature > 0 else math.inf
 
-    def best(self, index: NDArray[np.intp]) -> float:
-        """Return the best offset of the whole range."""
-        tried = np.linspace(-self._most, self._most, COARSE_STEPS)
-        return self.refined(index, min(tried.tolist(), key=lambda lag: self.error(lag, index)))
+    def find_offset(self, index: NDArray[np.intp]) -> float:
+        """Return the best offset in the whole range."""
+        offsets = np.linspace(-self._max_offset, self._max_offset, COARSE_STEPS)
+        return self.refine_offset(
+            index, min(offsets.tolist(), key=lambda offset: self.error(offset, index))
+        )
 
-    def refined(self, index: NDArray[np.intp], start: float) -> float:
-        """Return the best offset near a given one."""
-        step = 2.0 * self._most / (COARSE_STEPS - 1)
-        low, high = max(start - step, -self._most), min(start + step, self._most)
+    def refine_offset(self, index: NDArray[np.intp], start: float) -> float:
+        """Return the best offset near ``start``."""
+        step = 2.0 * self._max_offset / (COARSE_STEPS - 1)
+        low, high = max(start - step, -self._max_offset), min(start + step, self._max_offset)
         search = load("scipy.optimize").minimize_scalar
-        minimum = search(lambda lag: self.error(lag, index), bounds=(low, high), method="bounded")
+        minimum = search(
+            lambda offset: self.error(offset, index), bounds=(low, high), method="bounded"
+        )
         return float(minimum.x)

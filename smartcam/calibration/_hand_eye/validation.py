@@ -1,7 +1,7 @@
 """Check whether a robot's poses and the views belong together, and find those that do not.
 
-A closed form finds camera and target from each of many small groups of poses. The answer that fits
-most of all poses is used, so a few poses that belong to other views do not spoil the rest.
+A closed form finds camera and target from each of many small groups of poses. The result that fits
+most of the poses is used, so a few poses that belong to other views do not spoil it.
 """
 
 from __future__ import annotations
@@ -42,63 +42,63 @@ POSES_PER_GROUP: Final = 4
 """A group has this many poses, one more than a closed form needs."""
 
 MAX_GROUPS: Final = 60
-"""At most this many groups are tried: if a third of the poses is wrong, one group in six has none
-of them."""
+"""At most this many groups are tried: if a third of the poses is wrong, one group in six has no
+wrong pose."""
 
 MIN_GROSS_ERROR_RATIO: Final = 10.0
 """A pose whose error is more than this many times the median belongs to another view."""
 
 MIN_INVERTED_FIT_RATIO: Final = 5.0
-"""Poses are taken for inverted, or a view for numbered from the target's other end, only if they
-then fit this many times better."""
+"""Poses are taken as inverted, or a view as numbered from the target's other end, only if they then
+fit this many times better."""
 
 MIN_OTHER_FIT_RATIO: Final = 20.0
-"""Poses are taken for transposed, mirrored or in another unit of length only if they then fit this
+"""Poses are taken as transposed, mirrored or in another unit of length only if they then fit this
 many times better: such mistakes are rarer than a pose of another view."""
 
 WORST_USABLE_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
 """Largest noise of a usable robot: 2 degrees and 10 mm."""
 
-MILLI: Final = 1e-3
+METRES_PER_MILLIMETRE: Final = 1e-3
 
-X_MIRROR: Final = np.diag([-1.0, 1.0, 1.0])
-"""Mirror of the x axis: mirrors of other axes differ by rotations of base and flange only."""
+MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0])
+"""Mirror of the x axis; mirrors of other axes differ only by rotations of base and flange."""
 
 
-class Agreed(NamedTuple):
+class AgreedMotion(NamedTuple):
     """The poses of camera and target on which most of the robot's poses agree."""
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
-    off: Array  # (V,), error of each pose, metres on the target
+    errors: Array  # (V,), error of each pose, metres on the target
 
     @property
     def median(self) -> float:
         """Median error of all poses, metres."""
-        return float(np.median(self.off))
+        return float(np.median(self.errors))
 
-    def gross(self, limit: float) -> NDArray[np.intp]:
+    def gross_error_indices(self, limit: float) -> NDArray[np.intp]:
         """Return the indices of poses whose error is above ``limit`` and far above the others'."""
-        return np.flatnonzero(self.off > max(limit, MIN_GROSS_ERROR_RATIO * self.median))
+        return np.flatnonzero(self.errors > max(limit, MIN_GROSS_ERROR_RATIO * self.median))
 
 
-def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
+def as_target_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     """Return poses of the target in the camera's frame as a list.
 
     Raises SHAPE if these are no poses; WRONG_FRAME if they are in several frames, or inverted.
     """
     label = "pose of the target"
-    poses_seen = [
+    poses = [
         as_motion(pose, f"{label} {number}", CAMERA, TARGET)
         for number, pose in enumerate(as_list(target_poses, object, label))
     ]
-    for number, pose in enumerate(poses_seen):
-        if pose.label != poses_seen[0].label or (pose.target, pose.source) == (TARGET, CAMERA):
-            wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else poses_seen[0].label
+    for number, pose in enumerate(poses):
+        if pose.label != poses[0].label or (pose.target, pose.source) == (TARGET, CAMERA):
+            expected = f"T_{CAMERA}_{TARGET}" if number == 0 else poses[0].label
             raise Code.WRONG_FRAME.unexpected(
-                f"{label} {number}: expected {wanted}", wanted, pose.label
+                f"{label} {number}: expected {expected}", expected, pose.label
             )
-    return poses_seen
+    return poses
 
 
 def _target_extent(views: PixelObservations) -> float:
@@ -111,17 +111,17 @@ def meaningless_error(problem: Problem) -> float:
 
     It is the target's extent; without views it is half of the target's distance.
     """
-    if isinstance(problem.seen, PixelObservations):
-        return _target_extent(problem.seen)
-    return 0.5 * float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+    if isinstance(problem.observations, PixelObservations):
+        return _target_extent(problem.observations)
+    return 0.5 * float(np.median(np.linalg.norm(problem.target_poses.translation, axis=1)))
 
 
 def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
     """Return the RMS error on the target that a robot's noise causes, metres.
 
-    Assumes that a rotation moves the target in proportion to its distance from the camera.
+    A rotation is assumed to move the target in proportion to its distance from the camera.
     """
-    distance = float(np.median(np.linalg.norm(problem.poses.translation, axis=1)))
+    distance = float(np.median(np.linalg.norm(problem.target_poses.translation, axis=1)))
     return math.sqrt(2.0) * math.hypot(sigmas.translation, sigmas.rotation * distance)
 
 
@@ -130,17 +130,21 @@ def max_plausible_error(problem: Problem) -> float:
     return min(meaningless_error(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
-def agreement(problem: Problem) -> Agreed | None:
-    """Return camera and target that fit most of the poses; None if no closed form finds them."""
+def find_agreement(problem: Problem) -> AgreedMotion | None:
+    """Return the poses of camera and target that fit most of the views; None if there are none."""
     # Least median over proposals of small groups: right as long as most of the poses are.
     # Source: Rousseeuw, Least Median of Squares Regression (1984).
-    lever = _target_extent(problem.seen) if isinstance(problem.seen, PixelObservations) else 0.0
-    best: Agreed | None = None
+    lever = (
+        _target_extent(problem.observations)
+        if isinstance(problem.observations, PixelObservations)
+        else 0.0
+    )
+    best: AgreedMotion | None = None
     for indices in _groups(problem.count):
-        best = _better(problem, indices, lever, best)
+        best = _improve_agreement(problem, indices, lever, best)
     if best is not None:
-        agreeing = np.flatnonzero(best.off <= 3.0 * best.median)
-        best = _better(problem, agreeing, lever, best)
+        agreeing = np.flatnonzero(best.errors <= 3.0 * best.median)
+        best = _improve_agreement(problem, agreeing, lever, best)
     return best
 
 
@@ -153,96 +157,111 @@ def _groups(count: int) -> Iterator[NDArray[np.intp]]:
             yield np.sort(random.choice(count, POSES_PER_GROUP, replace=False))
 
 
-def _better(
-    problem: Problem, indices: NDArray[np.intp], lever: float, best: Agreed | None
-) -> Agreed | None:
-    """Return camera and target from some poses if they fit all poses better than ``best``."""
+def _improve_agreement(
+    problem: Problem, indices: NDArray[np.intp], lever: float, best: AgreedMotion | None
+) -> AgreedMotion | None:
+    """Return camera and target from the poses at ``indices`` if they fit better than ``best``."""
     for name in CLOSED_FORMS:
-        motion = solve_linear(name, problem.robot.subset(indices), problem.poses.subset(indices))
-        if motion is None:
+        motions = solve_linear(
+            name, problem.robot.subset(indices), problem.target_poses.subset(indices)
+        )
+        if motions is None:
             continue
-        expected = predicted_views(motion[0], problem.robot, motion[1])
-        tried = Agreed(*motion, _apart(problem.poses, expected, lever))
-        if best is None or tried.median < best.median:
-            best = tried
+        expected = predicted_views(motions[0], problem.robot, motions[1])
+        candidate = AgreedMotion(*motions, _pose_distances(problem.target_poses, expected, lever))
+        if best is None or candidate.median < best.median:
+            best = candidate
     return best
 
 
-def _apart(poses: Rigid, expected: Rigid, lever: float) -> Array:
-    """Return the distances (V,) of poses from the expected ones, metres at the lever's length."""
+def _pose_distances(poses: Rigid, expected: Rigid, lever: float) -> Array:
+    """Return the distances (V,) of poses from the expected ones, metres; turns act on the lever."""
     turn, shift = np.split(poses.steps_to(expected), 2, axis=1)
-    apart: Array = np.hypot(np.linalg.norm(shift, axis=1), lever * np.linalg.norm(turn, axis=1))
-    return apart
+    distances: Array = np.hypot(np.linalg.norm(shift, axis=1), lever * np.linalg.norm(turn, axis=1))
+    return distances
 
 
-def other_numbering(
-    robot: RobotPoses, poses: Rigid, turn: Rigid, lever: float
+def find_other_numbering(
+    robot: RobotPoses, poses: Rigid, half_turn: Rigid, lever: float
 ) -> NDArray[np.bool_]:
-    """Return a mask of views that number a target from its other end: at most half of them.
+    """Return a mask of the views that number a target from its other end, at most half of all.
 
-    The target looks the same after a half ``turn``, and each view alone may take either end for the
-    origin: the robot's motions show which one. ``lever``: the target's extent, metres.
+    The target looks the same after ``half_turn``, so a view alone cannot tell which end is the
+    origin; the robot's motions show it. ``lever``: the target's extent, metres.
     """
-    least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
+    least_median, is_turned = math.inf, np.zeros(poses.size, dtype=np.bool_)
     for indices, name in itertools.product(_groups(poses.size), CLOSED_FORMS):
         solution = solve_linear(name, robot.subset(indices), poses.subset(indices))
         if solution is None:
             continue
         expected = predicted_views(solution[0], robot, solution[1])
-        as_is, turned = (_apart(seen, expected, lever) for seen in (poses, poses @ turn))
-        middle = float(np.median(np.minimum(as_is, turned)))
-        if middle < least:
-            least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
-    return ~other if 2 * other.sum() > len(other) else other
+        distances, turned_distances = (
+            _pose_distances(views, expected, lever) for views in (poses, poses @ half_turn)
+        )
+        median = float(np.median(np.minimum(distances, turned_distances)))
+        if median < least_median:
+            least_median, is_turned = median, MIN_INVERTED_FIT_RATIO * turned_distances < distances
+    return ~is_turned if 2 * is_turned.sum() > len(is_turned) else is_turned
 
 
-def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
-    """Yield the poses in every other way that they may have been meant.
+def _other_readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
+    """Yield the poses as they are after undoing each of some common mistakes.
 
     Each item has the changed poses, the factor by which they must fit better, the error's code, and
-    words for what they are then taken for, and for the mistake.
+    words for the mistake.
     """
     poses, in_hand = robot.poses, robot.in_hand
-    how = "the other way round: they are inverted, or the camera is on the other side"
-    yield RobotPoses(poses, not in_hand), MIN_INVERTED_FIT_RATIO, Code.WRONG_FRAME, how
-    transposed = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
-    how = "with rotations transposed: their matrices or quaternions are inverted rotations"
-    yield RobotPoses(transposed, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how
-    mirrored = Rigid(X_MIRROR @ poses.rotation @ X_MIRROR, poses.translation @ X_MIRROR)
-    how = "in a left-handed base: expected axes x, y, z of a right hand"
-    yield RobotPoses(mirrored, in_hand), MIN_OTHER_FIT_RATIO, Code.MIRRORED, how
-    how = "as millimetres: expected metres"
-    yield RobotPoses(poses.scaled(MILLI), in_hand), MIN_OTHER_FIT_RATIO, Code.POOR_FIT, how
-    how = "with the target in millimetres: expected its lengths in metres"
-    yield RobotPoses(poses.scaled(1 / MILLI), in_hand), MIN_OTHER_FIT_RATIO, Code.POOR_FIT, how
+    reading = "the other way round: they are inverted, or the camera is on the other side"
+    yield RobotPoses(poses, not in_hand), MIN_INVERTED_FIT_RATIO, Code.WRONG_FRAME, reading
+    transposed_poses = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
+    reading = "with rotations transposed: their matrices or quaternions are inverted rotations"
+    yield RobotPoses(transposed_poses, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, reading
+    mirrored_poses = Rigid(MIRROR_X @ poses.rotation @ MIRROR_X, poses.translation @ MIRROR_X)
+    reading = "in a left-handed base: expected axes x, y, z of a right hand"
+    yield RobotPoses(mirrored_poses, in_hand), MIN_OTHER_FIT_RATIO, Code.MIRRORED, reading
+    reading = "as millimetres: expected metres"
+    yield (
+        RobotPoses(poses.scaled(METRES_PER_MILLIMETRE), in_hand),
+        MIN_OTHER_FIT_RATIO,
+        Code.POOR_FIT,
+        reading,
+    )
+    reading = "with the target in millimetres: expected its lengths in metres"
+    yield (
+        RobotPoses(poses.scaled(1 / METRES_PER_MILLIMETRE), in_hand),
+        MIN_OTHER_FIT_RATIO,
+        Code.POOR_FIT,
+        reading,
+    )
 
 
-def check_poses(problem: Problem) -> Agreed:
-    """Return the motion that most of the poses agree with.
+def check_poses(problem: Problem) -> AgreedMotion:
+    """Return the poses of camera and target with which most of the robot's poses agree.
 
-    Raises ``WRONG_FRAME`` or ``MIRRORED`` if the poses fit far better when they are read otherwise,
-    and ``POOR_FIT`` if they do not fit at all.
+    Raises ``WRONG_FRAME``, ``MIRRORED`` or ``POOR_FIT`` if the poses fit far better after undoing a
+    mistake, and ``POOR_FIT`` if they do not fit at all.
     """
-    as_given = agreement(problem)
-    error = math.inf if as_given is None else _on_target(problem, as_given)
-    for robot, min_ratio, code, how in _readings(problem.robot):
-        other = dataclasses.replace(problem, robot=robot)
-        agreed = agreement(other)
-        if agreed is None:
+    as_given = find_agreement(problem)
+    error = math.inf if as_given is None else _median_error(problem, as_given)
+    for robot, min_ratio, code, reading in _other_readings(problem.robot):
+        other_problem = dataclasses.replace(problem, robot=robot)
+        other_agreement = find_agreement(other_problem)
+        if other_agreement is None:
             continue
-        less = _on_target(other, agreed)
-        if less < max_plausible_error(other) and error > min_ratio * less:
-            off = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
+        other_error = _median_error(other_problem, other_agreement)
+        if other_error < max_plausible_error(other_problem) and error > min_ratio * other_error:
+            error_text = f"{1e3 * error:.3g} mm off" if math.isfinite(error) else "nowhere near"
             raise code.refusal(
                 "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
-                f"poses that are {off} as given, but {1e3 * less:.3g} mm when read {how}",
+                f"poses that are {error_text} as given, but {1e3 * other_error:.3g} mm when "
+                f"read {reading}",
                 "T_base_flange",
-                less,
+                other_error,
             )
-    most = max_plausible_error(problem)
-    if as_given is None or error > most:
-        off = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
-        raise poor_fit_error(f"{off}, {1e3 * most:.3g} mm at most expected", error)
+    max_error = max_plausible_error(problem)
+    if as_given is None or error > max_error:
+        error_text = f"one {1e3 * error:.3g} mm off" if math.isfinite(error) else "nothing near"
+        raise poor_fit_error(f"{error_text}, {1e3 * max_error:.3g} mm at most expected", error)
     return as_given
 
 
@@ -261,7 +280,7 @@ def poor_fit_error(actual: str, error: float | None) -> CalibrationError:
     )
 
 
-def _on_target(problem: Problem, agreed: Agreed) -> float:
+def _median_error(problem: Problem, agreed: AgreedMotion) -> float:
     """Return the median error of the points on the target, metres."""
-    solution = Solution(agreed.camera, agreed.target, np.zeros(problem.seen.extra_count))
+    solution = Solution(agreed.camera, agreed.target, np.zeros(problem.observations.extra_count))
     return float(np.median(np.concatenate(problem.errors(solution))))

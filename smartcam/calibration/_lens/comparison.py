@@ -10,12 +10,12 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, an_integer, each, or_none, takes
 from smartcam.calibration._lens.field import (
+    DEFAULT_MAP_SHAPE,
     MIN_MOTION_PLACES,
-    SHAPE,
     check_distance,
-    known_points,
-    places,
-    points_at,
+    finite_points,
+    map_pixels,
+    points_of_pixels,
     sensitivity,
 )
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
@@ -32,21 +32,21 @@ CELLS: Final = (6, 8)
 have seen the target."""
 
 SIGNIFICANCE_LEVEL: Final = 0.01
-"""If noise alone makes two calibrations differ this much with at most this probability, they do
-differ."""
+"""Two calibrations differ if the probability that noise alone makes them differ as much is below
+this value."""
 
 MIN_CHANCE: Final = 1e-9
-"""Smallest chance that is reported: the noise is not exactly normal, so smaller ones mean
+"""Smallest probability that is reported: the noise is not exactly normal, so smaller values mean
 nothing."""
 
 MAX_STEPS: Final = 50
 """The fit of the motion takes at most this many steps; it usually takes five."""
 
-SETTLED_PX: Final = 1e-9
-"""The fit ends when a step moves no point by more than this many pixels."""
+MAX_FINAL_STEP_PX: Final = 1e-9
+"""The fit of the motion ends when a step moves no point by more than this many pixels."""
 
 MIN_DIFFERENCE_PX: Final = 1e-3
-"""Two lenses do not differ where they project to within this many pixels."""
+"""Differences below this many pixels count as none."""
 
 
 class Lens(NamedTuple):
@@ -57,7 +57,7 @@ class Lens(NamedTuple):
         covariance: (4 + K, 4 + K), covariance of the lens' values; None: not known.
         points: (N, 3), places of the target's points in the camera's frame, metres; None: not
             known.
-        views: count of views from which ``covariance`` is an estimate.
+        views: number of views from which ``covariance`` was estimated.
     """
 
     camera: CameraModel
@@ -66,17 +66,17 @@ class Lens(NamedTuple):
     views: int = 1
 
     @classmethod
-    def of(cls, given: IntrinsicCalibration | CameraModel) -> Lens:
+    def of(cls, source: IntrinsicCalibration | CameraModel) -> Lens:
         """Return the lens of a calibration, or a bare lens; raise ``SHAPE`` for anything else."""
-        if isinstance(given, IntrinsicCalibration):
-            views = sum(fit.used for fit in given.views)
-            return cls(given.camera, given.covariance, given.target_points, views)
-        if isinstance(given, CameraModel):
-            return cls(given)
+        if isinstance(source, IntrinsicCalibration):
+            views = sum(fit.used for fit in source.views)
+            return cls(source.camera, source.covariance, source.target_points, views)
+        if isinstance(source, CameraModel):
+            return cls(source)
         raise Code.SHAPE.unexpected(
             "compare: expected calibrations of lenses, or camera models",
             "IntrinsicCalibration or CameraModel",
-            type(given).__name__,
+            type(source).__name__,
         )
 
 
@@ -147,7 +147,7 @@ def compare(
     b: IntrinsicCalibration | CameraModel,
     *,
     distance: float | None = None,
-    shape: tuple[int, int] = SHAPE,
+    shape: tuple[int, int] = DEFAULT_MAP_SHAPE,
 ) -> LensComparison:
     """Compare where two calibrations of one lens project the same points.
 
@@ -172,35 +172,39 @@ def compare(
 
 
 def compare_lenses(
-    a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+    a: Lens, b: Lens, *, distance: float | None = None, shape: tuple[int, int] = DEFAULT_MAP_SHAPE
 ) -> LensComparison:
     """Compare two lenses, as :func:`compare` does."""
     check_distance(distance)
-    first, second, at_infinity = a.camera, b.camera, distance is None
-    if tuple(first.size) != tuple(second.size):
+    camera_a, camera_b, at_infinity = a.camera, b.camera, distance is None
+    if tuple(camera_a.size) != tuple(camera_b.size):
         raise Code.WRONG_SIZE.refusal(
-            f"compare: expected lenses of images of one size, got {first.size[0]} x "
-            f"{first.size[1]} and {second.size[0]} x {second.size[1]} pixels",
-            first.size,
-            second.size,
+            f"compare: expected lenses of images of one size, got {camera_a.size[0]} x "
+            f"{camera_a.size[1]} and {camera_b.size[0]} x {camera_b.size[1]} pixels",
+            camera_a.size,
+            camera_b.size,
         )
-    pixels = places(first.size, shape)
-    gauge, bare = _gauge(a, b, distance)
-    motion = _align(first, second, gauge, at_infinity=at_infinity and bare)
-    points = points_at(first, pixels.reshape(-1, 2), distance)
+    pixels = map_pixels(camera_a.size, shape)
+    gauge, has_no_views = _gauge(a, b, distance)
+    motion = _align(camera_a, camera_b, gauge, at_infinity=at_infinity and has_no_views)
+    points = points_of_pixels(camera_a, pixels.reshape(-1, 2), distance)
     moved = points @ motion.rotation.T + (0.0 if at_infinity else motion.translation)
-    difference = _project(second, moved) - pixels.reshape(-1, 2)
+    difference = _project(camera_b, moved) - pixels.reshape(-1, 2)
     expected, ratio, chance = None, None, None
     if a.covariance is not None and b.covariance is not None:
         aligned = gauge @ motion.rotation.T + motion.translation
-        of_a = sensitivity(first, points, at_infinity=at_infinity).freed(sensitivity(first, gauge))
-        of_b = sensitivity(second, moved, at_infinity=at_infinity).freed(
-            sensitivity(second, aligned)
+        by_lens_a = sensitivity(camera_a, points, at_infinity=at_infinity).without_motion(
+            sensitivity(camera_a, gauge)
         )
-        spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
-        difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
-        ratio, chance = _judged(difference, spread, a.views + b.views - 2)
-        expected = (spread @ spread.swapaxes(1, 2)).reshape(*shape, 2, 2)
+        by_lens_b = sensitivity(camera_b, moved, at_infinity=at_infinity).without_motion(
+            sensitivity(camera_b, aligned)
+        )
+        deviations = np.concatenate(
+            [by_lens_a @ _square_root(a.covariance), by_lens_b @ _square_root(b.covariance)], axis=2
+        )
+        difference[~np.isfinite(deviations).all(axis=(1, 2))] = np.nan
+        ratio, chance = _test_differences(difference, deviations, a.views + b.views - 2)
+        expected = (deviations @ deviations.swapaxes(1, 2)).reshape(*shape, 2, 2)
     return LensComparison(
         distance=distance,
         pixels=pixels,
@@ -234,44 +238,44 @@ def rig_difference(
 
 
 def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
-    """Return the points that the motion is fitted to, and whether they are only directions.
+    """Return the points to which the motion is fitted, and whether neither lens has views.
 
-    They are the target's points in the cells of the image in which both have seen it, or in all
-    cells if these are too few. For lenses without views they are in the largest circle around the
-    image's centre: in corners without any view, lenses may project so differently that the camera
-    would seem turned.
+    The points are those of the target in the cells of the image in which both lenses saw it, or in
+    all cells if these are too few. For lenses without views, they are points in the largest circle
+    around the image's centre: in corners without any view, lenses may project so differently that
+    the camera would seem turned.
     """
-    finite = [(lens.camera, lens.points) for lens in (a, b) if lens.points is not None]
-    if not finite:
+    known = [(lens.camera, lens.points) for lens in (a, b) if lens.points is not None]
+    if not known:
         size = np.array(a.camera.size, dtype=np.float64)
-        pixels = places(a.camera.size, SHAPE).reshape(-1, 2)
-        inside = np.linalg.norm(pixels - (size - 1) / 2, axis=1) <= size.min() / 2
-        return known_points(points_at(a.camera, pixels[inside], distance)), True
-    cells = [_cells(camera, points) for camera, points in finite]
+        pixels = map_pixels(a.camera.size, DEFAULT_MAP_SHAPE).reshape(-1, 2)
+        is_inside = np.linalg.norm(pixels - (size - 1) / 2, axis=1) <= size.min() / 2
+        return finite_points(points_of_pixels(a.camera, pixels[is_inside], distance)), True
+    cells = [_cells(camera, points) for camera, points in known]
     common = set(cells[0]).intersection(*cells)
-    both = np.concatenate([points for _, points in finite])
-    shared = both[np.isin(np.concatenate(cells), list(common))]
-    return known_points(shared if len(common) >= MIN_MOTION_PLACES else both), False
+    all_points = np.concatenate([points for _, points in known])
+    common_points = all_points[np.isin(np.concatenate(cells), list(common))]
+    return finite_points(common_points if len(common) >= MIN_MOTION_PLACES else all_points), False
 
 
 def _cells(camera: CameraModel, points: Array) -> list[int]:
     """Return the index of the cell in which each point is seen."""
-    part = (camera.project(points) + 0.5) / camera.size * CELLS[::-1]
-    columns, rows = np.clip(np.floor(part), 0, np.array(CELLS[::-1]) - 1).astype(int).T
+    cell = (camera.project(points) + 0.5) / camera.size * CELLS[::-1]
+    columns, rows = np.clip(np.floor(cell), 0, np.array(CELLS[::-1]) - 1).astype(int).T
     cells: list[int] = (rows * CELLS[1] + columns).tolist()
     return cells
 
 
 def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity: bool) -> Rigid:
-    """Return the motion after which the second lens projects the gauge's points as the first does.
+    """Return the motion after which both lenses project the gauge's points to the same pixels.
 
     ``at_infinity``: the points are directions, so the motion is a turn. The method is Gauss-Newton.
     """
-    seen, motion = first.project(gauge), IDENTITY
+    pixels, motion = first.project(gauge), IDENTITY
     for _ in range(MAX_STEPS):
         moved = gauge @ motion.rotation.T + motion.translation
         by_motion = sensitivity(second, moved, at_infinity=at_infinity).by_motion.reshape(-1, 6)
-        residuals = (seen - _project(second, moved)).reshape(-1)
+        residuals = (pixels - _project(second, moved)).reshape(-1)
         finite = np.isfinite(residuals)
         if np.count_nonzero(finite) < len(finite) / 2:
             break
@@ -279,7 +283,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, at_infinity
             np.linalg.lstsq(by_motion[finite], residuals[finite], rcond=None)[0], dtype=np.float64
         )
         motion = motion.turned_after(step)
-        if np.abs(by_motion[finite] @ step).max() < SETTLED_PX:
+        if np.abs(by_motion[finite] @ step).max() < MAX_FINAL_STEP_PX:
             return motion
     raise Code.POOR_FIT.refusal(
         "compare: expected two calibrations of one lens, got lenses of which no motion of the "
@@ -294,37 +298,39 @@ def _project(camera: CameraModel, points: Array) -> Array:
     return np.where(finite, camera.project(np.where(finite, points, [0.0, 0.0, 1.0])), np.nan)
 
 
-def _root(covariance: Array) -> Array:
+def _square_root(covariance: Array) -> Array:
     """Return S with S S^T the covariance."""
     values, vectors = np.linalg.eigh(covariance)
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
     return root
 
 
-def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]:
+def _test_differences(difference: Array, deviations: Array, views: int) -> tuple[float, float]:
     """Return the ratio of differences (N, 2) to the expected ones, and its probability.
 
-    ``spread`` (N, 2, K): S with S S^T their covariance. ``views``: number of views behind both
-    estimates of it, minus one for each.
+    ``deviations`` (N, 2, K): S with S S^T their covariance. ``views``: number of views from which
+    both covariances were estimated, minus one for each.
     """
     # With D the covariances of the places by themselves, Q = sum of e^T D^-1 e has the mean 2 N and
     # is distributed as the sum of l times chi^2 of 1, l the eigenvalues of D^-1/2 S S^T D^-1/2,
     # which are those of S^T D^-1 S: places move together, since a lens has some ten values. So
     # Q / (2 N) is as chi^2 over its freedom, (sum l)^2 / sum l^2 (Satterthwaite, An Approximate
     # Distribution of Estimates of Variance Components, 1946); and as D is an estimate itself, it is
-    # F. Half of the views count: some tell far more than others.
+    # F. Only half of the views are counted, since some tell far more than others.
     finite = np.isfinite(difference).all(axis=1)
     if not finite.any():
         raise Code.OUT_OF_FIELD.refusal(
             "compare: expected lenses that reach the same places of the image, got none", got=0
         )
-    residuals, moves = difference[finite], spread[finite]
-    back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + MIN_DIFFERENCE_PX**2 * np.eye(2))
-    squares = float(np.einsum("ni,nij,nj->", residuals, back, residuals)) / (2 * len(residuals))
-    gram = np.einsum("nip,nij,njq->pq", moves, back, moves)
-    total, power = float(np.trace(gram)), float((gram**2).sum())
-    if power <= 0.0:  # nothing of either lens was fitted
+    residuals, finite_deviations = difference[finite], deviations[finite]
+    inverse = np.linalg.inv(
+        finite_deviations @ finite_deviations.swapaxes(1, 2) + MIN_DIFFERENCE_PX**2 * np.eye(2)
+    )
+    squares = float(np.einsum("ni,nij,nj->", residuals, inverse, residuals)) / (2 * len(residuals))
+    gram = np.einsum("nip,nij,njq->pq", finite_deviations, inverse, finite_deviations)
+    total, trace_of_square = float(np.trace(gram)), float((gram**2).sum())
+    if trace_of_square <= 0.0:  # nothing of either lens was fitted
         return math.sqrt(squares), float(squares <= 1.0)
-    known_to = Noise(1.0, max(views // 2, 1))
-    freedom = total**2 / power
-    return math.sqrt(squares), known_to.chance(freedom * squares, freedom)
+    noise = Noise(1.0, max(views // 2, 1))
+    freedom = total**2 / trace_of_square
+    return math.sqrt(squares), noise.chance(freedom * squares, freedom)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SUFFICIENT_RANGES: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
-"""Range of each quantity that is enough.
+"""Range of each quantity that counts as enough.
 
 Source: ROS' camera_calibration, calibrator.py (published).
 """
@@ -37,38 +37,43 @@ class Coverage(NamedTuple):
     @property
     def lacking(self) -> tuple[str, ...]:
         """Names of the quantities below 1."""
-        bars = self._asdict().items()
-        return tuple(name for name, value in bars if value < 1.0)
+        values = self._asdict().items()
+        return tuple(name for name, value in values if value < 1.0)
 
 
 def coverage(outlines: Sequence[Array], size: tuple[int, int]) -> Coverage:
     """Return the coverage of views: of places, sizes and tilts of the target.
 
-    For each view, x and y are the place of the target's centre within the range that it can have
-    without leaving the image, size is the square root of its part of the image's area, and skew is
-    twice the angle, in radians, by which its first corner differs from a right angle. A coverage is
-    the range of a quantity over the views, divided by its value in :data:`SUFFICIENT_RANGES`.
+    For each view, x and y are the place of the target's centre within the range in which the target
+    stays in the image. ``size`` is the square root of the target's part of the image's area, and
+    ``skew`` twice the angle, in radians, by which its first corner differs from a right angle. A
+    coverage is the range of a quantity over the views, divided by its value in
+    :data:`SUFFICIENT_RANGES`.
 
     ``outlines``: the target's four outer points in order (4, 2), pixels, of each view. ``size``:
     width and height of the images, pixels.
     """
-    seen = np.array([_quantities(outline, size) for outline in outlines])
-    ranges = np.ptp(seen, axis=0) if len(seen) else np.zeros(4)
-    full = np.array(list(SUFFICIENT_RANGES.values()))
-    return Coverage(*np.minimum(ranges / full, 1.0).tolist())
+    quantities = np.array([_quantities(outline, size) for outline in outlines])
+    ranges = np.ptp(quantities, axis=0) if len(quantities) else np.zeros(4)
+    sufficient = np.array(list(SUFFICIENT_RANGES.values()))
+    return Coverage(*np.minimum(ranges / sufficient, 1.0).tolist())
 
 
 def _quantities(outline: Array, size: tuple[int, int]) -> list[float]:
     x, y = outline.T
     # shoelace formula
     area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
-    border = math.sqrt(area)
+    side = math.sqrt(area)
     places = [
-        float(np.clip((mean - border / 2) / max(length - border, 1.0), 0.0, 1.0))
+        float(np.clip((mean - side / 2) / max(length - side, 1.0), 0.0, 1.0))
         for mean, length in zip(outline.mean(axis=0).tolist(), size, strict=True)
     ]
-    first, second = outline[0] - outline[1], outline[2] - outline[1]
-    lengths = float(np.linalg.norm(first) * np.linalg.norm(second))
-    angle = math.acos(max(-1.0, min(1.0, float(first @ second) / lengths))) if lengths else 0.0
+    first_side, second_side = outline[0] - outline[1], outline[2] - outline[1]
+    lengths = float(np.linalg.norm(first_side) * np.linalg.norm(second_side))
+    angle = (
+        math.acos(max(-1.0, min(1.0, float(first_side @ second_side) / lengths)))
+        if lengths
+        else 0.0
+    )
     skew = min(1.0, 2.0 * abs(math.pi / 2 - angle))
     return [*places, math.sqrt(area / (size[0] * size[1])), skew]

@@ -1,11 +1,11 @@
 """Compute how the error of a lens moves points over the field, beyond what a pose compensates.
 
-Two calibrations of one lens may differ without disagreeing: if the principal point is off, the
-camera seems turned by as much, and every pose that is found with that lens is turned equally. So an
-error over the field is given without the small motion of the camera that fits it best. The points
-that this motion is fitted to are a choice, the gauge: best are those of the target where the
-calibration saw it. Points that are much nearer or farther are then less certain, as in a program
-that finds the camera's pose with targets at one distance and uses it at another.
+Two calibrations of one lens may differ without disagreeing: if the principal point of one is off,
+the camera seems turned by as much, and every pose that is found with that lens is turned equally.
+So the small motion of the camera that fits an error over the field best is subtracted from the
+error. The points to which this motion is fitted, the gauge, can be chosen: best are the target's
+points where the calibration saw them. Points that are much nearer or farther are then less certain,
+as in a program that finds the camera's pose at one distance and uses it at another.
 
 Source: the idea is mrcal's (D. Kogan), which calls that motion the implied transformation; the
 formulas here are written anew.
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
     from smartcam.geometry._inside import Array
 
-SHAPE: Final = (25, 33)
-"""Rows and columns of a map: odd numbers, so that the middle is one of its places."""
+DEFAULT_MAP_SHAPE: Final = (25, 33)
+"""Rows and columns of a map: odd numbers, so that the map has a middle."""
 
 MAX_MAP_SIDE: Final = 500
 """A map has at most this many rows, and as many columns."""
 
 MAX_ROUND_TRIP_PX: Final = 1e-3
-"""A pixel whose direction is projected again comes back to within this many pixels."""
+"""A pixel is in the model's range if its direction, projected again, differs from the pixel by less
+than this."""
 
 MIN_MOTION_PLACES: Final = 6
 """A motion is fitted to at least this many places; three determine it."""
@@ -46,16 +47,16 @@ class Sensitivity(NamedTuple):
     # (N, 2, 3), derivatives by the point, pixels per metre; for directions pixels per radian
     by_point: Array
 
-    def freed(self, gauge: Sensitivity) -> Array:
-        """Return ``by_lens`` without the motion that fits best at a gauge's points."""
+    def without_motion(self, gauge: Sensitivity) -> Array:
+        """Return ``by_lens`` minus the camera motion that fits best at the gauge's points."""
         # Pixels move by B d with the lens and by A m with the motion: at the gauge m = -A_g^+ B_g d
         # leaves the least squares, so B d + A m = (B - A A_g^+ B_g) d.
         count = self.by_lens.shape[2]
         motion = np.linalg.lstsq(
             gauge.by_motion.reshape(-1, 6), gauge.by_lens.reshape(-1, count), rcond=None
         )
-        freed: Array = self.by_lens - self.by_motion @ motion[0]
-        return freed
+        remaining: Array = self.by_lens - self.by_motion @ motion[0]
+        return remaining
 
 
 def check_distance(distance: float | None) -> None:
@@ -68,8 +69,8 @@ def check_distance(distance: float | None) -> None:
         )
 
 
-def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
-    """Return pixels from corner to corner (rows, columns, 2).
+def map_pixels(size: tuple[int, int], shape: tuple[int, int]) -> Array:
+    """Return the pixels of a map that reaches from corner to corner, (rows, columns, 2).
 
     Raises ``SHAPE`` if there are fewer than 2 rows or columns, or more than 500.
     """
@@ -85,16 +86,18 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Array:
-    """Return the points (N, 3) of pixels (N, 2) at a distance, or directions at infinity.
+def points_of_pixels(camera: CameraModel, pixels: Array, distance: float | None) -> Array:
+    """Return the points (N, 3) at a distance that pixels (N, 2) show, or directions for None.
 
-    NaN where no direction leads to a pixel: a lens' model may end before the image does, and the
-    iteration that inverts it then ends elsewhere.
+    NaN where no direction leads to the pixel: the model of a lens may not reach the image's
+    corners, and the iteration that inverts the model then ends at another pixel.
     """
-    ahead = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
-    ahead[~np.isfinite(ahead).all(axis=1)] = [0.0, 0.0, 1.0]
-    distances = np.linalg.norm(camera.project(ahead) - pixels, axis=1)
-    points: Array = ahead / np.linalg.norm(ahead, axis=1, keepdims=True) * (distance or 1.0)
+    directions = np.column_stack([camera.directions(pixels), np.ones(len(pixels))])
+    directions[~np.isfinite(directions).all(axis=1)] = [0.0, 0.0, 1.0]
+    distances = np.linalg.norm(camera.project(directions) - pixels, axis=1)
+    points: Array = (
+        directions / np.linalg.norm(directions, axis=1, keepdims=True) * (distance or 1.0)
+    )
     points[~(distances < MAX_ROUND_TRIP_PX)] = np.nan
     return points
 
@@ -105,17 +108,19 @@ def sensitivity(camera: CameraModel, points: Array, *, at_infinity: bool = False
     ``at_infinity``: the points, in the camera's frame, are directions to points at infinity.
     """
     finite = np.isfinite(points).all(axis=1, keepdims=True)
-    safe = np.where(finite, points, [0.0, 0.0, 1.0])
-    at = linearize(safe, camera)
-    motion = pose_changes(at.by_point, safe)
+    safe_points = np.where(finite, points, [0.0, 0.0, 1.0])
+    projection = linearize(safe_points, camera)
+    motion = pose_changes(projection.by_point, safe_points)
     if at_infinity:
         motion[:, :, 3:] = 0.0
     missing = np.where(finite, 0.0, np.nan)[:, :, None]
-    return Sensitivity(at.by_lens + missing, motion + missing, at.by_point + missing)
+    return Sensitivity(
+        projection.by_lens + missing, motion + missing, projection.by_point + missing
+    )
 
 
-def known_points(points: Array) -> Array:
-    """Return those points (N, 3) that are not NaN; raise ``OUT_OF_FIELD`` if they are too few."""
+def finite_points(points: Array) -> Array:
+    """Return the points (N, 3) that are not NaN; raise ``OUT_OF_FIELD`` if there are too few."""
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) < MIN_MOTION_PLACES:
         raise Code.OUT_OF_FIELD.refusal(

@@ -1,7 +1,7 @@
-"""Suggest the next view of the target: the one that makes the lens most certain.
+"""Suggest the next view of the target: the view that reduces the lens' uncertainty most.
 
-For each of many possible views the uncertainty of the lens with that view is computed, from the
-calibration's covariance and from the information that the view would add. That needs no image.
+The uncertainty of the lens with each of many possible views is predicted, without an image, from
+the calibration's covariance and from the information that the view would add.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from smartcam.calibration._least_squares import inverse_scaled
 from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Sight
 from smartcam.calibration._lens.field import (
     check_distance,
-    known_points,
-    places,
-    points_at,
+    finite_points,
+    map_pixels,
+    points_of_pixels,
     sensitivity,
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
@@ -44,31 +44,31 @@ ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
 """Rows that the target may be brought to, as parts of its range in the image."""
 
 SIZES: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
-"""Parts of the image's width or height that the target may take."""
+"""Parts of the image's width or height that the target may fill."""
 
 MAX_TILT_DEG: Final = 35.0
-"""Largest tilt of a suggested view, degrees: more adds little information and is hard to detect."""
+"""Tilt of the suggested tilted views, degrees: a larger one adds little and is hard to detect."""
 
 SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
 """Side of the target that is farther away, and the camera's axis that the target is tilted
 about."""
 
 MARGIN_RATIO: Final = 0.02
-"""Each side of the image keeps this part free beside the target."""
+"""Margin that stays free between the target and each side of the image, as a part of that side."""
 
 MAX_STEPS: Final = 12
-"""A target is moved to its place in at most this many steps; most are there after five."""
+"""A target is moved to its place in at most this many steps; five are usually enough."""
 
 MAP_SHAPE: Final = (9, 12)
 """Rows and columns of the map over which the uncertainty is averaged."""
 
 MAX_SAME_RAY_RADIANS: Final = 1e-3
-"""A point that lies off the ray of its own pixel by more than this angle, radians, is where the
-lens' model is not valid."""
+"""The lens' model is not valid at a point that is off the ray of its own pixel by more than this
+angle, radians."""
 
 
 class NextView(NamedTuple):
-    """A view that may be taken.
+    """A view that may be taken next.
 
     Attributes:
         text: text for people: place and tilt of the target.
@@ -86,7 +86,7 @@ class NextView(NamedTuple):
 
 
 class CandidateViews(NamedTuple):
-    """C views that could be taken; all of their points are inside of the image."""
+    """C views that could be taken; all points of the target would be inside of the image."""
 
     texts: list[str]
     poses: Rigid  # ``T_camera_target`` of each
@@ -108,13 +108,13 @@ def suggest_views(
 ) -> list[NextView]:
     """Return views that could be taken next, the most useful one first.
 
-    They are taken from about a hundred: nine places in the image, three distances, head-on and
+    They are chosen from about a hundred: nine places in the image, three distances, head-on and
     tilted to four sides. Each is assumed to show all of the target's points, with the noise of the
     calibration's views. They are ranked by the mean of :meth:`IntrinsicCalibration.uncertainty`.
 
     Args:
         calibration: calibration from the views so far.
-        distance: distance at which the uncertainty counts, metres; None: infinity.
+        distance: distance of the points whose uncertainty counts, metres; None: infinity.
         roll: turn of the target about the line of sight, radians; 0 is upright.
         target: the target to be shown; None: that of the views.
 
@@ -123,16 +123,16 @@ def suggest_views(
     """
     check_distance(distance)
     camera = calibration.camera
-    shown = target or calibration.views[0].view.target
-    suggestions = candidates(camera, shown, roll)
-    basis = _fitted(calibration.covariance)
-    start, times = _mixed_covariance(calibration, basis)
-    weight = basis.T @ _criterion(calibration, distance) @ basis
-    added = _informations(camera, suggestions.poses, shown.points, basis)
-    added = added / (_variance(calibration) * times)
-    after = np.linalg.inv(np.linalg.inv(start) + added)
-    means = np.sqrt(np.maximum(np.einsum("cij,ji->c", after, weight), 0.0) / 2)
-    present = math.sqrt(max(float(np.einsum("ij,ji->", start, weight)), 0.0) / 2)
+    shown_target = target or calibration.views[0].view.target
+    suggestions = candidate_views(camera, shown_target, roll)
+    basis = _fitted_basis(calibration.covariance)
+    covariance, scatter_ratio = _mixed_covariance(calibration, basis)
+    weight = basis.T @ _mean_variance_matrix(calibration, distance) @ basis
+    information = _information_matrices(camera, suggestions.poses, shown_target.points, basis)
+    information = information / (_point_variance(calibration) * scatter_ratio)
+    new_covariances = np.linalg.inv(np.linalg.inv(covariance) + information)
+    means = np.sqrt(np.maximum(np.einsum("cij,ji->c", new_covariances, weight), 0.0) / 2)
+    present = math.sqrt(max(float(np.einsum("ij,ji->", covariance, weight)), 0.0) / 2)
     return [
         NextView(
             suggestions.texts[number],
@@ -145,14 +145,14 @@ def suggest_views(
     ]
 
 
-def _variance(calibration: IntrinsicCalibration) -> float:
+def _point_variance(calibration: IntrinsicCalibration) -> float:
     """Return the variance of a coordinate in the views so far, pixels^2."""
     sigmas = np.concatenate([fit.view.sigmas for fit in calibration.views if fit.used])
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
-def _fitted(covariance: Array) -> Array:
-    """Return the derivatives (4 + K, F) of all values by those that were fitted."""
+def _fitted_basis(covariance: Array) -> Array:
+    """Return the derivatives (4 + K, F) of the lens' values by the F that were fitted."""
     columns, fixed = np.eye(len(covariance)), np.diag(covariance) <= 0.0
     # fx and fy are one unknown
     if not fixed[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):
@@ -164,8 +164,8 @@ def _fitted(covariance: Array) -> Array:
 def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, float]:
     """Return the covariance of the fitted values (F, F), and its ratio to that of noise alone.
 
-    V views determine the covariance along V directions only. So it is mixed: V / (V + F) of it
-    comes from the views' scatter, the rest from the noise of the points times that ratio.
+    V views determine the covariance along V directions only. So the result is a mean with weights:
+    V / (V + F) for the scatter of the views, the rest for the noise of the points times the ratio.
     """
     used = [fit for fit in calibration.views if fit.used]
     points = None
@@ -175,118 +175,130 @@ def _mixed_covariance(calibration: IntrinsicCalibration, basis: Array) -> tuple[
     bundle = Bundle.single(calibration.camera, poses, basis, points)
     sights = [Sight(0, number, fit.view) for number, fit in enumerate(used)]
     equations = BundleEquations(bundle, sights, calibration.sigma**2)
-    information = equations.normal(bundle).reduced()[0]
-    back = np.linalg.pinv(basis)
-    scattered, count = back @ calibration.covariance @ back.T, len(information)
-    times = float(np.trace(information @ scattered)) / max(count, 1)
-    part = len(used) / (len(used) + count)
-    by_noise = times * inverse_scaled(information)
-    return part * scattered + (1.0 - part) * by_noise, max(times, 1e-12)
+    information = equations.normal(bundle).eliminate_poses()[0]
+    inverse = np.linalg.pinv(basis)
+    scatter_covariance, count = inverse @ calibration.covariance @ inverse.T, len(information)
+    scatter_ratio = float(np.trace(information @ scatter_covariance)) / max(count, 1)
+    share = len(used) / (len(used) + count)
+    noise_covariance = scatter_ratio * inverse_scaled(information)
+    return share * scatter_covariance + (1.0 - share) * noise_covariance, max(scatter_ratio, 1e-12)
 
 
-def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Array:
+def _mean_variance_matrix(calibration: IntrinsicCalibration, distance: float | None) -> Array:
     """Return M such that ``trace(C M)`` is the mean variance of a coordinate for a covariance C."""
     camera = calibration.camera
-    points = points_at(camera, places(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
-    field = sensitivity(camera, known_points(points), at_infinity=distance is None)
-    freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
-    criterion: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
+    points = points_of_pixels(camera, map_pixels(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
+    field = sensitivity(camera, finite_points(points), at_infinity=distance is None)
+    by_lens = field.without_motion(sensitivity(camera, finite_points(calibration.target_points)))
+    criterion: Array = np.einsum("nip,niq->pq", by_lens, by_lens) / len(by_lens)
     return criterion
 
 
-def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:
-    """Return each view's information on the fitted values (C, F, F), at a variance of 1 pixel^2."""
-    # The pose is unknown, too, so that B^T B becomes B^T B - B^T A (A^T A)^-1 A^T B.
+def _information_matrices(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:
+    """Return the information (C, F, F) of each view on the fitted values, for 1 pixel of noise."""
+    # The pose of the view is unknown, so B^T B becomes B^T B - B^T A (A^T A)^-1 A^T B.
     shape = (poses.size, 2 * len(points), -1)
     turned = points @ poses.rotation.swapaxes(1, 2)
     in_camera = (turned + poses.translation[:, None]).reshape(-1, 3)
-    at = sensitivity(camera, in_camera)
-    by_lens = (at.by_lens @ basis).reshape(shape)
-    by_pose = pose_changes(at.by_point, turned.reshape(-1, 3)).reshape(shape)
-    both = by_pose.swapaxes(1, 2) @ by_lens
-    inner = by_pose.swapaxes(1, 2) @ by_pose
-    left: Array = by_lens.swapaxes(1, 2) @ by_lens - both.swapaxes(1, 2) @ np.linalg.solve(
-        inner, both
+    projection = sensitivity(camera, in_camera)
+    by_lens = (projection.by_lens @ basis).reshape(shape)
+    by_pose = pose_changes(projection.by_point, turned.reshape(-1, 3)).reshape(shape)
+    mixed = by_pose.swapaxes(1, 2) @ by_lens
+    pose_information = by_pose.swapaxes(1, 2) @ by_pose
+    information: Array = by_lens.swapaxes(1, 2) @ by_lens - mixed.swapaxes(1, 2) @ np.linalg.solve(
+        pose_information, mixed
     )
-    return left
+    return information
 
 
-def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> CandidateViews:
+def candidate_views(camera: CameraModel, target: Target, roll: float = 0.0) -> CandidateViews:
     """Return possible views of a target that is turned by ``roll`` about the line of sight."""
     low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
     centre = np.append((low + high) / 2, 0.0)
-    half = (high - low) / 2
-    rim = np.array(
+    half_size = (high - low) / 2
+    unit_rim = np.array(
         [[-1, -1], [1, -1], [1, 1], [-1, 1], [0, -1], [1, 0], [0, 1], [-1, 0]], dtype=np.float64
     )
-    around = np.column_stack([rim * half, np.zeros(len(rim))])
+    rim_points = np.column_stack([unit_rim * half_size, np.zeros(len(unit_rim))])
     tilts = {"": (0.0, 0.0), **SIDES}
-    ways = list(itertools.product(SIZES, ROWS, COLUMNS, tilts))
-    turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(MAX_TILT_DEG)
+    combinations = list(itertools.product(SIZES, ROWS, COLUMNS, tilts))
+    turns = np.array([[*tilts[side], 0.0] for *_, side in combinations]) * math.radians(
+        MAX_TILT_DEG
+    )
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
-    turned = around @ rotations.swapaxes(1, 2)
-    fills, parts = np.array([fill for fill, *_ in ways]), np.array([[u, v] for _, v, u, _ in ways])
-    shifts = _placed(camera, turned, fills, parts)
+    turned = rim_points @ rotations.swapaxes(1, 2)
+    fills, fractions = (
+        np.array([fill for fill, *_ in combinations]),
+        np.array([[u, v] for _, v, u, _ in combinations]),
+    )
+    shifts = _place_targets(camera, turned, fills, fractions)
     poses = Rigid(rotations, shifts - rotations @ centre)
-    good = _visible(camera, turned + shifts[:, None])
-    chosen = np.flatnonzero(good).tolist()
-    corners = (turned[good, :4] + shifts[good, None]).reshape(-1, 3)
+    visible = _is_visible(camera, turned + shifts[:, None])
+    indices = np.flatnonzero(visible).tolist()
+    corners = (turned[visible, :4] + shifts[visible, None]).reshape(-1, 3)
     return CandidateViews(
-        [_words(*ways[number], roll) for number in chosen],
-        poses.subset(chosen),
+        [_describe(*combinations[number], roll) for number in indices],
+        poses.subset(indices),
         camera.project(corners).reshape(-1, 4, 2),
     )
 
 
-def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> Array:
-    """Return the centres (C, 3) at which targets appear in the wanted places.
+def _place_targets(camera: CameraModel, turned: Array, fills: Array, fractions: Array) -> Array:
+    """Return the centres (C, 3) of targets that appear in the wanted places of the image.
 
-    ``turned`` (C, 8, 3): their rims around their centres, in the camera's axes. ``fills`` (C,) says
-    how much of the image they take, ``parts`` (C, 2) their place within the room that is left.
+    ``turned`` (C, 8, 3): points on the rim of each target, relative to its centre, along the
+    camera's axes. ``fills`` (C,): part of the image's width or height that the target fills.
+    ``fractions`` (C, 2): place of the target within the rest of the image, from 0 to 1.
     """
     size = np.array(camera.size, dtype=np.float64)
     extent = float(np.linalg.norm(turned, axis=2).max())
     depth = 2 * extent * camera.matrix[0, 0] / (fills * size[0])
-    at = np.broadcast_to((size - 1) / 2, (len(turned), 2)).copy()
+    centres = np.broadcast_to((size - 1) / 2, (len(turned), 2)).copy()
     shifts = np.zeros((len(turned), 3))
     for _ in range(MAX_STEPS):
-        ahead = np.column_stack([camera.directions(at), np.ones(len(at))])
-        shifts = ahead * depth[:, None]
-        seen = camera.project((turned + shifts[:, None]).reshape(-1, 3)).reshape(len(at), -1, 2)
-        first, last = seen.min(axis=1), seen.max(axis=1)
-        wide = last - first
-        lowest, room = (
-            MARGIN_RATIO * size + wide / 2,
-            np.maximum((1 - 2 * MARGIN_RATIO) * size - wide, 0.0),
+        directions = np.column_stack([camera.directions(centres), np.ones(len(centres))])
+        shifts = directions * depth[:, None]
+        pixels = camera.project((turned + shifts[:, None]).reshape(-1, 3)).reshape(
+            len(centres), -1, 2
         )
-        step = lowest + room * parts - (first + last) / 2
-        at = np.clip(at + np.nan_to_num(step), 0.0, size - 1)
-        depth = depth * np.nan_to_num(np.clip((wide / size).max(axis=1) / fills, 0.7, 1.5), nan=1.5)
+        first, last = pixels.min(axis=1), pixels.max(axis=1)
+        extents = last - first
+        lowest_centre, room = (
+            MARGIN_RATIO * size + extents / 2,
+            np.maximum((1 - 2 * MARGIN_RATIO) * size - extents, 0.0),
+        )
+        step = lowest_centre + room * fractions - (first + last) / 2
+        centres = np.clip(centres + np.nan_to_num(step), 0.0, size - 1)
+        depth = depth * np.nan_to_num(
+            np.clip((extents / size).max(axis=1) / fills, 0.7, 1.5), nan=1.5
+        )
     return shifts
 
 
-def _visible(camera: CameraModel, points: Array) -> Mask:
+def _is_visible(camera: CameraModel, points: Array) -> Mask:
     """Return a mask of views whose points (C, N, 3) lie in the image, where the model is valid."""
-    flat = points.reshape(-1, 3)
-    seen = camera.project(flat)
-    inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)
-    back = points_at(camera, np.where(inside, seen, 0.0), None)
-    ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
-    error = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
-    good: Mask = error.max(axis=1) < MAX_SAME_RAY_RADIANS
-    return good
+    all_points = points.reshape(-1, 3)
+    pixels = camera.project(all_points)
+    is_inside = ((pixels >= 0.0) & (pixels <= np.array(camera.size) - 1.0)).all(
+        axis=1, keepdims=True
+    )
+    round_trip = points_of_pixels(camera, np.where(is_inside, pixels, 0.0), None)
+    directions = all_points / np.linalg.norm(all_points, axis=1, keepdims=True)
+    error = np.where(is_inside, np.abs(round_trip - directions), np.inf).reshape(len(points), -1)
+    is_visible: Mask = error.max(axis=1) < MAX_SAME_RAY_RADIANS
+    return is_visible
 
 
-def _words(fill: float, row: float, column: float, side: str, roll: float) -> str:
-    across, down = COLUMNS[column], ROWS[row]
+def _describe(fill: float, row: float, column: float, side: str, roll: float) -> str:
+    column_name, row_name = COLUMNS[column], ROWS[row]
     place = {
         (True, True): "in the middle of the image",
-        (True, False): f"at the {across} edge of the image",
-        (False, True): f"at the {down} edge of the image",
-        (False, False): f"in the {down} {across} corner of the image",
+        (True, False): f"at the {column_name} edge of the image",
+        (False, True): f"at the {row_name} edge of the image",
+        (False, False): f"in the {row_name} {column_name} corner of the image",
     }[row == 0.5, column == 0.5]
-    tilted = f"tilted by {MAX_TILT_DEG:.0f} degrees, its {side} side farther away"
-    tilt = tilted if side else "not tilted"
-    turned = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
-    return f"{place}, {SIZES[fill]}, {tilt}{turned}"
+    tilt_text = f"tilted by {MAX_TILT_DEG:.0f} degrees, its {side} side farther away"
+    tilt = tilt_text if side else "not tilted"
+    roll_text = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
+    return f"{place}, {SIZES[fill]}, {tilt}{roll_text}"

@@ -16,7 +16,7 @@ from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, camera_covariance
 from smartcam.calibration._lens.coverage import Coverage, coverage
-from smartcam.calibration._lens.field import SHAPE, places, points_at
+from smartcam.calibration._lens.field import DEFAULT_MAP_SHAPE, map_pixels, points_of_pixels
 from smartcam.calibration._lens.poses import (
     CAMERA,
     TARGET,
@@ -27,12 +27,12 @@ from smartcam.calibration._lens.poses import (
     view_rms,
 )
 from smartcam.calibration._lens.projection import whitening
-from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, Sheet, choose_shape
+from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS, SheetOption, choose_shape
 from smartcam.calibration._lens.start import fit_lens, parameter_names
-from smartcam.calibration._lens.suspicions import examined
+from smartcam.calibration._lens.suspicions import examine_views
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
 from smartcam.calibration._one_blas_thread import one_blas_thread
-from smartcam.calibration._views import TargetView, as_list, as_views, label
+from smartcam.calibration._views import TargetView, as_list, as_views, view_name
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Array, Code, Remark, Rigid, check_choice
 
@@ -42,43 +42,46 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.bundle import AdjustedBundle
     from smartcam.geometry._inside import DistortionModel
 
-Bar = Annotated[storage.NonNegative, Field(le=1)]
-BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
+CoverageValue = Annotated[storage.NonNegative, Field(le=1)]
+COVERAGE_FORM = storage.row(
+    tuple[CoverageValue, CoverageValue, CoverageValue, CoverageValue], Coverage._make
+)
 
 MIN_VIEWS: Final = 3
-"""At least this many views are needed: two without noise determine a lens, a third one shows the
-noise."""
+"""At least this many views are needed: two views determine a lens, and a third one shows how much
+noise the points have."""
 
 MIN_TILT_RADIANS: Final = math.radians(5.0)
-"""The two most different planes must enclose this angle: parallel planes leave the focal length
-open."""
+"""The two most different orientations of the target must differ by this angle: parallel planes do
+not determine the focal length."""
 
 MIN_MOTION_SHARE: Final = 0.02
-"""Views whose points are closer together than this part of the image's longer side are one view."""
+"""Views count as the same view unless a point moves by this part of the image's longer side."""
 
 MAX_FOCAL_SIGMA_RATIO: Final = 0.1
 """The focal length is not determined if its standard deviation is more than this part of it."""
 
 BAD_VIEW_RATIO: Final = 3.0
-"""A view is bad if its weighted RMS is more than this many times the median of the others: healthy
-ones reach 1.6 (measured)."""
+"""A view is bad if its weighted RMS is more than this many times the median of the other views:
+good views reach 1.6 (measured)."""
 
 MAX_BAD_VIEW_SHARE: Final = 1 / 3
 """At most this part of the views may be left out."""
 
 MIN_REACHED_SHARE: Final = 0.9
-"""If the lens' model reaches less than this part of the image, a warning says so: wide lenses may
-miss corners."""
+"""A warning says if the lens' model describes less than this part of the image: models of wide
+lenses may not reach the corners."""
 
 POOR_FIT_RMS_PX: Final = 1.0
 """Residual RMS, pixels, above which the model of the lens, or the sheet, may be wrong."""
 
-MAX_ROUNDS: Final = 10
-"""Fits of a sheet's shape and of its numbers in turn; 16 views, half of them turned, take four."""
+MAX_ITERATIONS: Final = 10
+"""Alternations between fitting the sheet's shape and renumbering views; 16 views, half of them
+turned, take four."""
 
 MAX_RENUMBERED_RMS_SHARE: Final = 0.7
-"""Views are numbered anew only if that leaves less than this part of the residuals. A sheet that
-bends by 0.6 mm to one side leaves 0.4 and less (simulated)."""
+"""Views are renumbered only if the RMS of the residuals is then less than this part of that before:
+for a sheet that bends by 0.6 mm to one side it is 0.4 or less (simulated)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,7 +145,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     rms: storage.NonNegative
     sigma: storage.NonNegative
     held_out: storage.NumberOrNaN
-    coverage: Annotated[Coverage, BARS]
+    coverage: Annotated[Coverage, COVERAGE_FORM]
     sheet: storage.SheetOffsets | None
     warnings: storage.Remarks
 
@@ -162,11 +165,11 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(fit.view, number) for number, fit in enumerate(self.views) if not fit.used
+            view_name(fit.view, number) for number, fit in enumerate(self.views) if not fit.used
         )
 
     def uncertainty(
-        self, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
+        self, *, distance: float | None = None, shape: tuple[int, int] = DEFAULT_MAP_SHAPE
     ) -> ProjectionUncertainty:
         """Return a map of the uncertainty with which the lens projects, over its field.
 
@@ -211,19 +214,19 @@ class IntrinsicCalibration(storage.SavedCalibration):
             CalibrationError: ``DIFFERENT_TARGETS``; and those of
                 :func:`~smartcam.calibration.locate`.
         """
-        return tuple(self._errors(view) for view in views)
+        return tuple(self._view_errors(view) for view in views)
 
-    def _errors(self, view: TargetView) -> Array:
-        first = self.views[0].view.target
-        if self.sheet is not None and view.target != first:
+    def _view_errors(self, view: TargetView) -> Array:
+        target = self.views[0].view.target
+        if self.sheet is not None and view.target != target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"point_errors: expected views of {first}, whose points were adjusted, got one of "
+                f"point_errors: expected views of {target}, whose points were adjusted, got one of "
                 f"{view.target}",
-                first,
+                target,
                 view.target,
             )
         pose = Rigid.stacked([locate(view, self.camera).transform.rigid])
-        points = None if self.sheet is None else first.points + self.sheet
+        points = None if self.sheet is None else target.points + self.sheet
         bundle = Bundle.single(self.camera, pose, points=points)
         return adjust(bundle, [Sight(0, 0, view)], self.sigma**2).residuals[0]
 
@@ -249,7 +252,7 @@ def calibrate_intrinsics(
     *,
     distortion_model: DistortionModel = "plumb_bob",
     fixed: Iterable[str] = (),
-    sheet: Sheet = "auto",
+    sheet: SheetOption = "auto",
     drop_bad: bool = True,
 ) -> IntrinsicCalibration:
     """Calibrate a lens from views of a target.
@@ -284,100 +287,107 @@ def calibrate_intrinsics(
             is unknown, or these are no views; ``NOT_FINITE`` pixels; ``MIRRORED``: a view shows the
             target as in a mirror; ``POOR_FIT``: no lens of this model fits the views.
     """
-    given = as_views(views, "intrinsics")
-    check_choice(sheet, get_args(Sheet), "sheet")
-    check_views(given, "intrinsics", MIN_VIEWS)
-    _check_motion(given)
+    all_views = as_views(views, "intrinsics")
+    check_choice(sheet, get_args(SheetOption), "sheet")
+    check_views(all_views, "intrinsics", MIN_VIEWS)
+    _check_motion(all_views)
     fixed_names = tuple(as_list(fixed, str, "fixed: name"))
-    used = list(range(len(given)))
+    used = list(range(len(all_views)))
     while True:
-        adjusted = fit_lens([given[number] for number in used], distortion_model, fixed_names)
-        worst, ratio = worst_view([given[number] for number in used], adjusted)
-        dropped = len(given) - len(used) + 1
-        enough = len(used) > MIN_VIEWS and dropped <= MAX_BAD_VIEW_SHARE * len(given)
-        if ratio <= BAD_VIEW_RATIO or not (drop_bad and enough):
+        adjusted = fit_lens([all_views[number] for number in used], distortion_model, fixed_names)
+        worst, ratio = worst_view([all_views[number] for number in used], adjusted)
+        dropped_count = len(all_views) - len(used) + 1
+        can_drop = len(used) > MIN_VIEWS and dropped_count <= MAX_BAD_VIEW_SHARE * len(all_views)
+        if ratio <= BAD_VIEW_RATIO or not (drop_bad and can_drop):
             break
         del used[worst]
     check_tilts(adjusted, "intrinsics")
     bad = [used[worst]] if ratio > BAD_VIEW_RATIO else []
-    calibration = _summary(
-        given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
+    calibration = _build_calibration(
+        all_views, used, adjusted, [*bad, *sorted(set(range(len(all_views))) - set(used))], sheet
     )
-    turned = list[str]()
-    target = given[0].target
+    renumbered = list[str]()
+    target = all_views[0].target
     if target.half_turn_symmetric and sheet != "exact" and len(target.points) <= MAX_FREE_POINTS:
-        calibration, turned = _numbered_alike(calibration, distortion_model, fixed_names, sheet)
-    again = functools.partial(
+        calibration, renumbered = _renumber_views(calibration, distortion_model, fixed_names, sheet)
+    recalibrate = functools.partial(
         calibrate_intrinsics,
         distortion_model=distortion_model,
         fixed=fixed_names,
         sheet=sheet,
         drop_bad=drop_bad,
     )
-    calibration = examined(calibration, again, drop=drop_bad)
-    if not turned:
+    calibration = examine_views(calibration, recalibrate, drop_strays=drop_bad)
+    if not renumbered:
         return calibration
     remark = Code.SHEET_NOT_EXACT.remark(
-        f"the target looks the same after half a turn, and its shape shows that {', '.join(turned)}"
-        " numbered it from its other end than the rest; they are numbered as the rest here"
+        f"the target looks the same after half a turn, and its shape shows that "
+        f"{', '.join(renumbered)} numbered it from its other end than the rest; they are "
+        "numbered as the rest here"
     )
     return dataclasses.replace(calibration, warnings=(*calibration.warnings, remark))
 
 
-def _numbered_alike(
-    calibration: IntrinsicCalibration, model: DistortionModel, held: tuple[str, ...], sheet: Sheet
+def _renumber_views(
+    calibration: IntrinsicCalibration,
+    model: DistortionModel,
+    fixed: tuple[str, ...],
+    sheet: SheetOption,
 ) -> tuple[IntrinsicCalibration, list[str]]:
     """Return the calibration from views numbered from one end, and the names of turned views.
 
-    Without turned views, and if the shape of the sheet does not explain far more then, the
-    calibration is ``calibration``.
+    The result is ``calibration`` and no names if no view is turned, or if renumbering does not
+    reduce the residuals much.
     """
-    # Shape and numbers are fitted in turn, which only lowers the squares: Lloyd, as for flips.
+    # Fitting the shape and choosing the numbers alternately only lowers the squares: Lloyd (1982).
     views = [fit.view for fit in calibration.views]
     used = [number for number, fit in enumerate(calibration.views) if fit.used]
     bad = sorted(set(range(len(views))) - set(used))
-    numbered, turned = list(views), np.zeros(len(views), dtype=np.bool_)
-    shaped = calibration
-    for _ in range(MAX_ROUNDS):
-        lens = fit_lens([numbered[i] for i in used], model, held)
-        shaped = _summary(numbered, used, lens, bad, "free")
-        wrong = np.zeros(len(views), dtype=np.bool_)
+    renumbered, is_turned = list(views), np.zeros(len(views), dtype=np.bool_)
+    candidate = calibration
+    for _ in range(MAX_ITERATIONS):
+        adjusted = fit_lens([renumbered[i] for i in used], model, fixed)
+        candidate = _build_calibration(renumbered, used, adjusted, bad, "free")
+        is_wrong = np.zeros(len(views), dtype=np.bool_)
         for number in used:
-            both = numbered[number], half_turned(numbered[number])
-            as_is, other = (float((errors**2).sum()) for errors in shaped.point_errors(both))
-            wrong[number] = other < as_is
-        if not wrong.any():
+            numberings = renumbered[number], half_turned(renumbered[number])
+            error, turned_error = (
+                float((errors**2).sum()) for errors in candidate.point_errors(numberings)
+            )
+            is_wrong[number] = turned_error < error
+        if not is_wrong.any():
             break
-        turned ^= wrong
-        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
-    if not turned.any() or shaped.rms > MAX_RENUMBERED_RMS_SHARE * calibration.rms:
+        is_turned ^= is_wrong
+        renumbered = [half_turned(view) if is_turned[i] else view for i, view in enumerate(views)]
+    if not is_turned.any() or candidate.rms > MAX_RENUMBERED_RMS_SHARE * calibration.rms:
         return calibration, []
-    if 2 * turned.sum() > len(turned):
-        turned = ~turned
-        numbered = [half_turned(view) if turned[i] else view for i, view in enumerate(views)]
-    lens = fit_lens([numbered[i] for i in used], model, held)
-    better = _summary(numbered, used, lens, bad, sheet)
-    names = [label(view, i) for i, view in enumerate(views) if turned[i]]
-    return (calibration, []) if better.sheet is None else (better, names)
+    if 2 * is_turned.sum() > len(is_turned):
+        is_turned = ~is_turned
+        renumbered = [half_turned(view) if is_turned[i] else view for i, view in enumerate(views)]
+    adjusted = fit_lens([renumbered[i] for i in used], model, fixed)
+    calibrated = _build_calibration(renumbered, used, adjusted, bad, sheet)
+    names = [view_name(view, i) for i, view in enumerate(views) if is_turned[i]]
+    return (calibration, []) if calibrated.sheet is None else (calibrated, names)
 
 
 def check_views(
-    views: Sequence[TargetView], called: str, least: int, size: tuple[int, int] | None = None
+    views: Sequence[TargetView], label: str, minimum: int, size: tuple[int, int] | None = None
 ) -> None:
-    """Refuse views that do not belong together, and unusable ones; ``called``: name for errors.
+    """Raise an error for views that do not belong together, or cannot be used.
 
-    ``least``: least number of views. ``size``: size of the images, pixels; None: that of the first.
-    Raises ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
+    ``label``: name for messages. ``minimum``: least number of views. ``size``: size of the images,
+    pixels; None: that of the first. Raises ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``,
+    ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
-    if len(views) < least:
+    if len(views) < minimum:
         raise Code.TOO_FEW.unexpected(
-            f"{called}: expected {least} views or more", least, len(views)
+            f"{label}: expected {minimum} views or more", minimum, len(views)
         )
     for number, view in enumerate(views):
         if view.target != views[0].target:
             raise Code.DIFFERENT_TARGETS.refusal(
-                f"{called}: expected views of one target, {views[0].target}, got {view.target} in "
-                f"{label(view, number)}",
+                f"{label}: expected views of one target, {views[0].target}, got {view.target} in "
+                f"{view_name(view, number)}",
                 views[0].target,
                 view.target,
             )
@@ -385,27 +395,27 @@ def check_views(
 
 
 def _check_motion(views: Sequence[TargetView]) -> None:
-    """Refuse views that are all nearly the same."""
-    least, largest = MIN_MOTION_SHARE * max(views[0].size), 0.0
+    """Raise ``POSES_TOO_SIMILAR`` if all views are nearly the same."""
+    min_move, largest_move = MIN_MOTION_SHARE * max(views[0].size), 0.0
     for view in views[1:]:
         common, first, second = np.intersect1d(views[0].ids, view.ids, return_indices=True)
         if not len(common):
             return
         moves = views[0].points[first] - view.points[second]
-        largest = max(largest, float(np.linalg.norm(moves, axis=1).max()))
-    if largest < least:
+        largest_move = max(largest_move, float(np.linalg.norm(moves, axis=1).max()))
+    if largest_move < min_move:
         raise Code.POSES_TOO_SIMILAR.refusal(
-            f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "
-            f"got {len(views)} that differ by {largest:.3g}",
-            least,
-            largest,
+            f"intrinsics: expected views in which the target moves by {min_move:.3g} pixels or "
+            f"more, got {len(views)} that differ by {largest_move:.3g}",
+            min_move,
+            largest_move,
         )
 
 
 def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
-    """Refuse views of parallel planes, and a focal length that is not determined.
+    """Raise ``INSUFFICIENT_ROTATION`` for parallel planes, or an undetermined focal length.
 
-    Raises ``INSUFFICIENT_ROTATION``; ``label`` is for messages.
+    ``label``: name for messages.
     """
     normals = adjusted.bundle.poses.rotation[:, :, 2]
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
@@ -419,24 +429,24 @@ def check_tilts(adjusted: AdjustedBundle, label: str) -> None:
             tilt,
         )
     # values = basis times unknowns, so their covariance is B C B^T
-    spread = adjusted.bundle.basis[0] @ adjusted.by_noise @ adjusted.bundle.basis[0].T
+    covariance = adjusted.bundle.basis[0] @ adjusted.noise_covariance @ adjusted.bundle.basis[0].T
     length = float(adjusted.bundle.cameras[0].matrix[0, 0])
-    relative = math.sqrt(max(float(spread[0, 0]), 0.0)) / length
-    if relative > MAX_FOCAL_SIGMA_RATIO:
+    sigma_ratio = math.sqrt(max(float(covariance[0, 0]), 0.0)) / length
+    if sigma_ratio > MAX_FOCAL_SIGMA_RATIO:
         raise Code.INSUFFICIENT_ROTATION.refusal(
             f"{label}: expected views that tell the focal length to "
             f"{MAX_FOCAL_SIGMA_RATIO:.0%}, got {length:.5g} pixels with a standard deviation of "
-            f"{relative:.2g} of it: tilt the "
+            f"{sigma_ratio:.2g} of it: tilt the "
             "target more, and show it nearer",
             MAX_FOCAL_SIGMA_RATIO,
-            relative,
+            sigma_ratio,
         )
 
 
 def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[int, float]:
-    """Return the worst view, and its weighted RMS over the median of the others."""
+    """Return the index of the worst view, and its weighted RMS over the median of the others."""
     errors = [
-        weighted_rms(view, residuals, adjusted.more)
+        weighted_rms(view, residuals, adjusted.extra_variance)
         for view, residuals in zip(views, adjusted.residuals, strict=True)
     ]
     worst = int(np.argmax(errors))
@@ -444,53 +454,53 @@ def worst_view(views: Sequence[TargetView], adjusted: AdjustedBundle) -> tuple[i
     return worst, errors[worst] / others if others > 0 else 1.0
 
 
-def weighted_rms(view: TargetView, residuals: Array, more: float) -> float:
-    """Return the rms of a view's residuals in units of their standard deviation."""
-    weighted = whitening(view.covariance, more) @ residuals[..., None]
-    return math.sqrt(float((weighted**2).mean()))
+def weighted_rms(view: TargetView, residuals: Array, extra_variance: float) -> float:
+    """Return the RMS of a view's residuals, in standard deviations."""
+    whitened = whitening(view.covariance, extra_variance) @ residuals[..., None]
+    return math.sqrt(float((whitened**2).mean()))
 
 
-def _together(errors: Sequence[float], views: Sequence[TargetView]) -> float:
-    freedom = [2 * len(view.ids) - 6 for view in views]
-    return math.sqrt(float(np.average(np.square(errors), weights=freedom)))
+def _combined_rms(errors: Sequence[float], views: Sequence[TargetView]) -> float:
+    weights = [2 * len(view.ids) - 6 for view in views]
+    return math.sqrt(float(np.average(np.square(errors), weights=weights)))
 
 
-def _summary(
+def _build_calibration(
     views: Sequence[TargetView],
     used: list[int],
     adjusted: AdjustedBundle,
     bad: list[int],
-    sheet: Sheet,
+    sheet: SheetOption,
 ) -> IntrinsicCalibration:
-    of_used = [views[number] for number in used]
-    sights = [Sight(0, number, view) for number, view in enumerate(of_used)]
-    shape = choose_shape(adjusted, sights, sheet)
+    used_views = [views[number] for number in used]
+    sights = [Sight(0, number, view) for number, view in enumerate(used_views)]
+    sheet_fit = choose_shape(adjusted, sights, sheet)
     errors = [
-        view_rms(left.residuals[0]) if len(used) > MIN_VIEWS else math.nan
-        for left in shape.left_out
+        view_rms(left_out_fit.residuals[0]) if len(used) > MIN_VIEWS else math.nan
+        for left_out_fit in sheet_fit.left_out
     ]
-    adjusted, bundle = shape.adjusted, shape.adjusted.bundle
+    adjusted, bundle = sheet_fit.adjusted, sheet_fit.adjusted.bundle
     camera, basis = bundle.cameras[0], bundle.basis[0]
-    without = dict(zip(used, errors, strict=True))
+    held_out_errors = dict(zip(used, errors, strict=True))
     fits = [
-        _view_fit(view, camera, adjusted, used.index(number), without[number])
-        if number in without
+        _view_fit(view, camera, adjusted, used.index(number), held_out_errors[number])
+        if number in held_out_errors
         else _view_fit(view, camera)
         for number, view in enumerate(views)
     ]
     calibration = IntrinsicCalibration(
         camera=camera,
-        covariance=basis @ camera_covariance(adjusted, shape.left_out) @ basis.T,
+        covariance=basis @ camera_covariance(adjusted, sheet_fit.left_out) @ basis.T,
         views=tuple(fits),
         rms=adjusted.rms,
-        sigma=math.sqrt(adjusted.more),
-        held_out=_together(errors, of_used),
-        sheet=shape.off,
+        sigma=math.sqrt(adjusted.extra_variance),
+        held_out=_combined_rms(errors, used_views),
+        sheet=sheet_fit.offsets,
         coverage=coverage([_outline(fits[number], camera) for number in used], camera.size),
         warnings=(),
     )
     return dataclasses.replace(
-        calibration, warnings=tuple(_remarks(calibration, bad, shape.remarks))
+        calibration, warnings=tuple(_remarks(calibration, bad, sheet_fit.remarks))
     )
 
 
@@ -498,7 +508,7 @@ def _view_fit(
     view: TargetView,
     camera: CameraModel,
     adjusted: AdjustedBundle | None = None,
-    place: int = 0,
+    pose_index: int = 0,
     held_out: float = math.nan,
 ) -> ViewFit:
     """Return the fit of the lens to a view; for a bad view only its pose is fitted."""
@@ -506,8 +516,8 @@ def _view_fit(
         pose = locate(view, camera)
         transform, residuals, held_out = pose.transform, pose.residuals, pose.rms
     else:
-        transform = Transform(CAMERA, TARGET, *adjusted.bundle.poses.subset(place))
-        residuals = adjusted.residuals[place]
+        transform = Transform(CAMERA, TARGET, *adjusted.bundle.poses.subset(pose_index))
+        residuals = adjusted.residuals[pose_index]
     return ViewFit(
         view=view,
         used=adjusted is not None,
@@ -519,27 +529,27 @@ def _view_fit(
 
 
 def _outline(fit: ViewFit, camera: CameraModel) -> Array:
-    """Return the target's four outer points (4, 2), also those that were hidden."""
+    """Return the pixels (4, 2) of the target's four corners, even if these were hidden."""
     low, high = fit.view.target.points.min(axis=0), fit.view.target.points.max(axis=0)
     corners = np.array(
         [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
     )
-    seen = camera.project(fit.transform.apply(corners))
-    return np.where(np.isfinite(seen), seen, fit.view.points.mean(axis=0))
+    projected = camera.project(fit.transform.apply(corners))
+    return np.where(np.isfinite(projected), projected, fit.view.points.mean(axis=0))
 
 
 def _remarks(
-    calibration: IntrinsicCalibration, bad: list[int], of_sheet: list[Remark]
+    calibration: IntrinsicCalibration, bad: list[int], sheet_remarks: list[Remark]
 ) -> Iterator[Remark]:
     for number, fit in enumerate(calibration.views):
         for code, text in fit.view.warnings:
-            yield Remark(code, f"{label(fit.view, number)}: {text}")
+            yield Remark(code, f"{view_name(fit.view, number)}: {text}")
     for number in bad:
         fit = calibration.views[number]
-        done = "was not used" if not fit.used else "is used all the same"
+        outcome = "was not used" if not fit.used else "is used all the same"
         yield Code.BAD_VIEW.remark(
-            f"{label(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
-            f"{calibration.rms:.3g} in all: it {done}"
+            f"{view_name(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
+            f"{calibration.rms:.3g} in all: it {outcome}"
         )
     if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
@@ -547,20 +557,20 @@ def _remarks(
             f"the lens is not of the model {calibration.camera.distortion_model}, the sheet is not "
             "flat, or points were taken for others"
         )
-    yield from of_sheet
+    yield from sheet_remarks
     camera = calibration.camera
-    seen = points_at(camera, places(camera.size, SHAPE).reshape(-1, 2), None)
-    reached = float(np.isfinite(seen[:, 0]).mean())
-    if reached < MIN_REACHED_SHARE:
+    seen = points_of_pixels(camera, map_pixels(camera.size, DEFAULT_MAP_SHAPE).reshape(-1, 2), None)
+    reached_share = float(np.isfinite(seen[:, 0]).mean())
+    if reached_share < MIN_REACHED_SHARE:
         yield Code.OUT_OF_FIELD.remark(
             f"the model {camera.distortion_model} ends before the image does: no direction leads "
-            f"to {1 - reached:.0%} of it, of which nothing is known; show the target there, or "
-            "take another model"
+            f"to {1 - reached_share:.0%} of it, of which nothing is known; show the target there, "
+            "or take another model"
         )
     if lacking := calibration.coverage.lacking:
-        bars = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)
+        values = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)
         yield Code.POOR_COVERAGE.remark(
-            f"the views cover too little: {bars} of what is good enough"
+            f"the views cover too little: {values} of what is good enough"
         )
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(

@@ -17,7 +17,7 @@ import numpy as np
 from smartcam.calibration._least_squares import solve_scaled
 from smartcam.calibration._lens.bundle import lens_values
 from smartcam.calibration._lens.projection import (
-    SMOOTH,
+    SMOOTH_TERM_COUNT,
     linearize,
     pose_changes,
     smooth_changes,
@@ -40,32 +40,35 @@ FLIPS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": 
 """Ways to flip a picture, each with the axes of the image whose direction changes."""
 
 _LENS_VALUES: Final = 4 + max(COEFFICIENTS.values())
-_ENDS: Final = np.cumsum([0, _LENS_VALUES, _LENS_VALUES, 6, 5, 2, SMOOTH, SMOOTH]).tolist()
+_ENDS: Final = np.cumsum(
+    [0, _LENS_VALUES, _LENS_VALUES, 6, 5, 2, SMOOTH_TERM_COUNT, SMOOTH_TERM_COUNT]
+).tolist()
 LENS, RIGHT_LENS, RIG, SHEET, SHUTTER, IMAGE, RIGHT_IMAGE = (
     range(first, last) for first, last in itertools.pairwise(_ENDS)
 )
-"""Places of the shared unknowns: values of the lens, or of a pair's both; the place of a pair's
-cameras; five ways in which a sheet deforms (stretching along x, shearing, and three ways to bend);
-two in which a rolling shutter deforms a picture (leaning, and stretching from row to row); smooth
-changes of the image."""
+"""Indices of the shared unknowns: values of the lens, or of both lenses of a pair; the pose of one
+camera of a pair in the other's frame; five deformations of a sheet (stretching along x, shearing,
+and three bends); two deformations of a picture by a rolling shutter (leaning, and stretching from
+row to row); smooth changes of the image."""
 
-COUNT: Final = _ENDS[-1]
+UNKNOWN_COUNT: Final = _ENDS[-1]
 """Number of the shared unknowns."""
 
-LENSES: Final = np.arange(COUNT) < RIG.start
-"""Mask of the lenses' values among them."""
+LENS_MASK: Final = np.arange(UNKNOWN_COUNT) < RIG.start
+"""Mask of the lenses' values among the shared unknowns."""
 
 MIN_VIEWS_TO_EXPLAIN: Final = 4
 """The misfit of fewer views than this is not explained."""
 
 MIN_CHANGE_EVIDENCE: Final = 40.0
 """A change from one view on is reported if the information criterion prefers it by this much to all
-else: 170 random parts of recorded sets reach 32, pictures resized by 1 % 48 to 350 (measured)."""
+other causes: 170 random parts of recorded sets reach 32, pictures resized by 1 % 48 to 350
+(measured)."""
 
 APART_COST_RATIO: Final = 4.0
-"""The views of pairs are reported as of different moments if another place of the cameras for each
-pair reduces the squares by this factor: OpenCV's recorded pairs reach 1.6, two recorded sets of a
-board in the hand 8 to 19, a board that moves by 0.2 mm in between 8 (measured)."""
+"""The views of a pair are reported as taken at different times if cameras that move between the
+pairs reduce the squares by this factor: OpenCV's recorded pairs reach 1.6, two recorded sets of a
+hand-held board 8 to 19, a board that moves by 0.2 mm between the two views 8 (measured)."""
 
 FITTED_COST_RATIO: Final = 1.2
 """A known lens is wrong if one fitted to the views reduces the squares by this factor: lenses from
@@ -73,69 +76,72 @@ other views reach 1.04 on recorded pairs; a focal length that is 1 % off reaches
 0.05 pixels."""
 
 MIN_VIEWS_FOR_LENS: Final = 3
-"""A lens for that comparison is fitted to at least this many views."""
+"""A lens is fitted to at least this many views to test a known lens."""
 
-MAX_ROUNDS: Final = 20
-"""Lens and flips are chosen in turn, in at most this many rounds."""
+MAX_ITERATIONS: Final = 20
+"""Alternations between fitting the lens and choosing which views are flipped."""
 
 
-class Fitted(NamedTuple):
+class FittedView(NamedTuple):
     """A view, with the pose and the points that were fitted to it."""
 
     view: TargetView
     camera: CameraModel
     pose: Rigid  # ``T_camera_target``
     points: Array  # (T, 3), points of the target, metres
-    # of a pair's right camera: ``T_right_left``; the pose that is eliminated is in the left camera
+    # ``T_right_left`` if the camera is the right one of a pair: then the pose of the target in the
+    # left camera is eliminated
     rig: Rigid | None = None
 
-    def equations(self, more: float) -> Equations:
-        """Return the view's equations; ``more``: variance added to the points' own, pixels^2."""
-        flat = self.points[self.view.ids]
-        turned = flat @ self.pose.rotation.T
-        seen = linearize(turned + self.pose.translation, self.camera)
-        white = whitening(self.view.covariance, more)
-        by_pose, lens, image = pose_changes(seen.by_point, turned), LENS, IMAGE
-        shared = np.zeros((*seen.pixels.shape, COUNT))
+    def equations(self, extra_variance: float) -> Equations:
+        """Return the view's equations; ``extra_variance``, pixels^2, is added to its covariance."""
+        target_points = self.points[self.view.ids]
+        turned = target_points @ self.pose.rotation.T
+        projection = linearize(turned + self.pose.translation, self.camera)
+        white = whitening(self.view.covariance, extra_variance)
+        by_pose, lens, image = pose_changes(projection.by_point, turned), LENS, IMAGE
+        shared = np.zeros((*projection.pixels.shape, UNKNOWN_COUNT))
         if self.rig is not None:
             lens, image = RIGHT_LENS, RIGHT_IMAGE
             away = turned + self.pose.translation - self.rig.translation
-            shared[..., RIG] = pose_changes(seen.by_point, away)
-            by_pose = pose_changes(seen.by_point @ self.rig.rotation, turned @ self.rig.rotation)
-        shared[..., lens[: seen.by_lens.shape[2]]] = seen.by_lens
-        shared[..., SHEET] = seen.by_point @ self.pose.rotation @ _deformations(flat)
-        shared[..., SHUTTER] = seen.pixels[:, 1, None, None] / self.camera.size[1] * np.eye(2)
-        shared[..., image] = smooth_changes(seen.pixels, self.camera.size)
+            shared[..., RIG] = pose_changes(projection.by_point, away)
+            by_pose = pose_changes(
+                projection.by_point @ self.rig.rotation, turned @ self.rig.rotation
+            )
+        shared[..., lens[: projection.by_lens.shape[2]]] = projection.by_lens
+        shared[..., SHEET] = projection.by_point @ self.pose.rotation @ _deformations(target_points)
+        shared[..., SHUTTER] = projection.pixels[:, 1, None, None] / self.camera.size[1] * np.eye(2)
+        shared[..., image] = smooth_changes(projection.pixels, self.camera.size)
         return Equations(
             white @ by_pose,
             white @ shared,
-            (white @ (self.view.points - seen.pixels)[..., None])[..., 0],
-            np.sqrt(more + self.view.sigmas**2),
+            (white @ (self.view.points - projection.pixels)[..., None])[..., 0],
+            np.sqrt(extra_variance + self.view.sigmas**2),
         )
 
 
-def _deformations(flat: Array) -> Array:
-    """Return the moves of points (N, 3) as the sheet stretches, shears and bends, (N, 3, 5)."""
-    x, y = (flat[:, :2] / np.ptp(flat, axis=0).max()).T
-    moves = np.zeros((len(flat), 3, len(SHEET)))
+def _deformations(points: Array) -> Array:
+    """Return the shifts (N, 3, 5) of points (N, 3) by each of the five deformations of a sheet."""
+    x, y = (points[:, :2] / np.ptp(points, axis=0).max()).T
+    moves = np.zeros((len(points), 3, len(SHEET)))
     moves[:, 0, 0], moves[:, 0, 1] = x, y
     moves[:, 2, 2], moves[:, 2, 3], moves[:, 2, 4] = x**2, x * y, y**2
     return moves
 
 
 class Equations(NamedTuple):
-    """The linear equations of one view, in standard deviations."""
+    """The linear equations of one view, or of a pair's two, in standard deviations."""
 
     by_pose: Array  # (N, 2, 6), derivatives by the pose
-    by_shared: Array  # (N, 2, COUNT), derivatives by the shared unknowns
+    by_shared: Array  # (N, 2, UNKNOWN_COUNT), derivatives by the shared unknowns
     residuals: Array  # (N, 2), seen minus projected
     deviations: Array  # (N,), standard deviation of each point, pixels
 
 
-class Reduced(NamedTuple):
-    """Normal equations of views for the values of a lens and a sheet, without their poses.
+class SharedEquations(NamedTuple):
+    """Normal equations of views for the L shared unknowns, after eliminating the poses.
 
-    If the values change by x, the weighted squares of view i are ``squares[i] - 2 right[i] x + x
+    If the unknowns change by x, the weighted squares of view i are ``squares[i] - 2 right[i] x + x
     matrix[i] x``.
     """
 
@@ -144,9 +150,9 @@ class Reduced(NamedTuple):
     squares: Array  # (V,), weighted squares before any change
 
     @classmethod
-    def of(cls, equations: Sequence[Equations]) -> Reduced:
+    def from_views(cls, equations: Sequence[Equations]) -> SharedEquations:
         """Return the equations of views after eliminating the pose of each."""
-        parts = []
+        products = []
         for equation in equations:
             rows = equation.by_pose.reshape(-1, 6)
             rows_of_shared = np.column_stack(
@@ -155,238 +161,270 @@ class Reduced(NamedTuple):
             rows_of_shared = rows_of_shared - rows @ solve_scaled(
                 rows.T @ rows, rows.T @ rows_of_shared
             )
-            parts.append(rows_of_shared.T @ rows_of_shared)
-        sums = np.array(parts)
+            products.append(rows_of_shared.T @ rows_of_shared)
+        sums = np.array(products)
         return cls(sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1])
 
     def misfits(self, change: Array) -> Array:
-        """Return the weighted squares of each view (V,) if the values change by (L,)."""
+        """Return the weighted squares (V,) of the views after a change (L,) of the unknowns."""
         misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
         return misfits
 
-    def best(self, free: Mask, places: Sequence[int] = ()) -> tuple[Array, float]:
-        """Return the change of the free values (L,) with the least squares, and those squares.
+    def solve(self, free: Mask, per_view: Sequence[int] = ()) -> tuple[Array, float]:
+        """Return the change (L,) of the free unknowns with the least squares, and those squares.
 
-        The values at the indices ``places`` may differ between the views.
+        The unknowns at the indices ``per_view`` may differ between the views.
         """
-        # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
+        # Schur's complement eliminates those of each view: x_v = M_vv^-1 (b_v - M_v x)
         matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
-        for sums_matrix, side in zip(self.matrix, self.right, strict=True) if places else ():
-            block = sums_matrix[np.ix_(places, places)]
-            both = solve_scaled(block, np.column_stack([sums_matrix[places], side[places]]))
-            matrix = matrix - sums_matrix[:, places] @ both[:, :-1]
-            right = right - sums_matrix[:, places] @ both[:, -1]
-            squares = squares - side[places] @ both[:, -1]
+        for sums_matrix, sums_right in (
+            zip(self.matrix, self.right, strict=True) if per_view else ()
+        ):
+            block = sums_matrix[np.ix_(per_view, per_view)]
+            solved = solve_scaled(
+                block, np.column_stack([sums_matrix[per_view], sums_right[per_view]])
+            )
+            matrix = matrix - sums_matrix[:, per_view] @ solved[:, :-1]
+            right = right - sums_matrix[:, per_view] @ solved[:, -1]
+            squares = squares - sums_right[per_view] @ solved[:, -1]
         basis = np.eye(len(right))[:, free]
         change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
         return change, float(squares - change @ right)
 
 
 class _FlippedLens(NamedTuple):
-    """Effect of a flip on a lens' values: ``shift`` is added, ``mirror`` a factor of changes."""
+    """The lens that a flipped picture shows: values ``v + shift``, changes times ``mirror``."""
 
     mirror: Array  # (L,), 1 or -1 for each value
     shift: Array  # (L,), in the unit of each value
 
     @classmethod
-    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
-        """Return the effect of flipping pictures along some axes."""
-        values = np.zeros(COUNT)
+    def from_camera(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
+        """Return the lens that pictures flipped along some axes show."""
+        values = np.zeros(UNKNOWN_COUNT)
         values[: 4 + len(camera.distortion)] = lens_values(camera)
-        mirror, goal = np.ones(len(values)), values.copy()
+        mirror, flipped_values = np.ones(len(values)), values.copy()
         for axis in axes:
-            mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
+            mirror[2 + axis], flipped_values[2 + axis] = (
+                -1.0,
+                camera.size[axis] - 1 - values[2 + axis],
+            )
             if camera.distortion_model != "equidistant":
-                place = (7, 6)[axis]  # p2 describes a tilt along x, p1 one along y
-                mirror[place], goal[place] = -1.0, -values[place]
-        return cls(mirror, goal - values)
+                coefficient = (7, 6)[axis]  # p2 describes a tilt along x, p1 one along y
+                mirror[coefficient], flipped_values[coefficient] = -1.0, -values[coefficient]
+        return cls(mirror, flipped_values - values)
 
-    def best(self, reduced: Reduced, free: Mask, flipped: Mask) -> tuple[Mask, float]:
-        """Improve a guess which views are flipped; return the mask and the squares of all views."""
-        # Lens and flips are chosen in turn, which only lowers the squares.
+    def find_flips(self, reduced: SharedEquations, free: Mask, flipped: Mask) -> tuple[Mask, float]:
+        """Improve a guess ``flipped`` of the flipped views; return their mask, and the squares."""
+        # Fitting the lens and choosing the flipped views alternately only lowers the squares.
         # Source: Lloyd, Least Squares Quantization in PCM (1982).
         basis = np.eye(len(self.mirror))[:, free]
-        as_is = mirrored = reduced.squares
-        for _ in range(MAX_ROUNDS):
-            plain, other = (reduced.matrix[mask].sum(axis=0) for mask in (~flipped, flipped))
-            back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
-            matrix = plain + self.mirror[:, None] * other * self.mirror
-            right = reduced.right[~flipped].sum(axis=0) + back
+        plain_misfits = flipped_misfits = reduced.squares
+        for _ in range(MAX_ITERATIONS):
+            plain_matrix, flipped_matrix = (
+                reduced.matrix[mask].sum(axis=0) for mask in (~flipped, flipped)
+            )
+            flipped_right = self.mirror * (
+                reduced.right[flipped].sum(axis=0) - flipped_matrix @ self.shift
+            )
+            matrix = plain_matrix + self.mirror[:, None] * flipped_matrix * self.mirror
+            right = reduced.right[~flipped].sum(axis=0) + flipped_right
             change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
-            as_is = reduced.misfits(change)
-            mirrored = reduced.misfits(self.shift + self.mirror * change)
-            better = mirrored < as_is
-            if (better == flipped).all():
+            plain_misfits = reduced.misfits(change)
+            flipped_misfits = reduced.misfits(self.shift + self.mirror * change)
+            is_better = flipped_misfits < plain_misfits
+            if (is_better == flipped).all():
                 break
-            flipped = better
-        return flipped, float(np.minimum(as_is, mirrored).sum())
+            flipped = is_better
+        return flipped, float(np.minimum(plain_misfits, flipped_misfits).sum())
 
 
 class _Misfit:
-    """The misfit of views, and how far the causes that are no blunder explain it."""
+    """The misfit of views, and how far ordinary causes, which are no blunder, explain it."""
 
     def __init__(self, equations: Sequence[Equations], free: Mask) -> None:
-        """``free`` (COUNT,): mask of the values that were fitted."""
-        self.reduced = Reduced.of(equations)
-        self._count, views = sum(equation.residuals.size for equation in equations), len(equations)
-        determined = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
-        self.usual, bends = free & determined, determined.copy()
-        self.usual[SHEET], bends[: IMAGE.start] = True, False
-        best = self.reduced.best
-        explained = {
-            "sheets that bend anew in each view": (best(self.usual, SHEET)[1], views * len(SHEET)),
-            "a shutter that rolls": (best(self.usual, SHUTTER)[1], views * len(SHUTTER)),
-            "a lens of another model": (best(self.usual | bends)[1], float(bends.sum())),
-        }
-        self._before = best(self.usual)[1]
-        self._best = min(
-            self.score(squares, count)
-            for squares, count in [(self._before, 0), *explained.values()]
+        """``free`` (UNKNOWN_COUNT,): mask of the values that were fitted."""
+        self.reduced = SharedEquations.from_views(equations)
+        self._residual_count, view_count = (
+            sum(equation.residuals.size for equation in equations),
+            len(equations),
         )
-        self._others = ", ".join(
-            f"{name} {self._before / max(after, 1e-300):.3g}"
+        determined = np.diag(self.reduced.matrix.sum(axis=0)) > 0.0
+        self.free, smooth = free & determined, determined.copy()
+        self.free[SHEET], smooth[: IMAGE.start] = True, False
+        solve = self.reduced.solve
+        explained = {
+            "sheets that bend anew in each view": (
+                solve(self.free, SHEET)[1],
+                view_count * len(SHEET),
+            ),
+            "a shutter that rolls": (solve(self.free, SHUTTER)[1], view_count * len(SHUTTER)),
+            "a lens of another model": (solve(self.free | smooth)[1], float(smooth.sum())),
+        }
+        self._unexplained = solve(self.free)[1]
+        self._best_score = min(
+            self.score(squares, count)
+            for squares, count in [(self._unexplained, 0), *explained.values()]
+        )
+        self._other_causes = ", ".join(
+            f"{name} {self._unexplained / max(after, 1e-300):.3g}"
             for name, (after, _) in explained.items()
         )
 
     def score(self, squares: float, unknowns: float) -> float:
         """Return the information criterion of a cause that leaves these squares."""
         # Schwarz, Estimating the Dimension of a Model (1978)
-        return self._count * math.log(max(squares, 1e-300)) + unknowns * math.log(self._count)
+        return self._residual_count * math.log(max(squares, 1e-300)) + unknowns * math.log(
+            self._residual_count
+        )
 
-    def offer(
+    def accept_cause(
         self, squares: float, unknowns: float, ratio: float = 1.0, evidence: float = 0.0
     ) -> bool:
-        """Offer a further cause; return whether it explains the views best so far, and enough.
+        """Compare a cause with all causes before; return whether it is the best, and good enough.
 
-        ``ratio``: least factor by which it must reduce the squares. ``evidence``: least difference
-        of the information criterion to all causes before.
+        ``squares``: the squares that the cause leaves. ``ratio``: least factor by which the cause
+        must reduce the squares. ``evidence``: least difference of the information criterion to all
+        causes before.
         """
-        gained = self._best - self.score(squares, unknowns)
-        self._best -= max(gained, 0.0)
-        return gained > evidence and self._before > ratio * squares
+        gain = self._best_score - self.score(squares, unknowns)
+        self._best_score -= max(gain, 0.0)
+        return gain > evidence and self._unexplained > ratio * squares
 
-    def compared(self, after: float) -> str:
+    def comparison(self, squares: float) -> str:
         """Return a sentence that compares a cause that leaves these squares with the others."""
         return (
-            f"The squares of all are {self._before / max(after, 1e-300):.3g} times smaller so; "
-            f"what else was tried explains less for what it takes: {self._others}"
+            "The squares of all are "
+            f"{self._unexplained / max(squares, 1e-300):.3g} times smaller so; "
+            f"what else was tried explains less for what it takes: {self._other_causes}"
         )
 
-    def changed(
+    def change_remarks(
         self, changes: Mapping[str, Sequence[int]], names: Sequence[str]
     ) -> Iterator[Remark]:
-        """Yield a remark if other values from one view on explain the views best.
+        """Yield a remark if unknowns that change from one view on explain the views best.
 
-        ``changes``: what may have changed, with the indices of its values.
+        ``changes``: question about each possible change, with the indices of its unknowns.
         """
-        tried = list[tuple[float, int, str]]()
-        for first in range(2, len(names) - 1):
-            parts = [slice(None, first), slice(first, None)]
-            sums = Reduced(
-                *(np.array([part[span].sum(axis=0) for span in parts]) for part in self.reduced)
+        fits = list[tuple[float, int, str]]()
+        for first_changed in range(2, len(names) - 1):
+            halves = [slice(None, first_changed), slice(first_changed, None)]
+            sums = SharedEquations(
+                *(
+                    np.array([values[views].sum(axis=0) for views in halves])
+                    for values in self.reduced
+                )
             )
-            tried += [
-                (sums.best(self.usual, places)[1], first, how) for how, places in changes.items()
+            fits += [
+                (sums.solve(self.free, indices)[1], first_changed, cause)
+                for cause, indices in changes.items()
             ]
-        after, first, best = min(tried)
-        least = self.score(after, len(changes[best]) + 1) + MIN_CHANGE_EVIDENCE
-        if not self.offer(after, len(changes[best]) + 1, evidence=MIN_CHANGE_EVIDENCE):
+        after, first_changed, best_cause = min(fits)
+        max_score = self.score(after, len(changes[best_cause]) + 1) + MIN_CHANGE_EVIDENCE
+        if not self.accept_cause(after, len(changes[best_cause]) + 1, evidence=MIN_CHANGE_EVIDENCE):
             return
-        alike = [
-            how
-            for squares, moment, how in sorted(tried)
-            if moment == first and self.score(squares, len(changes[how]) + 1) < least
+        similar_causes = [
+            cause
+            for squares, start, cause in sorted(fits)
+            if start == first_changed and self.score(squares, len(changes[cause]) + 1) < max_score
         ]
-        code = Code.POOR_FIT if alike == [MOVED] else Code.WRONG_LENS
+        code = Code.POOR_FIT if similar_causes == [MOVE_QUESTION] else Code.WRONG_LENS
         yield code.remark(
-            f"views of two settings: those from {names[first]} on do not fit those before: "
-            f"{', or '.join(alike)}? {self.compared(after)}"
+            f"views of two settings: those from {names[first_changed]} on do not fit those before: "
+            f"{', or '.join(similar_causes)}? {self.comparison(after)}"
         )
 
 
-ZOOMED: Final = "was the zoom or the focus moved, or were pictures resized or cut"
-MOVED: Final = "did the cameras move against each other"
+ZOOM_QUESTION: Final = "was the zoom or the focus moved, or were pictures resized or cut"
+MOVE_QUESTION: Final = "did the cameras move against each other"
 
 
 def misfit_remarks(
-    fitted: Sequence[Sequence[Fitted]], more: float, free: Mask, names: Sequence[str]
+    fitted: Sequence[Sequence[FittedView]], extra_variance: float, free: Mask, names: Sequence[str]
 ) -> Iterator[Remark]:
     """Yield a remark if a blunder explains the views better than all else.
 
     Blunders are a change of the camera from one view on and flipped pictures; of a pair also
-    cameras that move against each other, and views of different moments. In a flipped picture a
-    board is found as well if it looks the same in a mirror; its points are then those of a camera
-    with a mirrored lens. But a large misfit may have other causes: each cause is fitted, and
-    the best one counts.
+    cameras that move against each other, and views of different moments. A board
+    that looks the same in a mirror is also found in a flipped picture, as if the lens was mirrored.
+    A large misfit may have other causes, so each cause is fitted, and only the best one is
+    reported.
 
-    ``fitted``: the view, or the left and the right one of a pair, at each moment. ``more``:
-    variance in addition to the points' own, pixels^2. ``free`` (COUNT,): mask of the values that
-    were fitted. ``names``: names of the views.
+    ``fitted``: the view, or the left and the right view of a pair, of each moment.
+    ``extra_variance``, pixels^2, is added to the points' covariance. ``free`` (UNKNOWN_COUNT,):
+    mask of the values that were fitted. ``names``: names of the views.
     """
     if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
         return
-    equations = [[view.equations(more) for view in views] for views in fitted]
-    joined = [
+    equations = [[view.equations(extra_variance) for view in views] for views in fitted]
+    moments = [
         Equations(*map(np.concatenate, zip(*equation, strict=True))) for equation in equations
     ]
-    misfit, apart = _Misfit(joined, free), False
-    reduced, usual, changes = misfit.reduced, misfit.usual, {ZOOMED: LENS[:4]}
+    misfit, is_apart = _Misfit(moments, free), False
+    reduced, usable, changes = misfit.reduced, misfit.free, {ZOOM_QUESTION: LENS[:4]}
     if len(fitted[0]) > 1:
         sides = {"left": LENS[:4], "right": RIGHT_LENS[:4]}
         changes = {
-            f"{side} camera: {ZOOMED}": places for side, places in sides.items() if usual[places[0]]
+            f"{side} camera: {ZOOM_QUESTION}": indices
+            for side, indices in sides.items()
+            if usable[indices[0]]
         }
-        changes[MOVED] = RIG
-        after = reduced.best(usual, RIG)[1]
-        apart = misfit.offer(after, len(RIG) * len(fitted), APART_COST_RATIO)
-    if remarks := list(misfit.changed(changes, names)):
+        changes[MOVE_QUESTION] = RIG
+        squares = reduced.solve(usable, RIG)[1]
+        is_apart = misfit.accept_cause(squares, len(RIG) * len(fitted), APART_COST_RATIO)
+    if remarks := list(misfit.change_remarks(changes, names)):
         yield from remarks
-    elif apart:
+    elif is_apart:
         yield Code.NOT_SIMULTANEOUS.remark(
             "the views of each pair do not belong together: did the target move between the two, "
-            f"or one camera against the other? {misfit.compared(after)}"
+            f"or one camera against the other? {misfit.comparison(squares)}"
         )
     elif len(fitted[0]) == 1:
-        yield from _flipped(misfit, fitted[0][0].camera, names)
+        yield from _flip_remarks(misfit, fitted[0][0].camera, names)
 
 
-def _flipped(misfit: _Misfit, camera: CameraModel, names: Sequence[str]) -> Iterator[Remark]:
-    tried = [
-        (*_FlippedLens.of(camera, axes).best(misfit.reduced, misfit.usual, guess), how)
-        for how, axes in FLIPS.items()
-        for guess in _guesses(misfit.reduced, [2 + axis for axis in axes])
+def _flip_remarks(misfit: _Misfit, camera: CameraModel, names: Sequence[str]) -> Iterator[Remark]:
+    fits = [
+        (
+            *_FlippedLens.from_camera(camera, axes).find_flips(misfit.reduced, misfit.free, guess),
+            direction,
+        )
+        for direction, axes in FLIPS.items()
+        for guess in _guess_flips(misfit.reduced, [2 + axis for axis in axes])
     ]
-    flipped, after, how = min(tried, key=lambda one: one[1])
-    if flipped.any() and not flipped.all() and misfit.offer(after, len(names)):
-        fewer = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
-        which = ", ".join(itertools.compress(names, fewer.tolist()))
+    flipped, squares, direction = min(fits, key=lambda fit: fit[1])
+    if flipped.any() and not flipped.all() and misfit.accept_cause(squares, len(names)):
+        minority = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
+        flipped_names = ", ".join(itertools.compress(names, minority.tolist()))
         yield Code.MIRRORED.remark(
-            f"pictures that look flipped {how} against the others, or those of another camera: "
-            f"{which}. {misfit.compared(after)}"
+            f"pictures that look flipped {direction} against the others, or those of another "
+            f"camera: {flipped_names}. {misfit.comparison(squares)}"
         )
 
 
-def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
-    """Yield guesses which views are flipped: those that fit another principal point."""
-    for place in places:
-        weight = np.maximum(reduced.matrix[:, place, place], np.finfo(np.float64).tiny)
-        wish = reduced.right[:, place] / weight
-        yield wish < np.median(wish)
-        yield wish < 0
-        yield np.abs(wish) > 3 * np.median(np.abs(wish))
+def _guess_flips(reduced: SharedEquations, indices: Sequence[int]) -> Iterator[Mask]:
+    """Yield masks of views that may be flipped: those that fit another principal point."""
+    for index in indices:
+        weight = np.maximum(reduced.matrix[:, index, index], np.finfo(np.float64).tiny)
+        shifts = reduced.right[:, index] / weight
+        yield shifts < np.median(shifts)
+        yield shifts < 0
+        yield np.abs(shifts) > 3 * np.median(np.abs(shifts))
 
 
-def lens_remarks(fitted: Sequence[Fitted], label: str, more: float) -> Iterator[Remark]:
+def lens_remarks(
+    fitted: Sequence[FittedView], label: str, extra_variance: float
+) -> Iterator[Remark]:
     """Yield a remark if a known lens is not the camera's (``WRONG_LENS``).
 
-    ``fitted``: views through that lens; ``label``: name of the lens, for messages; ``more``:
-    variance in addition to the points' own, pixels^2.
+    ``fitted``: views through that lens. ``label``: name of the lens, for messages.
+    ``extra_variance``, pixels^2, is added to the points' covariance.
     """
     if len(fitted) < MIN_VIEWS_FOR_LENS:
         return
-    equations = [view.equations(more) for view in fitted]
-    reduced = Reduced.of(equations)
-    before, after = float(reduced.squares.sum()), reduced.best(LENSES)[1]
+    equations = [view.equations(extra_variance) for view in fitted]
+    reduced = SharedEquations.from_views(equations)
+    before, after = float(reduced.squares.sum()), reduced.solve(LENS_MASK)[1]
     if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(
             f"the {label} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "

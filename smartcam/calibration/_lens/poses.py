@@ -1,4 +1,4 @@
-"""Locate a target in front of a camera with a known lens."""
+"""Find the pose of a target in front of a camera with a known lens."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
-from smartcam.calibration._lens.projection import excess
-from smartcam.calibration._views import TargetView, checked
+from smartcam.calibration._lens.projection import excess_variance
+from smartcam.calibration._views import TargetView, check_type
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Code, Rigid, exp_rotation
 
@@ -42,15 +42,16 @@ MAX_OUTSIDE_RATIO: Final = 0.1
 """A point may lie outside of the image by this part of the image's sides."""
 
 MIN_AGREEMENT: Final = 0.5
-"""The agreement of a view with its target, from -1 to 1, must be below minus this value; above plus
-this value the view shows the sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
+"""The agreement of a view with its target, from -1 to 1, must be below minus this value. Above plus
+this value, the view shows the sheet in a mirror. Views of steep sheets and of fisheyes have
+-0.8."""
 
 MAX_RAY_SHIFT_RATIO: Final = 1e-9
-"""Rays are moved by at most this part of the focal length, to avoid rounding errors in a solver."""
+"""Rays are shifted by at most this part of the focal length, to avoid rounding errors in OpenCV."""
 
-MAX_UNSURE_RATIO: Final = 4.0
-"""Both poses are refined if the squared residuals of one are at most this many times those of the
-other."""
+MAX_AMBIGUOUS_RATIO: Final = 4.0
+"""Both poses of a view are refined if the squared residuals of one are at most this many times
+those of the other."""
 
 MAX_SAME_TURN_RADIANS: Final = 1e-3
 """Two poses turned by less than this angle, rad, are the same minimum."""
@@ -64,12 +65,13 @@ class TargetPose:
         transform: ``T_camera_target``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the target in the camera's frame:
             the rotation is ``exp([turn]x) R``. It is computed from the points' covariance, enlarged
-            if the residuals are larger than that explains. It does not include errors of the lens.
+            if the residuals are larger than that covariance explains. It does not include errors of
+            the lens.
         residuals: (N, 2), seen minus projected, pixels.
         rms: RMS of a coordinate of the residuals, pixels, corrected for their degrees of freedom.
-        ambiguity: RMS of this pose over that of the other possible pose, which a plane far away or
-            seen head-on has: near 1 if the points cannot show which is right; 0 if there is no
-            other.
+        ambiguity: RMS of this pose over that of the other possible pose: near 1 if the points
+            cannot show which pose is right, as for a plane that is far away or seen head-on; 0 if
+            there is no other pose.
         other: the other possible pose; None if there is none.
     """
 
@@ -98,27 +100,28 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
             picture was flipped; ``POOR_FIT``: the points have wrong numbers, or no pose puts them
             in front of the camera; ``SHAPE``: the arguments are no view and no camera.
     """
-    checked(camera, CameraModel, "pose of the target: camera")
+    check_type(camera, CameraModel, "pose of the target: camera")
     check_view(view, camera.size)
     sights = [Sight(0, 0, view)]
-    adjusted = [
+    fits = [
         adjust(Bundle.single(camera, start), sights, 0.0) for start in plane_poses(view, camera)
     ]
-    adjusted = sorted(
-        (fit for fit in adjusted if math.isfinite(fit.weighted)), key=lambda fit: fit.weighted
+    fits = sorted(
+        (fit for fit in fits if math.isfinite(fit.weighted_squares)),
+        key=lambda fit: fit.weighted_squares,
     )
-    if not adjusted:
+    if not fits:
         raise Code.POOR_FIT.refusal(
-            f"pose of the target{_of(view)}: expected one in front of the camera that shows its "
-            f"{len(view.ids)} points where they are, got none",
+            f"pose of the target{_in_view(view)}: expected one in front of the camera that shows "
+            f"its {len(view.ids)} points where they are, got none",
             "a pose in front of the camera",
         )
-    more = excess(adjusted[0].residuals[0], view.covariance, adjusted[0].freedom)
-    if more:
-        adjusted = [adjust(fit.bundle, sights, more) for fit in adjusted]
-    best, pose = adjusted[0], adjusted[0].bundle.poses
+    extra_variance = excess_variance(fits[0].residuals[0], view.covariance, fits[0].freedom)
+    if extra_variance:
+        fits = [adjust(fit.bundle, sights, extra_variance) for fit in fits]
+    best, pose = fits[0], fits[0].bundle.poses
     other = next(
-        (fit for fit in adjusted[1:] if pose.angle_to(fit.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
+        (fit for fit in fits[1:] if pose.angle_to(fit.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
         None,
     )
     rms = view_rms(best.residuals[0])
@@ -137,76 +140,76 @@ def _transform(fit: AdjustedBundle) -> Transform:
 
 
 def view_rms(residuals: Array) -> float:
-    """Return the RMS of a coordinate of residuals (N, 2), corrected for the six of a pose."""
+    """Return the RMS of a coordinate of residuals (N, 2), corrected for a pose's six parameters."""
     # E[sum r^2] = sigma^2 (2 N - 6): each fitted parameter takes one square away.
     return math.sqrt(float((residuals**2).sum()) / (2 * len(residuals) - 6))
 
 
 def check_view(view: TargetView, size: tuple[int, int]) -> None:
-    """Refuse a view that does not determine the pose, or whose image has not ``size``, pixels.
+    """Raise an error for a view that does not determine the pose, or not of ``size``, pixels.
 
     Raises the errors of :func:`locate`.
     """
-    called = f"pose of the target{_of(checked(view, TargetView, 'pose of the target'))}"
+    label = f"pose of the target{_in_view(check_type(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
     if count < MIN_POINTS:
         raise Code.TOO_FEW.unexpected(
-            f"{called}: expected {MIN_POINTS} points or more", MIN_POINTS, count
+            f"{label}: expected {MIN_POINTS} points or more", MIN_POINTS, count
         )
     if tuple(view.size) != tuple(size):
         raise Code.WRONG_SIZE.refusal(
-            f"{called}: expected an image of {size[0]} x {size[1]} pixels, got {view.size[0]} x "
+            f"{label}: expected an image of {size[0]} x {size[1]} pixels, got {view.size[0]} x "
             f"{view.size[1]}",
             size,
             view.size,
         )
-    _check_inside(view, called)
+    _check_inside(view, label)
     plane = view.object_points[:, :2]
     spread = np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)
     if spread[1] < MIN_SPREAD_RATIO * spread[0]:
         raise Code.COLLINEAR.refusal(
-            f"{called}: expected points that are not on one line, got {count} on one",
+            f"{label}: expected points that are not on one line, got {count} on one",
             got=view.ids.tolist(),
         )
-    _check_sides(view, called)
+    _check_numbering(view, label)
 
 
-def _check_inside(view: TargetView, called: str) -> None:
+def _check_inside(view: TargetView, label: str) -> None:
     """Raise ``WRONG_SIZE`` for points that are far outside of the image."""
     sides = np.array(view.size)
-    outside = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
-    row = int(np.argmax(outside))
-    if outside[row] > MAX_OUTSIDE_RATIO:
+    excess = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
+    row = int(np.argmax(excess))
+    if excess[row] > MAX_OUTSIDE_RATIO:
         point = view.points[row].tolist()
         raise Code.WRONG_SIZE.refusal(
-            f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, "
+            f"{label}: expected points in the image of {sides[0]} x {sides[1]} pixels, "
             f"got {point} in row {row}",
             view.size,
             point,
         )
 
 
-def _check_sides(view: TargetView, called: str) -> None:
+def _check_numbering(view: TargetView, label: str) -> None:
     """Raise ``MIRRORED`` for a mirrored sheet, and ``POOR_FIT`` for points with wrong numbers."""
-    turn = view.agreement
-    if turn > MIN_AGREEMENT:
+    agreement = view.agreement
+    if agreement > MIN_AGREEMENT:
         raise Code.MIRRORED.refusal(
-            f"{called}: expected its x to turn left to its y as one reads the sheet, got a view as "
+            f"{label}: expected its x to turn left to its y as one reads the sheet, got a view as "
             "in a mirror: was the picture flipped, or are u and v exchanged?",
             "y to the left of x",
-            turn,
+            agreement,
         )
-    if turn > -MIN_AGREEMENT:
+    if agreement > -MIN_AGREEMENT:
         raise Code.POOR_FIT.refusal(
-            f"{called}: expected points with the numbers that they have on {view.target}, got an "
-            f"order that agrees with it by {-turn:.2g} of 1 only",
+            f"{label}: expected points with the numbers that they have on {view.target}, got an "
+            f"order that agrees with it by {-agreement:.2g} of 1 only",
             MIN_AGREEMENT,
-            -turn,
+            -agreement,
         )
 
 
 def half_turn(target: Target) -> Rigid:
-    """Return the half turn of a target, in its own frame, after which it looks the same."""
+    """Return the half turn, in the target's frame, after which the target looks the same."""
     return Rigid(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1])
 
 
@@ -218,7 +221,7 @@ def half_turned(view: TargetView) -> TargetView:
     )
 
 
-def _of(view: TargetView) -> str:
+def _in_view(view: TargetView) -> str:
     return f" in {view.name}" if view.name else ""
 
 
@@ -230,9 +233,9 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     Source: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation (2014).
     """
     rays = camera.directions(view.points)
-    poses = _ippe(view.object_points, rays)
+    poses = _solve_ippe(view.object_points, rays)
     if not poses:  # OpenCV takes the root of a difference, which may be negative for exact rays
-        poses = _ippe(
+        poses = _solve_ippe(
             view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
         )
     return poses
@@ -251,12 +254,12 @@ def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
     residuals = (camera.project(pose.apply(view.object_points)) - view.points for pose in poses)
     squares = [float(np.nan_to_num((pixels**2).sum(), nan=math.inf)) for pixels in residuals]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]
-    if math.isfinite(best) and second > MAX_UNSURE_RATIO * best:
+    if math.isfinite(best) and second > MAX_AMBIGUOUS_RATIO * best:
         return poses[squares.index(best)]
     return locate(view, camera).transform.rigid
 
 
-def _ippe(points: Array, rays: Array) -> list[Rigid]:
+def _solve_ippe(points: Array, rays: Array) -> list[Rigid]:
     cv2 = load("cv2")
     try:
         _, turns, shifts, _ = cv2.solvePnPGeneric(

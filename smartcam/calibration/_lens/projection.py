@@ -23,14 +23,15 @@ MIN_SIGMA_PX = 1e-4
 weights."""
 
 SIGNIFICANCE_LEVEL = 0.01
-"""Residuals beyond the points' covariance count as an error if noise alone causes them with less
+"""Residuals count as larger than the points' covariance says if noise alone causes them with less
 than this probability."""
 
 
-DEGREE = 5
-"""Polynomials of the place in the image up to this degree stand for any smooth error of a lens."""
+MAX_DEGREE = 5
+"""Any smooth error of a lens is approximated by polynomials of the place in the image up to this
+degree."""
 
-SMOOTH = (DEGREE + 1) * (DEGREE + 2)
+SMOOTH_TERM_COUNT = (MAX_DEGREE + 1) * (MAX_DEGREE + 2)
 """Number of terms of these polynomials, for both coordinates."""
 
 
@@ -50,16 +51,20 @@ def linearize(points: Array, camera: CameraModel) -> Projection:
     if not len(source):
         return Projection(np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4 + count)))
     if camera.distortion_model == "equidistant":
-        seen, by = cv2.fisheye.projectPoints(source, zero, zero, camera.matrix, camera.distortion)
+        projected, jacobian = cv2.fisheye.projectPoints(
+            source, zero, zero, camera.matrix, camera.distortion
+        )
         # columns: f 2, c 2, k 4, rotation 3, translation 3, skew 1
-        by = by.reshape(-1, 2, 15)
-        by_lens, by_point = by[..., :8], by[..., 11:14]
+        jacobian = jacobian.reshape(-1, 2, 15)
+        by_lens, by_point = jacobian[..., :8], jacobian[..., 11:14]
     else:
-        seen, by = cv2.projectPoints(source, zero, zero, camera.matrix, camera.distortion)
+        projected, jacobian = cv2.projectPoints(
+            source, zero, zero, camera.matrix, camera.distortion
+        )
         # columns: rotation 3, translation 3, f 2, c 2, k
-        by = by.reshape(-1, 2, 10 + count)
-        by_point, by_lens = by[..., 3:6], by[..., 6:]
-    pixels = np.array(seen, dtype=np.float64).reshape(-1, 2)
+        jacobian = jacobian.reshape(-1, 2, 10 + count)
+        by_point, by_lens = jacobian[..., 3:6], jacobian[..., 6:]
+    pixels = np.array(projected, dtype=np.float64).reshape(-1, 2)
     pixels[source[:, 0, 2] <= 0] = np.nan
     return Projection(pixels, by_point, by_lens)
 
@@ -80,47 +85,47 @@ def pose_changes(by_point: Array, turned_points: Array) -> Array:
 
 
 def smooth_changes(pixels: Array, size: tuple[int, int]) -> Array:
-    """Return the derivatives of pixels (N, 2) by smooth changes of their image (N, 2, SMOOTH)."""
+    """Return the derivatives (N, 2, T) of pixels (N, 2) by T smooth changes of their image."""
     x, y = (2.0 * pixels / max(size) - np.array(size) / max(size)).T
-    powers = [x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+    powers = [x**i * y**j for i in range(MAX_DEGREE + 1) for j in range(MAX_DEGREE + 1 - i)]
     changes = np.kron(np.eye(2), np.stack(powers, axis=1)[:, None])
     return np.asarray(changes, dtype=np.float64)
 
 
-def whitening(covariance: Array, more: float) -> Array:
+def whitening(covariance: Array, extra_variance: float) -> Array:
     """Return matrices (N, 2, 2) that make residuals independent, of variance 1.
 
-    ``covariance`` (N, 2, 2) is that of the residuals; ``more`` is a variance that is added to each
-    coordinate, pixels^2.
+    ``covariance`` (N, 2, 2) is that of the residuals; ``extra_variance`` is a variance that is
+    added to each coordinate, pixels^2.
     """
     # With C^-1 = L L^T (Cholesky) the residuals L^T r have the covariance L^T C L = I, and their
     # squares add up to r^T C^-1 r.
-    total = covariance + max(more, MIN_SIGMA_PX**2) * np.eye(2)
+    total = covariance + max(extra_variance, MIN_SIGMA_PX**2) * np.eye(2)
     matrices = np.linalg.cholesky(np.linalg.inv(total)).swapaxes(1, 2)
     return np.asarray(matrices, dtype=np.float64)
 
 
-def excess(residuals: Array, covariance: Array, freedom: int) -> float:
+def excess_variance(residuals: Array, covariance: Array, freedom: int) -> float:
     """Return the variance of residuals, pixels^2, that their covariance does not explain.
 
     Added to each coordinate, it makes the sum of the weighted squares equal to their degrees of
-    freedom. It is 0 if chance makes residuals as large in 1 of 100 cases or more. ``residuals`` are
-    (N, 2), pixels, ``covariance`` is (N, 2, 2), and ``freedom`` is the number of coordinates minus
-    that of fitted parameters; with 0 or less the result is 0.
+    freedom. It is 0 if chance makes residuals this large in 1 of 100 cases or more. ``residuals``
+    are (N, 2), pixels, ``covariance`` is (N, 2, 2), and ``freedom`` is the number of coordinates
+    minus that of fitted parameters; with 0 or less the result is 0.
     """
-    # Along each point's principal axes: find s^2 of sum e_j^2 / (l_j + s^2) = freedom, which falls
-    # with s^2, so there is one root at most; at sum e_j^2 / freedom it is negative or 0.
+    # Along each point's principal axes: find s^2 with sum e_j^2 / (l_j + s^2) = freedom. The sum
+    # falls with s^2, so there is one root at most, which is not above sum e_j^2 / freedom.
     # Source: Paule and Mandel, Consensus Values and Weighting Factors (1982).
     values, vectors = np.linalg.eigh(covariance)
     squared = np.einsum("nij,ni->nj", vectors, residuals) ** 2
     values = np.maximum(values, 0.0) + MIN_SIGMA_PX**2
 
-    def off(more: float) -> float:
-        return float((squared / (values + more)).sum()) - freedom
+    def excess_squares(variance: float) -> float:
+        return float((squared / (values + variance)).sum()) - freedom
 
     if freedom <= 0 or not np.isfinite(squared).all():
         return 0.0
-    if Noise(1.0).chance(off(0.0) + freedom, freedom) >= SIGNIFICANCE_LEVEL:
+    if Noise(1.0).chance(excess_squares(0.0) + freedom, freedom) >= SIGNIFICANCE_LEVEL:
         return 0.0
     largest = float(squared.sum()) / freedom
-    return float(load("scipy.optimize").brentq(off, 0.0, largest, xtol=1e-16))
+    return float(load("scipy.optimize").brentq(excess_squares, 0.0, largest, xtol=1e-16))

@@ -26,26 +26,28 @@ if TYPE_CHECKING:
     from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, LeftOut, Sight
     from smartcam.geometry._inside import Array
 
-Sheet: TypeAlias = Literal["auto", "exact", "free"]
-"""Treatment of a sheet's points: nominal, adjusted, or chosen by the fit."""
+SheetOption: TypeAlias = Literal["auto", "exact", "free"]
+"""Choice of a sheet's points: nominal (``exact``), adjusted (``free``), or chosen by the fit."""
 
 MIN_POSES: Final = 4
-"""Fewer views than this, each left out in turn, do not show how much is chance."""
+"""At least this many left-out views show whether adjusted points predict better by more than
+chance."""
 
 MAX_FREE_POINTS: Final = 1000
 """A target with free points has at most this many: the equations for more would take gigabytes."""
 
 
-class Shape(NamedTuple):
-    """The fitted points of a sheet, and the evidence that the sheet is not exact."""
+class SheetFit(NamedTuple):
+    """A fit with nominal or adjusted points of the sheet, and remarks on the sheet."""
 
     adjusted: AdjustedBundle
-    left_out: list[LeftOut]  # left-out fit of each pose
-    off: Array | None  # (T, 3), adjustment of the points, metres
+    left_out: list[LeftOut]  # fits without each pose
+    # (T, 3), adjusted minus nominal points, metres; None if they are nominal
+    offsets: Array | None
     remarks: list[Remark]
 
 
-def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet) -> Shape:
+def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: SheetOption) -> SheetFit:
     """Return the fit with the target's points either nominal or adjusted.
 
     ``adjusted`` has the nominal points. With ``sheet`` ``auto``, points are adjusted if
@@ -60,28 +62,30 @@ def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet
             MAX_FREE_POINTS,
             count,
         )
-    exact = Shape(adjusted, leave_out(adjusted, sights), None, [])
+    exact = SheetFit(adjusted, leave_out(adjusted, sights), None, [])
     if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
         return exact
-    free = adjust_shape(adjusted.bundle, sights, adjusted.more)
-    left_out, shifts = (
-        leave_out(free, sights),
-        _shifts(free.bundle, sights[0].view.target.points),
+    free_fit = adjust_shape(adjusted.bundle, sights, adjusted.extra_variance)
+    left_out, offsets = (
+        leave_out(free_fit, sights),
+        _offsets(free_fit.bundle, sights[0].view.target.points),
     )
-    # the simpler one, unless the other is better by more than one standard error: Breiman,
+    # nominal points, unless adjusted ones predict better by more than one standard error: Breiman,
     # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
     gains = _squares(exact.left_out) - _squares(left_out)
-    better = math.isfinite(free.weighted) and gains.sum() > math.sqrt(len(gains)) * gains.std(
-        ddof=1
-    )
-    if sheet == "free" or (sheet == "auto" and better):
-        remarks = [_remark(shifts, "the print or the board is not exact")] if better else []
-        return Shape(free, left_out, shifts, remarks)
-    done = "it is taken as exact all the same, which sheet='auto' does not"
-    return exact._replace(remarks=[_remark(shifts, done)] if better else [])
+    is_free_better = math.isfinite(free_fit.weighted_squares) and gains.sum() > math.sqrt(
+        len(gains)
+    ) * gains.std(ddof=1)
+    if sheet == "free" or (sheet == "auto" and is_free_better):
+        remarks = (
+            [_remark(offsets, "the print or the board is not exact")] if is_free_better else []
+        )
+        return SheetFit(free_fit, left_out, offsets, remarks)
+    text = "it is taken as exact all the same, which sheet='auto' does not"
+    return exact._replace(remarks=[_remark(offsets, text)] if is_free_better else [])
 
 
-def _shifts(bundle: Bundle, nominal: Array) -> Array:
+def _offsets(bundle: Bundle, nominal: Array) -> Array:
     return np.zeros(nominal.shape) if bundle.points is None else bundle.points - nominal
 
 
@@ -91,47 +95,47 @@ def _squares(left_out: Sequence[LeftOut]) -> Array:
     )
 
 
-def _remark(shifts: Array, text: str) -> Remark:
-    rms = 1e3 * math.sqrt(float((shifts**2).sum(axis=1).mean()))
-    most = 1e3 * float(np.linalg.norm(shifts, axis=1).max())
+def _remark(offsets: Array, text: str) -> Remark:
+    rms = 1e3 * math.sqrt(float((offsets**2).sum(axis=1).mean()))
+    largest = 1e3 * float(np.linalg.norm(offsets, axis=1).max())
     return Code.SHEET_NOT_EXACT.remark(
-        f"the sheet's points are {rms:.2g} mm rms from their nominal places, {most:.2g} mm "
+        f"the sheet's points are {rms:.2g} mm rms from their nominal places, {largest:.2g} mm "
         f"at most: {text}"
     )
 
 
-def adjust_shape(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
+def adjust_shape(bundle: Bundle, sights: Sequence[Sight], extra_variance: float) -> AdjustedBundle:
     """Return the least-squares solution in which the target's points are adjusted, too.
 
     ``bundle`` is near the solution; the target's points start from its ``points``, or from their
-    nominal places if that is None. ``more`` is a first guess of the variance in addition to the
-    points' covariance, pixels^2, which is estimated anew.
+    nominal places if that is None. ``extra_variance``, pixels^2, is a first guess of the variance
+    in addition to the points' covariance, which is estimated anew.
     """
     nominal = sights[0].view.target.points
     points = nominal if bundle.points is None else bundle.points
-    free = dataclasses.replace(bundle, points=points, free=True)
-    adjusted = adjust_weighted(free, sights, more)
-    return dataclasses.replace(adjusted, bundle=_moved_bundle(adjusted.bundle, nominal))
+    free_bundle = dataclasses.replace(bundle, points=points, has_free_points=True)
+    adjusted = adjust_weighted(free_bundle, sights, extra_variance)
+    return dataclasses.replace(adjusted, bundle=_move_bundle_to_nominal(adjusted.bundle, nominal))
 
 
-def _moved_bundle(bundle: Bundle, nominal: Array) -> Bundle:
+def _move_bundle_to_nominal(bundle: Bundle, nominal: Array) -> Bundle:
     """Return an equivalent bundle whose points have the nominal place, direction and size."""
     # Points q = s A p + a are shown as p is by poses (R A^T, s t - R A^T a) and a rig (R_c, s t_c):
     # R A^T q + s t - R A^T a = s (R p + t), and a point s times as far away is in the same pixel.
     if bundle.points is None:
         return bundle
-    size, turn, shift = best_similarity(bundle.points, nominal)
-    back = bundle.poses.rotation @ turn.T
-    poses = Rigid(back, size * bundle.poses.translation - back @ shift)
-    points = size * bundle.points @ turn.T + shift
-    return dataclasses.replace(bundle, points=points, poses=poses, rig=bundle.rig.scaled(size))
+    scale, turn, shift = best_similarity(bundle.points, nominal)
+    rotation = bundle.poses.rotation @ turn.T
+    poses = Rigid(rotation, scale * bundle.poses.translation - rotation @ shift)
+    points = scale * bundle.points @ turn.T + shift
+    return dataclasses.replace(bundle, points=points, poses=poses, rig=bundle.rig.scaled(scale))
 
 
 def moved_to_nominal(points: Array, nominal: Array) -> Array:
     """Return the points, moved and scaled to the nominal place, direction and size."""
-    size, turn, shift = best_similarity(points, nominal)
-    fitted: Array = size * points @ turn.T + shift
-    return fitted
+    scale, turn, shift = best_similarity(points, nominal)
+    moved: Array = scale * points @ turn.T + shift
+    return moved
 
 
 def best_similarity(points: Array, nominal: Array) -> tuple[float, Array, Array]:
@@ -140,9 +144,9 @@ def best_similarity(points: Array, nominal: Array) -> tuple[float, Array, Array]
     # R = U diag(1, 1, det(U V^T)) V^T and s = sum b (R a) / sum |a|^2.
     # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
     # Patterns (1991).
-    middle = points.mean(axis=0)
-    centred, nominal_centred = points - middle, nominal - nominal.mean(axis=0)
+    centre = points.mean(axis=0)
+    centred, nominal_centred = points - centre, nominal - nominal.mean(axis=0)
     left, _, right = np.linalg.svd(nominal_centred.T @ centred)
     turn = left @ np.diag([1.0, 1.0, math.copysign(1.0, np.linalg.det(left @ right))]) @ right
-    size = float(((centred @ turn.T) * nominal_centred).sum() / (centred**2).sum())
-    return size, turn, nominal.mean(axis=0) - size * turn @ middle
+    scale = float(((centred @ turn.T) * nominal_centred).sum() / (centred**2).sum())
+    return scale, turn, nominal.mean(axis=0) - scale * turn @ centre

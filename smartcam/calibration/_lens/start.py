@@ -1,4 +1,4 @@
-"""Define the unknowns of a lens, and fit them a first time to views of a target."""
+"""Define the unknowns of a lens, and fit a lens to views of a target."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array, DistortionModel
 
 FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
-"""Focal lengths that OpenCV begins with, as parts of the image's longer side: None for that of its
-own closed form, then those of fields of view of 53, 103, 28, 75 and 14 degrees."""
+"""Focal lengths from which OpenCV starts, as parts of the image's longer side. None: from OpenCV's
+closed form. The others belong to fields of view of 53, 103, 28, 75 and 14 degrees."""
 
 MAX_VIEWS_OF_OPENCV: Final = 20
-"""OpenCV gets at most this many views; afterwards the fit is adjusted to all."""
+"""OpenCV gets at most this many views; then the fit is adjusted to all views."""
 
 MAX_GOOD_RMS_PX: Final = 0.5
 """No further focal length is tried once the RMS is at most this many pixels."""
@@ -51,13 +51,13 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
     ``fixed``: names of coefficients that stay 0; ``aspect``: fx and fy are one unknown. Raises
     ``SHAPE`` if there is no such model, or if it has no coefficient of that name.
     """
-    names, own_names, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
-    unknown = sorted(fixed_names.difference(own_names, {"aspect"}))
+    names, coefficients, fixed_names = parameter_names(model), coefficient_names(model), set(fixed)
+    unknown = sorted(fixed_names.difference(coefficients, {"aspect"}))
     if unknown:
         raise Code.SHAPE.refusal(
-            f"fixed: expected coefficients of {model} ({', '.join(own_names)}) or aspect, got "
+            f"fixed: expected coefficients of {model} ({', '.join(coefficients)}) or aspect, got "
             f"{', '.join(unknown)}",
-            [*own_names, "aspect"],
+            [*coefficients, "aspect"],
             unknown,
         )
     columns = np.eye(len(names))
@@ -73,7 +73,7 @@ def fit_lens(
 ) -> AdjustedBundle:
     """Return the lens and the poses that fit views best.
 
-    OpenCV finds the strongest coefficients; from there everything is adjusted, with weights.
+    OpenCV finds the strongest coefficients; from there all values are adjusted, with weights.
 
     Raises ``POOR_FIT`` if no focal length leads to a fit, and the errors of :func:`lens_basis`.
     """
@@ -81,7 +81,7 @@ def fit_lens(
     fits: list[AdjustedBundle] = []
     for length in FOCAL_LENGTHS:
         try:
-            fits.append(_fit(views, model, basis, length))
+            fits.append(_fit_from_length(views, model, basis, length))
         except (CalibrationError, load("cv2").error):
             continue
         if fits[-1].rms <= MAX_GOOD_RMS_PX:
@@ -95,23 +95,23 @@ def fit_lens(
     return min(fits, key=lambda candidate: candidate.rms)
 
 
-def _fit(
+def _fit_from_length(
     views: Sequence[TargetView], model: DistortionModel, basis: Array, length: float | None
 ) -> AdjustedBundle:
-    guess = _first(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
+    guess = _opencv_lens(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
     # coefficients that stay 0 are set to 0, and fy to fx if they are one unknown
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
-    if not np.isfinite(adjusted.weighted):
+    if not np.isfinite(adjusted.weighted_squares):
         raise Code.POOR_FIT.refusal("points behind the camera")
     return adjusted
 
 
-def _first(
+def _opencv_lens(
     views: Sequence[TargetView], model: DistortionModel, length: float | None
 ) -> CameraModel:
-    """Return OpenCV's lens with only the two strongest coefficients (and p1, p2)."""
+    """Return OpenCV's fit of a lens with only the two strongest coefficients (and p1, p2)."""
     cv2: Any = load("cv2")
     (width, height), matrix = views[0].size, None
     if length is not None:
@@ -119,24 +119,24 @@ def _first(
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     points = [view.object_points.astype(np.float32).reshape(-1, 1, 3) for view in views]
     pixels = [view.points.astype(np.float32).reshape(-1, 1, 2) for view in views]
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-6)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-6)
     if model == "equidistant":
         names = ["RECOMPUTE_EXTRINSIC", "FIX_SKEW", "FIX_K3", "FIX_K4"]
-        calibrate, space = cv2.fisheye.calibrate, cv2.fisheye
+        calibrate, namespace = cv2.fisheye.calibrate, cv2.fisheye
     else:
-        names, calibrate, space = ["FIX_K3"], cv2.calibrateCamera, cv2
+        names, calibrate, namespace = ["FIX_K3"], cv2.calibrateCamera, cv2
     names += [] if length is None else ["USE_INTRINSIC_GUESS"]
     # OpenCV 5 has the fisheye's flags among the others
     flags = sum(
-        getattr(space, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
+        getattr(namespace, f"CALIB_{name}", 0) or getattr(cv2, f"CALIB_{name}") for name in names
     )
-    start = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
-    _, fitted, bends, *_ = calibrate(
-        points, pixels, (width, height), matrix, start, flags=flags, criteria=stop
+    initial = np.zeros(COEFFICIENTS["equidistant" if model == "equidistant" else "plumb_bob"])
+    _, fitted_matrix, coefficients, *_ = calibrate(
+        points, pixels, (width, height), matrix, initial, flags=flags, criteria=criteria
     )
     distortion = np.zeros(COEFFICIENTS[model])
-    distortion[: bends.size] = bends.ravel()
-    fitted[0, 1] = 0.0
+    distortion[: coefficients.size] = coefficients.ravel()
+    fitted_matrix[0, 1] = 0.0
     return CameraModel(
-        size=(width, height), matrix=fitted, distortion=distortion, distortion_model=model
+        size=(width, height), matrix=fitted_matrix, distortion=distortion, distortion_model=model
     )

@@ -1,4 +1,4 @@
-"""Find suspicious views once a lens is fitted: points that are off, views that are copies.
+"""Find suspicious views after a fit: points that are off, and views that are copies.
 
 A point is judged by the part of its residual that the pose of its view cannot compensate.
 """
@@ -15,16 +15,16 @@ import numpy as np
 
 from smartcam.calibration._least_squares import solve_scaled
 from smartcam.calibration._lens.misfit import (
-    COUNT,
-    LENSES,
+    LENS_MASK,
+    UNKNOWN_COUNT,
     Equations,
-    Fitted,
-    Reduced,
+    FittedView,
+    SharedEquations,
     lens_remarks,
     misfit_remarks,
 )
-from smartcam.calibration._lens.projection import excess
-from smartcam.calibration._views import label
+from smartcam.calibration._lens.projection import excess_variance
+from smartcam.calibration._views import view_name
 from smartcam.geometry._inside import Code, Remark
 
 if TYPE_CHECKING:
@@ -41,16 +41,16 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 STRAY_LIMITS: Final = ((7.0, 1.5), (12.0, 0.25))
-"""A point is a stray if it is off by both the standard deviations and the pixels of either pair. In
-200 recorded views, whose noise is not quite normal, the farthest points are 9.6 deviations and 0.8
-pixels off, or 5.9 and 1.8 (measured)."""
+"""Pairs of standard deviations and pixels. A point is a stray if it is off by more than both values
+of a pair. In 200 recorded views, whose noise is not quite normal, the farthest points are off by
+9.6 deviations and 0.8 pixels, or by 5.9 deviations and 1.8 pixels (measured)."""
 
 MAX_STRAY_SHARE: Final = 0.2
 """At most this part of a view's points are strays: with more, the view is bad as a whole."""
 
 MIN_POINTS_KEPT: Final = 8
-"""Strays are left out only if this many points are left: with fewer, any of them may be the wrong
-one."""
+"""Strays are left out only while at least this many points are kept: among fewer, it is not clear
+which are the strays."""
 
 MEDIAN_SQUARED_LENGTH: Final = 2.0 * math.log(2.0)
 """Median of the squared length of two independent normal numbers with a variance of 1."""
@@ -59,18 +59,18 @@ MAX_POINTS_IN_MESSAGE: Final = 5
 """A message names at most this many points."""
 
 MAX_RMS_PX: Final = 10.0
-"""Residual RMS, pixels, above which points are not the target's: the wrong model of a lens leaves
-less."""
+"""Residual RMS, pixels, above which points are taken for those of another target: a wrong model of
+the lens causes a smaller RMS."""
 
 MAX_RMS_SHARE: Final = 0.015
-"""The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
+"""The limit MAX_RMS_PX as a part of the longer side of the image; the largest limit holds."""
 
 MAX_RMS_SIGMAS: Final = 20.0
-"""The limit MAX_RMS_PX as a multiple of the points' standard deviation; the larger holds."""
+"""The limit MAX_RMS_PX as a multiple of the points' standard deviation; the largest limit holds."""
 
 DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
-"""A principal point that lies this part of the image's sides off the centre may belong to another
-image."""
+"""A principal point is doubted if it is farther from the centre than this part of the image's
+sides: it may belong to an image of another size."""
 
 DOUBTED_CENTRE_SIGMAS: Final = 5.0
 """Least distance of a doubted principal point from the centre, in standard deviations."""
@@ -79,170 +79,186 @@ DOUBTED_CENTRE_SIGMAS: Final = 5.0
 class Stray(NamedTuple):
     """A point of a view that is not where the others predict it."""
 
-    number: int  # index of the view
+    view_index: int  # index of the view
     row: int  # index of the point in the view
-    ident: int  # number of the point on the target
-    off: float  # distance from the predicted place, pixels
+    point_id: int  # number of the point on the target
+    distance: float  # distance from the predicted place, pixels
 
 
-def strays(
-    fitted: Sequence[Fitted], more: float, used: Sequence[bool], *, lens: bool = True
+def find_strays(
+    fitted: Sequence[FittedView],
+    extra_variance: float,
+    used: Sequence[bool],
+    *,
+    is_lens_fitted: bool = True,
 ) -> list[Stray]:
     """Return the points that lie far from where all others predict them.
 
-    ``more``: variance in addition to the points' own, pixels^2. ``used``: mask of the views that it
-    was estimated from; another view may be bad because of a few of its points. ``lens``: whether
-    the lens was fitted to the views; if not, a point is no stray when a lens that fits the other
-    points predicts its place.
+    ``extra_variance``, pixels^2, is added to the points' covariance; ``used`` is the mask of the
+    views from which it was estimated. ``is_lens_fitted``: whether the lens was fitted to the views;
+    if not, a point is no stray if a lens that fits the other points predicts its place.
     """
-    equations = [view.equations(more) for view in fitted]
-    squares_of_views = _stray_squares(equations, used)
-    if not lens and any(squares.any() for squares in squares_of_views):
-        equations = _with_their_lens(equations, [squares == 0 for squares in squares_of_views])
-        squares_of_views = _stray_squares(equations, used)
+    equations = [view.equations(extra_variance) for view in fitted]
+    squares_of_views = _stray_squares_of_views(equations, used)
+    if not is_lens_fitted and any(squares.any() for squares in squares_of_views):
+        equations = _refit_lens(equations, [squares == 0 for squares in squares_of_views])
+        squares_of_views = _stray_squares_of_views(equations, used)
     outliers = []
-    for number, (equation, squares) in enumerate(zip(equations, squares_of_views, strict=True)):
+    for view_index, (equation, squares) in enumerate(zip(equations, squares_of_views, strict=True)):
         for row in np.flatnonzero(squares).tolist():
-            pixels = float(equation.deviations[row]) * math.sqrt(squares[row])
-            outliers.append(Stray(number, row, int(fitted[number].view.ids[row]), pixels))
+            distance = float(equation.deviations[row]) * math.sqrt(squares[row])
+            outliers.append(Stray(view_index, row, int(fitted[view_index].view.ids[row]), distance))
     return outliers
 
 
-def _with_their_lens(equations: Sequence[Equations], masks: Sequence[Mask]) -> list[Equations]:
+def _refit_lens(equations: Sequence[Equations], kept_masks: Sequence[Mask]) -> list[Equations]:
     """Return the equations after fitting the lens to the kept points."""
     masked = [
-        Equations(*(part[rows] for part in equation))
-        for equation, rows in zip(equations, masks, strict=True)
+        Equations(*(part[mask] for part in equation))
+        for equation, mask in zip(equations, kept_masks, strict=True)
     ]
-    change = Reduced.of(masked).best(LENSES)[0]
-    left = []
-    for equation, rows in zip(equations, masks, strict=True):
+    change = SharedEquations.from_views(masked).solve(LENS_MASK)[0]
+    refitted = []
+    for equation, mask in zip(equations, kept_masks, strict=True):
         residuals = equation.residuals - equation.by_shared @ change
-        by_pose, right = equation.by_pose[rows].reshape(-1, 6), residuals[rows].ravel()
+        by_pose, right = equation.by_pose[mask].reshape(-1, 6), residuals[mask].ravel()
         step = solve_scaled(by_pose.T @ by_pose, by_pose.T @ right)
-        left.append(equation._replace(residuals=residuals - equation.by_pose @ step))
-    return left
+        refitted.append(equation._replace(residuals=residuals - equation.by_pose @ step))
+    return refitted
 
 
-def squares_off(equations: Equations, scale: float) -> Array:
-    """Return the squared distances (N,) of points from their predicted places, 0 for small ones.
+def stray_squares(equations: Equations, unit_square: float) -> Array:
+    """Return the squared distances (N,) of strays from their predicted places; 0 for other points.
 
-    The other points of the view predict the places. ``scale``: squared length of one standard
+    The other points of the view predict the places. ``unit_square``: squared length of one standard
     deviation along each axis.
     """
     inliers = np.full(len(equations.residuals), np.isfinite(equations.residuals).all())
-    least = max(MIN_POINTS_KEPT, (1.0 - MAX_STRAY_SHARE) * len(inliers))
-    while inliers.sum() >= least:
+    min_inliers = max(MIN_POINTS_KEPT, (1.0 - MAX_STRAY_SHARE) * len(inliers))
+    while inliers.sum() >= min_inliers:
         rows, right = (
             equations.by_pose[inliers].reshape(-1, 6),
             equations.residuals[inliers].ravel(),
         )
         step = solve_scaled(rows.T @ rows, rows.T @ right)
         squares = ((equations.residuals - equations.by_pose @ step) ** 2).sum(axis=1)
-        outlying = _outlying(equations, squares, scale)
-        if not (inliers & outlying).any():
-            return np.where(~inliers & outlying, squares, 0.0)
-        inliers[int(np.argmax(np.where(inliers & outlying, squares, 0.0)))] = False
+        is_outlying = _is_outlying(equations, squares, unit_square)
+        if not (inliers & is_outlying).any():
+            return np.where(~inliers & is_outlying, squares, 0.0)
+        inliers[int(np.argmax(np.where(inliers & is_outlying, squares, 0.0)))] = False
     return np.zeros(len(equations.residuals))
 
 
-def _outlying(equations: Equations, squares: Array, scale: float) -> Mask:
+def _is_outlying(equations: Equations, squares: Array, unit_square: float) -> Mask:
     pixels = equations.deviations * np.sqrt(squares)
-    times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
-    outlying: Mask = np.any(
-        [(times > most) & (pixels > least) for most, least in STRAY_LIMITS], axis=0
+    sigmas = np.sqrt(squares / max(unit_square, np.finfo(np.float64).tiny))
+    is_outlying: Mask = np.any(
+        [(sigmas > max_sigmas) & (pixels > min_pixels) for max_sigmas, min_pixels in STRAY_LIMITS],
+        axis=0,
     )
-    return outlying
+    return is_outlying
 
 
-def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list[Array]:
-    """Return the squared distances (N,) from their predicted places in each view, 0 for most."""
-    of_used = itertools.compress(equations, used)
+def _stray_squares_of_views(equations: Sequence[Equations], used: Sequence[bool]) -> list[Array]:
+    """Return the :func:`stray_squares` (N,) of each view."""
+    used_equations = itertools.compress(equations, used)
     # unlike the variance of all points, the median is hardly changed by a few strays
-    middle = np.median(
-        np.concatenate([(equation.residuals**2).sum(axis=1) for equation in of_used])
+    median = np.median(
+        np.concatenate([(equation.residuals**2).sum(axis=1) for equation in used_equations])
     )
-    return [squares_off(equation, float(middle) / MEDIAN_SQUARED_LENGTH) for equation in equations]
+    return [
+        stray_squares(equation, float(median) / MEDIAN_SQUARED_LENGTH) for equation in equations
+    ]
 
 
-def without(views: Sequence[TargetView], outliers: Sequence[Stray]) -> list[TargetView]:
-    """Return views without some of their points."""
-    fewer = list(views)
-    for number, group in itertools.groupby(outliers, key=lambda outlier: outlier.number):
-        view = views[number]
+def remove_points(views: Sequence[TargetView], outliers: Sequence[Stray]) -> list[TargetView]:
+    """Return the views without the ``outliers``."""
+    cleaned = list(views)
+    for view_index, group in itertools.groupby(outliers, key=lambda outlier: outlier.view_index):
+        view = views[view_index]
         rows = np.setdiff1d(np.arange(len(view.ids)), [outlier.row for outlier in group])
-        fewer[number] = dataclasses.replace(
+        cleaned[view_index] = dataclasses.replace(
             view,
             ids=view.ids[rows],
             points=view.points[rows],
             covariance=view.covariance[rows],
         )
-    return fewer
+    return cleaned
 
 
-def stray_remarks(outliers: Sequence[Stray], names: Sequence[str], done: str) -> Iterator[Remark]:
-    """Yield the remarks on strays; ``names`` are those of the views."""
-    counts = collections.Counter(outlier.ident for outlier in outliers)
-    often = {ident for ident, count in counts.items() if count >= max(3, len(names) / 2)}
-    for ident in sorted(often):
-        distances = [outlier.off for outlier in outliers if outlier.ident == ident]
+def stray_remarks(
+    outliers: Sequence[Stray], names: Sequence[str], outcome: str
+) -> Iterator[Remark]:
+    """Yield remarks on strays in views with these names; ``outcome``: what was done, in words."""
+    view_counts = collections.Counter(outlier.point_id for outlier in outliers)
+    frequent_ids = {
+        point_id for point_id, count in view_counts.items() if count >= max(3, len(names) / 2)
+    }
+    for point_id in sorted(frequent_ids):
+        distances = [outlier.distance for outlier in outliers if outlier.point_id == point_id]
         yield Code.OUTLIER.remark(
-            f"point {ident} of the target is {np.median(distances):.3g} pixels off in "
+            f"point {point_id} of the target is {np.median(distances):.3g} pixels off in "
             f"{len(distances)} of {len(names)} views: it is not at its nominal place, "
-            "or something is taken for "
-            f"it; it {done} there"
+            f"or something is taken for it; it {outcome} there"
         )
-    rest = [outlier for outlier in outliers if outlier.ident not in often]
-    if rest:
-        each = [
-            f"{outlier.ident} in {names[outlier.number]} ({outlier.off:.3g} pixels)"
-            for outlier in rest
+    others = [outlier for outlier in outliers if outlier.point_id not in frequent_ids]
+    if others:
+        descriptions = [
+            f"{outlier.point_id} in {names[outlier.view_index]} ({outlier.distance:.3g} pixels)"
+            for outlier in others
         ]
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{_listed(each, ', ')}: each {done}"
+            f"{_join_first(descriptions, ', ')}: each {outcome}"
         )
 
 
-def _listed(texts: Sequence[str], separator: str) -> str:
-    more = len(texts) - MAX_POINTS_IN_MESSAGE
+def _join_first(texts: Sequence[str], separator: str) -> str:
+    rest_count = len(texts) - MAX_POINTS_IN_MESSAGE
     first = separator.join(texts[:MAX_POINTS_IN_MESSAGE])
-    return f"{first}, and {more} more" if more > 0 else first
+    return f"{first}, and {rest_count} more" if rest_count > 0 else first
 
 
-def without_strays(
-    views: Sequence[TargetView], poses: Sequence[TargetPose], camera: CameraModel, *, given: bool
+def remove_strays(
+    views: Sequence[TargetView],
+    poses: Sequence[TargetPose],
+    camera: CameraModel,
+    *,
+    is_lens_given: bool,
 ) -> tuple[list[TargetView], list[Remark]]:
     """Return the views without their stray points, and the remarks about views, points and lens.
 
-    ``given``: the user gave the lens, so it may be another camera's; else these views gave it.
+    ``is_lens_given``: whether the user gave the lens, which may then be another camera's; otherwise
+    it was calibrated from these views.
     """
     residuals = np.concatenate([pose.residuals for pose in poses])
     noise = np.concatenate([view.covariance for view in views])
-    more = excess(residuals, noise, residuals.size - 6 * len(views))
+    extra_variance = excess_variance(residuals, noise, residuals.size - 6 * len(views))
     fitted = [
-        Fitted(view, camera, pose.transform.rigid, view.target.points)
+        FittedView(view, camera, pose.transform.rigid, view.target.points)
         for view, pose in zip(views, poses, strict=True)
     ]
-    outliers = strays(fitted, more, [True] * len(fitted), lens=False)
-    names = [label(view, number) for number, view in enumerate(views)]
-    left = without(views, outliers)
-    cleaned = [fit._replace(view=view) for fit, view in zip(fitted, left, strict=True)]
+    outliers = find_strays(fitted, extra_variance, [True] * len(fitted), is_lens_fitted=False)
+    names = [view_name(view, number) for number, view in enumerate(views)]
+    cleaned_views = remove_points(views, outliers)
+    cleaned_fits = [
+        fit._replace(view=view) for fit, view in zip(fitted, cleaned_views, strict=True)
+    ]
     remarks = stray_remarks(outliers, names, "was not used"), view_remarks(views, names)
-    of_lens = lens_remarks(cleaned, "lens", more) if given else ()
-    return left, [*itertools.chain(*remarks), *of_lens]
+    lens_warnings = lens_remarks(cleaned_fits, "lens", extra_variance) if is_lens_given else ()
+    return cleaned_views, [*itertools.chain(*remarks), *lens_warnings]
 
 
-def examined(
+def examine_views(
     calibration: IntrinsicCalibration,
-    again: Callable[[list[TargetView]], IntrinsicCalibration],
+    recalibrate: Callable[[list[TargetView]], IntrinsicCalibration],
     *,
-    drop: bool,
+    drop_strays: bool,
 ) -> IntrinsicCalibration:
-    """Return the calibration without stray points, and with remarks on them.
+    """Return the calibration with remarks on suspicious views, and without stray points.
 
-    ``again`` calibrates from other views. ``drop``: whether stray points are left out. Raises
-    ``POOR_FIT``: the points are not the target's.
+    ``recalibrate`` calibrates from other views. ``drop_strays``: whether stray points are left out.
+    Raises ``POOR_FIT`` if the points are not the target's.
     """
     views, used = (
         [fit.view for fit in calibration.views],
@@ -250,22 +266,29 @@ def examined(
     )
     points = views[0].target.points + (0.0 if calibration.sheet is None else calibration.sheet)
     fitted = [
-        Fitted(fit.view, calibration.camera, fit.transform.rigid, points)
+        FittedView(fit.view, calibration.camera, fit.transform.rigid, points)
         for fit in calibration.views
     ]
-    names = [label(view, number) for number, view in enumerate(views)]
+    names = [view_name(view, number) for number, view in enumerate(views)]
     check_rms("intrinsics", calibration.rms, views)
-    of_fit = [*view_remarks(views, names), *_remarks_on_middle(calibration)]
-    free = np.zeros(COUNT, dtype=np.bool_)
+    fit_remarks = [*view_remarks(views, names), *_centre_remarks(calibration)]
+    free = np.zeros(UNKNOWN_COUNT, dtype=np.bool_)
     free[: len(calibration.covariance)] = np.diag(calibration.covariance) > 0
-    of_used = [[fit] for fit in itertools.compress(fitted, used)], calibration.sigma**2, free
-    of_fit += misfit_remarks(*of_used, list(itertools.compress(names, used)))
-    outliers = strays(fitted, calibration.sigma**2, used)
-    if outliers and drop:
-        calibration, of_fit = again(without(views, outliers)), []  # remarked on by check_rms
-    done = "was not used" if drop else "is used all the same"
-    remarks = stray_remarks(outliers, names, done)
-    return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings, *of_fit))
+    misfit_arguments = (
+        [[fit] for fit in itertools.compress(fitted, used)],
+        calibration.sigma**2,
+        free,
+    )
+    fit_remarks += misfit_remarks(*misfit_arguments, list(itertools.compress(names, used)))
+    outliers = find_strays(fitted, calibration.sigma**2, used)
+    if outliers and drop_strays:
+        # the new calibration already has the remarks on its own fit
+        calibration, fit_remarks = recalibrate(remove_points(views, outliers)), []
+    outcome = "was not used" if drop_strays else "is used all the same"
+    remarks = stray_remarks(outliers, names, outcome)
+    return dataclasses.replace(
+        calibration, warnings=(*remarks, *calibration.warnings, *fit_remarks)
+    )
 
 
 def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[Remark]:
@@ -277,43 +300,43 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
     if copies:
         yield Code.COINCIDENT.remark(
             "views that are the same to the last digit: "
-            f"{_listed(copies, '; ')}: "
+            f"{_join_first(copies, '; ')}: "
             "they count as often as they are there, and errors come out too small"
         )
 
 
-def _remarks_on_middle(calibration: IntrinsicCalibration) -> Iterator[Remark]:
+def _centre_remarks(calibration: IntrinsicCalibration) -> Iterator[Remark]:
     size = np.array(calibration.camera.size)
-    middle, sigmas = calibration.camera.matrix[:2, 2], np.sqrt(np.diag(calibration.covariance)[2:4])
-    distances = np.abs(middle - (size - 1) / 2)
+    centre, sigmas = calibration.camera.matrix[:2, 2], np.sqrt(np.diag(calibration.covariance)[2:4])
+    distances = np.abs(centre - (size - 1) / 2)
     if (
         (distances > DOUBTED_CENTRE_OFFSET_SHARE * size)
         & (distances > DOUBTED_CENTRE_SIGMAS * sigmas)
     ).any():
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
-            f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "
+            f"pixels, got ({centre[0]:.0f}, {centre[1]:.0f}): were points taken from an image of "
             "another size? Where images are cut to a part of the sensor's, all is well"
         )
 
 
 def check_rms(label: str, rms: float, views: Sequence[TargetView]) -> None:
     """Raise ``POOR_FIT`` if the residuals are so large that the points cannot be the target's."""
-    most = most_rms(views)
-    if rms > most:
+    max_rms = max_plausible_rms(views)
+    if rms > max_rms:
         raise Code.POOR_FIT.refusal(
             f"{label}: expected views of {views[0].target}, got residuals of {rms:.3g} pixels rms, "
-            f"{most:.3g} at most expected: are columns and rows those of the sheet, and are the "
+            f"{max_rms:.3g} at most expected: are columns and rows those of the sheet, and are the "
             "points those that their numbers say?",
-            most,
+            max_rms,
             rms,
         )
 
 
-def most_rms(
-    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
+def max_plausible_rms(
+    views: Sequence[TargetView], max_pixels: float = MAX_RMS_PX, max_share: float = MAX_RMS_SHARE
 ) -> float:
-    """Return the RMS of a coordinate, pixels, above which views are impossible."""
+    """Return the RMS of a coordinate, pixels, above which points are not those of the target."""
     noise = float(np.median(np.concatenate([view.sigmas for view in views])))
-    longer = max(max(view.size) for view in views)
-    return max(worst, part * longer, MAX_RMS_SIGMAS * noise)
+    longer_side = max(max(view.size) for view in views)
+    return max(max_pixels, max_share * longer_side, MAX_RMS_SIGMAS * noise)

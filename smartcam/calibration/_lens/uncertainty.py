@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.calibration._lens.field import (
-    SHAPE,
+    DEFAULT_MAP_SHAPE,
     check_distance,
-    known_points,
-    places,
-    points_at,
+    finite_points,
+    map_pixels,
+    points_of_pixels,
     sensitivity,
 )
 
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 
 class MapFigures(NamedTuple):
-    """Four numbers that sum up a map, for a coordinate; NaN where the lens' model does not reach.
+    """Four numbers that sum up a map, as the RMS of a coordinate.
+
+    A number is NaN if the lens' model reaches none of its pixels.
 
     Attributes:
         centre: value at the centre of the image.
@@ -72,10 +74,10 @@ class ProjectionUncertainty:
         """
         # A pixel's derivative by the point, J (2, 3), is 0 along the ray, so J^+ gives the least
         # shift, which is across it.
-        back = np.full_like(self.by_point.swapaxes(2, 3), np.nan)
+        inverse = np.full_like(self.by_point.swapaxes(2, 3), np.nan)
         finite = np.isfinite(self.by_point).all(axis=(2, 3))
-        back[finite] = np.linalg.pinv(self.by_point[finite])
-        shifts = back @ self.covariance @ back.swapaxes(2, 3)
+        inverse[finite] = np.linalg.pinv(self.by_point[finite])
+        shifts = inverse @ self.covariance @ inverse.swapaxes(2, 3)
         across: Array = np.sqrt(np.trace(shifts, axis1=2, axis2=3) / 2)
         return across
 
@@ -92,13 +94,13 @@ def figures(sigma: Array) -> MapFigures:
     finite = sigma[np.isfinite(sigma)]
     return MapFigures(
         float(sigma[rows // 2, columns // 2]),
-        _mean(corners[np.isfinite(corners)]),
+        _rms(corners[np.isfinite(corners)]),
         float(finite.max()) if len(finite) else math.nan,
-        _mean(finite),
+        _rms(finite),
     )
 
 
-def _mean(values: Array) -> float:
+def _rms(values: Array) -> float:
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
@@ -108,22 +110,22 @@ def uncertainty(
     gauge: Array,
     *,
     distance: float | None = None,
-    shape: tuple[int, int] = SHAPE,
+    shape: tuple[int, int] = DEFAULT_MAP_SHAPE,
 ) -> ProjectionUncertainty:
     """Return the map of a lens, from the covariance of its values (fx, fy, cx, cy, coefficients).
 
-    ``gauge``: (N, 3), points in the camera's frame that the motion is fitted to. All else, errors
-    included, is as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    ``gauge``: (N, 3), points in the camera's frame that the motion is fitted to. Other arguments
+    and errors: as in :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     check_distance(distance)
-    pixels = places(camera.size, shape)
-    points = points_at(camera, pixels.reshape(-1, 2), distance)
+    pixels = map_pixels(camera.size, shape)
+    points = points_of_pixels(camera, pixels.reshape(-1, 2), distance)
     field = sensitivity(camera, points, at_infinity=distance is None)
-    freed = field.freed(sensitivity(camera, known_points(gauge)))
+    by_lens = field.without_motion(sensitivity(camera, finite_points(gauge)))
     return ProjectionUncertainty(
         size=camera.size,
         distance=distance,
         pixels=pixels,
-        covariance=(freed @ covariance @ freed.swapaxes(1, 2)).reshape(*shape, 2, 2),
+        covariance=(by_lens @ covariance @ by_lens.swapaxes(1, 2)).reshape(*shape, 2, 2),
         by_point=field.by_point.reshape(*shape, 2, 3),
     )

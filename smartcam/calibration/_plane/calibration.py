@@ -31,22 +31,27 @@ from smartcam.calibration._plane.diagnostics import (
     TYPICAL_SIGMA_M,
     Evidence,
     check_side,
-    findings,
-    sigma_of,
+    estimate_sigma,
+    find_warnings,
 )
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
-from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, Candidates, rms, squares
+from smartcam.calibration._plane.model_selection import (
+    ROUNDING_RATIO,
+    Candidates,
+    rms,
+    sum_of_squares,
+)
 from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
-from smartcam.calibration._plane.robust import agreeing
+from smartcam.calibration._plane.robust import find_agreeing
 from smartcam.calibration._plane.validation import (
     check_lever,
     check_positive,
     check_samples,
-    distinct,
     extent,
     lever,
+    merge_repeated,
     normalize,
     read_pairs,
 )
@@ -71,18 +76,18 @@ POINTS_PER_BLOCK = 16_384
 """Covariances are computed for this many points at a time, which takes 5 MB."""
 
 MIN_POINTS_FOR_VERDICT: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
-"""A verdict needs this many points: fewer may fit the model although two of them are wrong by the
-same mistake (shown by simulation)."""
+"""A verdict needs this many points: fewer may fit the model although two of them are wrong in the
+same way (simulated)."""
 
 MAX_TOUCH_SIGMAS = 4.0
-"""A touch further than this many sigmas from the mean of its point's touches is remarked on: noise
-alone does it once in a thousand."""
+"""A touch farther than this many sigmas from the mean of its point's touches is remarked on: noise
+alone causes that once in a thousand touches."""
 
 MIN_DIRECTION_LENGTH = 1e-9
 """A vector shorter than this has no direction."""
 
 STALE_LEVEL = 0.01
-"""Probability with which a calibration that still holds is called stale."""
+"""Probability with which a calibration that still holds may be called stale."""
 
 
 class Drift(NamedTuple):
@@ -182,9 +187,9 @@ class PlaneCalibration(storage.SavedCalibration):
         return PlaneMap(self.matrix, self.place.camera)
 
     @cached_property
-    def _local(self) -> Array:
+    def _local_matrix(self) -> Array:
         """The matrix between centred and scaled points (4, 3)."""
-        return self.place.inward(self.matrix)
+        return self.place.to_normalized(self.matrix)
 
     @property
     def rotation(self) -> Array:
@@ -237,27 +242,37 @@ class PlaneCalibration(storage.SavedCalibration):
     def judged(self, predicted: float | None = None, where: str = "") -> Judgement:
         """Return the verdict and the advice.
 
-        ``predicted``: RMS error to expect, metres; None: that at the points. ``where``: text for
-        people: the place of the verdict.
+        ``predicted``: RMS error to expect, metres; None: that at the touched points. ``where``: the
+        place for which the verdict holds, as a part of its text.
         """
-        counted, out = self.weights > 0.0, [1 + index for index in self.outliers]
+        is_used, left_out = self.weights > 0.0, [1 + index for index in self.outliers]
         if predicted is None and self.touch_sigma is not None:
-            at_points = self.predicted_error(self.camera_points[counted])
+            at_points = self.predicted_error(self.camera_points[is_used])
             predicted = math.sqrt(float((at_points**2).mean()))
-        without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
-        held_out, more = self.held_out_error, "touch more points"
-        points = len(np.unique(self.camera_points[counted], axis=0))
-        if points < (least := MIN_POINTS_FOR_VERDICT.get(self.model, 0)):
+        without_text = (
+            f" without point{'s' * (len(left_out) > 1)} {', '.join(map(str, left_out))}"
+            if left_out
+            else ""
+        )
+        held_out, advice = self.held_out_error, "touch more points"
+        point_count = len(np.unique(self.camera_points[is_used], axis=0))
+        if point_count < (min_points := MIN_POINTS_FOR_VERDICT.get(self.model, 0)):
             held_out = None
-            more = f"two wrong ones of {points} points can look right: touch {least} or more"
+            advice = (
+                f"two wrong ones of {point_count} points can look right: touch {min_points} or more"
+            )
         return judge(
             None if held_out is None else 1e3 * held_out,
-            [warning for warning in self.warnings if not (out and warning.code == Code.OUTLIER)],
+            [
+                warning
+                for warning in self.warnings
+                if not (left_out and warning.code == Code.OUTLIER)
+            ],
             worst=1 + self.worst,
             predicted=None if predicted is None else 1e3 * predicted,
-            allowed=Allowed.of(self.allowed_error, extent(self.robot_points[counted])),
-            more=more,
-            where=f"{where}{without}",
+            allowed=Allowed.of(self.allowed_error, extent(self.robot_points[is_used])),
+            advice=advice,
+            where=f"{where}{without_text}",
         )
 
     def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
@@ -332,8 +347,8 @@ class PlaneCalibration(storage.SavedCalibration):
                 [localizations[n] for n in with_sigma],
                 self.transform,
                 self.normal,
-                self._rows,
-                self._variance * self.unit_covariance,
+                self._parameter_derivatives,
+                self._touch_variance * self.unit_covariance,
                 self.place.camera_size,
                 flip=flip,
             )
@@ -355,28 +370,32 @@ class PlaneCalibration(storage.SavedCalibration):
             CalibrationError: SHAPE or NOT_FINITE; UNVERIFIED: the touches' sigma is not known.
         """
         # J C J^T with the map's Jacobian by its parameters; C is derived in fitting.fit
-        seen = as_points(points, 2, "camera points")
+        camera_array = as_points(points, 2, "camera points")
         return np.concatenate(
             [
-                self._joint(seen[i : i + POINTS_PER_BLOCK])
-                for i in range(0, len(seen), POINTS_PER_BLOCK)
+                self._block_covariances(camera_array[i : i + POINTS_PER_BLOCK])
+                for i in range(0, len(camera_array), POINTS_PER_BLOCK)
             ]
             or [np.zeros((0, 3, 3))]
         )
 
-    def _joint(self, seen: Array) -> Array:
-        rows = self._rows(seen)
-        joint: Array = self._variance * (rows @ self.unit_covariance @ rows.swapaxes(1, 2))
-        return joint
+    def _block_covariances(self, camera_array: Array) -> Array:
+        derivatives = self._parameter_derivatives(camera_array)
+        covariances: Array = self._touch_variance * (
+            derivatives @ self.unit_covariance @ derivatives.swapaxes(1, 2)
+        )
+        return covariances
 
-    def _rows(self, seen: Array) -> Array:
+    def _parameter_derivatives(self, camera_array: Array) -> Array:
         """Return the derivatives of mapped points by the fit's matrix, (K, 3, 12), metres."""
-        local = (seen - self.place.camera) / self.place.camera_size
-        moved: Array = self.place.robot_size * element_derivatives(self._local, local)
-        return moved
+        normalized = (camera_array - self.place.camera) / self.place.camera_size
+        derivatives: Array = self.place.robot_size * element_derivatives(
+            self._local_matrix, normalized
+        )
+        return derivatives
 
     @property
-    def _variance(self) -> float:
+    def _touch_variance(self) -> float:
         if self.touch_sigma is None:
             raise Code.UNVERIFIED.refusal(
                 "predicted error: expected touch_sigma, or more points than the "
@@ -423,31 +442,36 @@ class PlaneCalibration(storage.SavedCalibration):
             raise Code.NOT_FINITE.unexpected(
                 "level: expected a number between 0 and 1", "a number between 0 and 1", level
             )
-        seen = as_points(np.atleast_2d(camera_points), 2, "camera points")
-        touched = as_points(np.atleast_2d(robot_points), 3, "robot points")
-        if len(seen) != len(touched) or not len(seen):
+        camera_array = as_points(np.atleast_2d(camera_points), 2, "camera points")
+        robot_array = as_points(np.atleast_2d(robot_points), 3, "robot points")
+        if len(camera_array) != len(robot_array) or not len(camera_array):
             raise Code.SHAPE.unexpected(
-                f"expected as many robot points as camera points ({len(seen)}), one at least",
-                len(seen),
-                len(touched),
+                f"expected as many robot points as camera points ({len(camera_array)}), "
+                "one at least",
+                len(camera_array),
+                len(robot_array),
             )
-        offsets = touched - self.transform(seen)
-        rows = self._rows(seen).reshape(-1, 12)
-        variance = self._variance
-        joint = rows @ self.unit_covariance @ rows.T + np.eye(len(rows))
-        squared = float(offsets.ravel() @ np.linalg.solve(joint, offsets.ravel()))
-        each = np.tile(np.eye(3), (len(seen), 1))
-        weighted = np.linalg.solve(joint, each)
-        pull = weighted.T @ offsets.ravel()
-        shifted = float(pull @ np.linalg.solve(each.T @ weighted, pull))
+        offsets = robot_array - self.transform(camera_array)
+        derivatives = self._parameter_derivatives(camera_array).reshape(-1, 12)
+        variance = self._touch_variance
+        offset_covariance = derivatives @ self.unit_covariance @ derivatives.T + np.eye(
+            len(derivatives)
+        )
+        all_squares = float(offsets.ravel() @ np.linalg.solve(offset_covariance, offsets.ravel()))
+        shift_basis = np.tile(np.eye(3), (len(camera_array), 1))
+        weighted = np.linalg.solve(offset_covariance, shift_basis)
+        weighted_sum = weighted.T @ offsets.ravel()
+        shift_squares = float(
+            weighted_sum @ np.linalg.solve(shift_basis.T @ weighted, weighted_sum)
+        )
         noise = Noise(
             max(variance, (ROUNDING_RATIO * self.place.robot_size) ** 2),
             None if self.sigma_given else self.freedom,
         )
-        chance = noise.chance(squared, len(rows))
-        if len(seen) > 1:
-            chance = min(1.0, 2.0 * min(chance, noise.chance(shifted, 3)))
-        expected = math.sqrt(variance * float(np.trace(joint)) / len(seen))
+        chance = noise.chance(all_squares, len(derivatives))
+        if len(camera_array) > 1:
+            chance = min(1.0, 2.0 * min(chance, noise.chance(shift_squares, 3)))
+        expected = math.sqrt(variance * float(np.trace(offset_covariance)) / len(camera_array))
         return Drift(offsets, expected, chance, normal_deviations(chance), chance < level)
 
     def at_height(self, height: float, camera_position: ArrayLike) -> PlaneCalibration:
@@ -462,21 +486,21 @@ class PlaneCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: OUT_OF_FIELD: the camera is not over that plane.
         """
-        camera = as_vector(camera_position, 3, "camera position")
-        distance = abs(float((camera - self._map.origin) @ self.normal))
+        camera_centre = as_vector(camera_position, 3, "camera position")
+        distance = abs(float((camera_centre - self._map.origin) @ self.normal))
         if not (math.isfinite(height) and distance > max(height, 0.0)):
             raise Code.OUT_OF_FIELD.refusal(
                 f"expected a height below the camera's ({distance:.6g} m), got {height:.6g} m",
                 distance,
                 height,
             )
-        part = height / distance
+        share = height / distance
         matrix = self.matrix.copy()
-        matrix[:3] = (1 - part) * matrix[:3] + part * np.outer(camera, matrix[3])
+        matrix[:3] = (1 - share) * matrix[:3] + share * np.outer(camera_centre, matrix[3])
         place = dataclasses.replace(
             self.place,
-            robot=(1 - part) * self.place.robot + part * camera,
-            robot_size=(1 - part) * self.place.robot_size,
+            robot=(1 - share) * self.place.robot + share * camera_centre,
+            robot_size=(1 - share) * self.place.robot_size,
         )
         return dataclasses.replace(self, matrix=matrix, place=place, height=self.height + height)
 
@@ -489,7 +513,7 @@ class PlaneCalibration(storage.SavedCalibration):
             )
         if self.unit_covariance.shape != (12, 12):
             raise storage.invalid_data_error(called, "unit_covariance: expected rows of 12", None)
-        _ = self._map  # refused here, not only when the first part comes
+        _ = self._map  # raises now for an invalid matrix, not only when the first part comes
 
 
 @takes(
@@ -563,69 +587,75 @@ def fit_plane(
         raise ConfigurationError(
             f"fit_plane: model: expected auto, {', '.join(MODELS)}, got {shown(model)}"
         )
-    camera, robot, parts = read_pairs(camera_points, robot_points, weights)
+    camera, robot, point_weights = read_pairs(camera_points, robot_points, weights)
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
     check_positive(allowed_error, "allowed_error", "metres")
-    once = distinct(camera, robot, parts)
-    marks, touched = once.camera, once.robot
+    merged = merge_repeated(camera, robot, point_weights)
+    marks, touches = merged.camera, merged.robot
     inliers = np.arange(len(marks))
-    least = MODELS["similarity" if model == "auto" else model].least
+    min_points = MODELS["similarity" if model == "auto" else model].min_points
     # the message about equal points must name the points as given
     if len(marks) < len(camera):
-        check_samples(camera, robot, least, touch_sigma, strays=robust)
+        check_samples(camera, robot, min_points, touch_sigma, allow_strays=robust)
     if robust:
-        inliers = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
-    check_samples(marks[inliers], touched[inliers], least, touch_sigma)
-    most = MAX_SIGMA.of(extent(touched[inliers])) if touch_sigma is None else touch_sigma
-    # of all points: those in a wrong order agree with one another as well as those in the right one
-    order = better_order(marks, touched, most)
-    if order is not None and set(order.moved).isdisjoint(inliers):
-        order = None
-    side = None if tool_z is None else mean_axis(tool_z, len(camera))
-    place, pairs = normalize(marks[inliers], touched[inliers], once.weights[inliers])
+        inliers = np.flatnonzero(find_agreeing(marks, touches, merged.weights, touch_sigma))
+    check_samples(marks[inliers], touches[inliers], min_points, touch_sigma)
+    max_sigma = MAX_SIGMA.of(extent(touches[inliers])) if touch_sigma is None else touch_sigma
+    # all points are used, since points in a wrong order may also agree with one another
+    reordered = better_order(marks, touches, max_sigma)
+    if reordered is not None and set(reordered.moved).isdisjoint(inliers):
+        reordered = None
+    tool_axis = None if tool_z is None else mean_axis(tool_z, len(camera))
+    place, pairs = normalize(marks[inliers], touches[inliers], merged.weights[inliers])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
-    unit = place.camera_size / place.robot_size
-    nominal = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
-    candidates = Candidates(pairs, None if nominal is None else nominal * unit)
-    first: ModelName = candidates.simplest() if model == "auto" else model
-    preferred = candidates.choose(sigma, first)
+    scale_ratio = place.camera_size / place.robot_size
+    expected_scale = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
+    candidates = Candidates(pairs, None if expected_scale is None else expected_scale * scale_ratio)
+    start_model: ModelName = candidates.simplest_model() if model == "auto" else model
+    preferred = candidates.choose(sigma, start_model)
     fitted = candidates.require(preferred if model == "auto" else model)
     held_out = candidates.held_out(fitted)
-    matrix = place.outward(fitted.matrix)
+    matrix = place.to_original(fitted.matrix)
     plane = PlaneMap(matrix, place.camera)
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
         candidates=candidates,
         preferred=preferred,
-        asked=model != "auto",
+        is_model_given=model != "auto",
         held_out=held_out,
         sigma=sigma,
-        most=most / place.robot_size,
+        max_sigma=max_sigma / place.robot_size,
         place=place,
-        nominal_scale=nominal,
-        side=None if side is None else check_side(plane.frame[:, 2], side),
-        numbers=1 + once.first[inliers],
+        nominal_scale=expected_scale,
+        tool_cosine=None if tool_axis is None else check_side(plane.frame[:, 2], tool_axis),
+        point_numbers=1 + merged.first_index[inliers],
     )
-    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
+    estimate = _estimate_touch_sigma(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
     if robust and touch_sigma is None and estimate is not None:
-        check_lever(lever(touched[inliers]), place.robot_size * estimate)
+        check_lever(lever(touches[inliers]), place.robot_size * estimate)
     left_out = np.setdiff1d(np.arange(len(marks)), inliers)
-    missed = np.zeros_like(touched)
-    missed[left_out] = touched[left_out] - plane.transform(marks[left_out])
-    beside = robot - touched[once.number]
-    compared: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
+    stray_offsets = np.zeros_like(touches)
+    stray_offsets[left_out] = touches[left_out] - plane.transform(marks[left_out])
+    touch_offsets = robot - touches[merged.point_index]
+    compared_models: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
     calibration = PlaneCalibration(
         model=fitted.model,
         camera_points=camera,
         robot_points=robot,
-        weights=np.where(np.isin(once.number, inliers), parts, 0.0),
+        weights=np.where(np.isin(merged.point_index, inliers), point_weights, 0.0),
         matrix=matrix,
         place=place,
         unit_covariance=fitted.unit_covariance / place.robot_size**2,
-        residuals=_put(missed, inliers, place.robot_size * fitted.residuals)[once.number] + beside,
-        leave_one_out=_put(missed, inliers, place.robot_size * held_out)[once.number] + beside,
+        residuals=_with_rows(stray_offsets, inliers, place.robot_size * fitted.residuals)[
+            merged.point_index
+        ]
+        + touch_offsets,
+        leave_one_out=_with_rows(stray_offsets, inliers, place.robot_size * held_out)[
+            merged.point_index
+        ]
+        + touch_offsets,
         freedom=fitted.freedom,
         touch_sigma=touch_sigma
         if estimate is None or touch_sigma is not None
@@ -633,52 +663,55 @@ def fit_plane(
         sigma_given=touch_sigma is not None,
         candidates={
             name: None if math.isnan(error) else place.robot_size * error
-            for name, error in candidates.errors(compared).items()
+            for name, error in candidates.errors(compared_models).items()
         },
         nominal_scale=nominal_scale,
-        tool_z=side,
+        tool_z=tool_axis,
         robot_frame=robot_frame,
         camera_frame=camera_frame,
         y_down=y_down,
         allowed_error=allowed_error,
-        warnings=findings(evidence),
+        warnings=find_warnings(evidence),
     )
-    remarks = [] if order is None else [order.remark(1 + once.first)]
+    remarks = [] if reordered is None else [reordered.remark(1 + merged.first_index)]
     remarks += [
-        *_moved_remark(missed[left_out], 1 + once.first[left_out]),
-        *(_left_out(calibration, index, parts[index]) for index in calibration.outliers),
+        *_move_remarks(stray_offsets[left_out], 1 + merged.first_index[left_out]),
+        *(
+            _left_out_remark(calibration, index, point_weights[index])
+            for index in calibration.outliers
+        ),
     ]
-    distances = np.linalg.norm(beside, axis=1)
-    if distances.max() > MAX_TOUCH_SIGMAS * most:
+    distances = np.linalg.norm(touch_offsets, axis=1)
+    if distances.max() > MAX_TOUCH_SIGMAS * max_sigma:
         number, worst = 1 + int(distances.argmax()), 1e3 * float(distances.max())
         text = f"point {number} was touched {worst:.3g} mm from"
         remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
     return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings))
 
 
-def _put(array: Array, at: NDArray[np.intp], values: Array) -> Array:
+def _with_rows(array: Array, rows: NDArray[np.intp], values: Array) -> Array:
     """Return a copy of ``array`` with ``values`` in some rows."""
     result = array.copy()
-    result[at] = values
+    result[rows] = values
     return result
 
 
-def _moved_remark(missed: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
-    """Yield a remark if the touches that were left out are off by the same way.
+def _move_remarks(offsets: Array, numbers: NDArray[np.intp]) -> Iterator[Remark]:
+    """Yield a remark if the touches that were left out are all shifted by about the same vector.
 
-    ``missed`` (N, 3): their distances from where the others say, metres. ``numbers``: of the
-    points, from 1.
+    ``offsets`` (N, 3): of these touches from the places that the others predict, metres.
+    ``numbers``: numbers of the points, from 1.
     """
-    if (move := common_move(missed)) is not None:
+    if (shift := common_move(offsets)) is not None:
         yield Code.POOR_FIT.remark(
             f"points {', '.join(map(str, numbers.tolist()))} are left out, and all lie "
-            f"{1e3 * float(np.linalg.norm(move)):.3g} mm off to one side: the sheet or the tip "
+            f"{1e3 * float(np.linalg.norm(shift)):.3g} mm off to one side: the sheet or the tip "
             "moved between the touches, and which of both holds now, they cannot tell"
         )
 
 
-def _left_out(calibration: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Return the remark on a point left out: its distance, and the part that touching explains."""
+def _left_out_remark(calibration: PlaneCalibration, index: int, weight: float) -> Remark:
+    """Return the remark on a point that was left out, with the distance that noise explains."""
     distance = float(np.linalg.norm(calibration.residuals[index]))
     variance = 3.0 / weight * (calibration.touch_sigma or 0.0) ** 2
     variance += (
@@ -690,11 +723,11 @@ def _left_out(calibration: PlaneCalibration, index: int, weight: float) -> Remar
     )
 
 
-def _estimated(fitted: Fit, weights: Array, typical: float) -> float | None:
-    """Estimate the sigma from the residuals; None without a degree of freedom."""
+def _estimate_touch_sigma(fitted: Fit, weights: Array, typical: float) -> float | None:
+    """Return the touches' sigma by the residuals; None without a degree of freedom."""
     if not fitted.freedom:
         return None
-    return sigma_of(squares(fitted.residuals, weights), fitted.freedom, typical)
+    return estimate_sigma(sum_of_squares(fitted.residuals, weights), fitted.freedom, typical)
 
 
 def mean_axis(tool_z: ArrayLike, count: int) -> Array:
@@ -703,11 +736,11 @@ def mean_axis(tool_z: ArrayLike, count: int) -> Array:
     ``tool_z``: (3,), or (``count``, 3), of each touch. Raises SHAPE, NOT_FINITE, or COINCIDENT if
     the mean has no length.
     """
-    given = np.asarray(tool_z, dtype=np.float64)
-    if given.shape == (count, 3):
-        axes = as_points(given, 3, "tool axis")
-        given = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).mean(axis=0)
-    axis = as_vector(given, 3, "tool axis")
+    values = np.asarray(tool_z, dtype=np.float64)
+    if values.shape == (count, 3):
+        axes = as_points(values, 3, "tool axis")
+        values = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).mean(axis=0)
+    axis = as_vector(values, 3, "tool axis")
     length = float(np.linalg.norm(axis))
     if not length > MIN_DIRECTION_LENGTH:
         raise Code.COINCIDENT.unexpected(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.calibration._plane.fitting import fit
-from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, sum_of_squares, touch_noise
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code, Remark
@@ -30,23 +30,24 @@ SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
-"""A scale may be off the nominal one by this part: printers and heights of parts change it by as
-much."""
+"""A scale may differ from the nominal one by this part: printers, and heights of parts, change it
+by as much."""
 
 MAX_SCALE_ERROR = 0.1
-"""A scale that is off the nominal one by more than this part comes from mixed-up units or
-sheets."""
+"""A scale that differs from the nominal one by more than this part is that of other units or
+another sheet."""
 
 MIN_TOOL_COSINE = 0.17
-"""If the cosine between tool and normal is smaller, the tool's axis does not show the side."""
+"""If the cosine between tool and normal is smaller than this, the tool's axis does not show from
+which side the plane is touched."""
 
 MAX_POINTS_FOR_PAIRS = 25
-"""With at most this many points, each pair is left out in turn; with more, two points hardly move
-the map."""
+"""With at most this many points, each pair of points is left out in turn; with more, two points
+hardly change the map."""
 
 MIN_POINTS_LEFT = 3
-"""More points than this must be left when some are left out: three fit a similarity nearly
-always."""
+"""More points than this must remain when some are left out: three points nearly always fit a
+similarity."""
 
 MIN_DEGREES_OF_FREEDOM = 6
 """An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
@@ -58,46 +59,55 @@ TYPICAL_SIGMA_M = 0.0002
 class Limit(NamedTuple):
     """The largest plausible standard deviation of a touch's coordinate."""
 
-    touch: float  # part from the robot's tip, metres
-    part: float  # part from the camera, as a part of the field
+    touch_sigma: float  # part that the robot's tip causes, metres
+    field_share: float  # part that the camera causes, relative to the size of the field
 
     def of(self, field: float) -> float:
         """Return the limit for a field of the given size, metres."""
-        return math.hypot(self.touch, self.part * field)
+        return math.hypot(self.touch_sigma, self.field_share * field)
 
 
 MAX_SIGMA = Limit(0.0005, 0.001)
 """Larger residuals may be mistakes: a hand-guided robot and a camera of 640 x 480 pixels stay below
 this limit."""
 
-_TINY = 1e-8
+MIN_VARIANCE_RATIO = 1e-8
 
 
 class Evidence(NamedTuple):
-    """The data that the tests examine; lengths are in units of ``place``."""
+    """The data that the tests examine; lengths are normalized as ``place`` says."""
 
     pairs: Pairs
-    fitted: Fit  # the fit that was chosen
+    fitted: Fit  # the fit of the model that is used
     candidates: Candidates  # the fits of the other models
-    preferred: ModelName  # the model that the user asked for
-    asked: bool  # whether the user named the model
+    preferred: ModelName  # the model that the points justify
+    is_model_given: bool  # whether the user chose the model
     held_out: Array  # (N, 3), residuals of the chosen fit
     sigma: float | None  # standard deviation of a touch's coordinate; None if it was not given
-    most: float  # the error that the user gave, else the largest plausible one
+    max_sigma: float  # the sigma that the user gave, else the largest plausible one
     place: Normalization  # centre and size of the points
     nominal_scale: float | None  # metres per unit of the camera's points; None if it was not given
     # cosine between tool and normal; None if the tool's axis was not given
-    side: float | None
-    numbers: NDArray[np.intp]  # (N,), names of the points in messages
+    tool_cosine: float | None
+    point_numbers: NDArray[np.intp]  # (N,), numbers of the points in messages, from 1
 
 
-def findings(evidence: Evidence) -> tuple[Remark, ...]:
+def find_warnings(evidence: Evidence) -> tuple[Remark, ...]:
     """Return the warnings, the most serious first."""
-    tests = (_planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
+    tests = (
+        _test_planarity,
+        _test_residuals,
+        _test_wrong_touches,
+        _test_model,
+        _test_scale,
+        _test_held_out,
+        _test_sigma,
+        _test_side,
+    )
     return tuple(remark for test in tests for remark in test(evidence))
 
 
-def sigma_of(squared: float, freedom: int, typical: float) -> float:
+def estimate_sigma(squared: float, freedom: int, typical: float) -> float:
     """Estimate the sigma of residuals from the sum of their squares.
 
     ``typical``: sigma assumed for the degrees of freedom that are missing; few residuals may all be
@@ -108,7 +118,7 @@ def sigma_of(squared: float, freedom: int, typical: float) -> float:
 
 
 def check_side(normal: Array, tool_z: Array) -> float:
-    """Return the cosine between tool and plane's normal; raise MIRRORED if they point alike."""
+    """Return the cosine between tool and normal; raise MIRRORED if they point to the same side."""
     cosine = float(normal @ tool_z) / float(np.linalg.norm(tool_z))
     if cosine > MIN_TOOL_COSINE:
         raise Code.MIRRORED.refusal(
@@ -121,72 +131,74 @@ def check_side(normal: Array, tool_z: Array) -> float:
 
 
 def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: bool) -> str | None:
-    """Return the remark on a scale that is not the nominal one; None for the nominal one.
+    """Return the text of a remark if the scale is not the nominal one, else None.
 
     Scales are in metres per unit of the camera; ``uncertainty`` is the standard deviation of
     ``measured``, as a part of it. Raises SCALE_MISMATCH if the scale is off by more than a tenth,
     or at all if it must be ``exact``.
     """
-    error = measured / nominal - 1.0
-    if abs(error) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
+    deviation = measured / nominal - 1.0
+    if abs(deviation) <= max(SCALE_TOLERANCE, 3.0 * uncertainty):
         return None
-    percent = f"{100 * error:+.2g}" if abs(error) < 0.1 else f"{100 * error:+.0f}"
+    percent = f"{100 * deviation:+.2g}" if abs(deviation) < 0.1 else f"{100 * deviation:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
-    if exact or abs(error) > MAX_SCALE_ERROR:
+    if exact or abs(deviation) > MAX_SCALE_ERROR:
         raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 
 
-def _planarity(evidence: Evidence) -> Iterator[Remark]:
-    """Compare the residuals out of the plane with the given noise, or with those inside it."""
-    flat, weights, count = evidence.candidates.get("affine"), evidence.pairs.weights, -3
+def _test_planarity(evidence: Evidence) -> Iterator[Remark]:
+    """Compare the residuals along the normal with the given noise, or with those in the plane."""
+    affine, weights, count = evidence.candidates.get("affine"), evidence.pairs.weights, -3
     count += len(weights)
-    if flat is None or not count:
+    if affine is None or not count:
         return
-    normal = np.cross(*flat.matrix[:3, :2].T)
+    normal = np.cross(*affine.matrix[:3, :2].T)
     normal /= np.linalg.norm(normal)
-    out = flat.residuals @ normal
-    squared = float((weights * out**2).sum())
+    heights = affine.residuals @ normal
+    squares_of_heights = float((weights * heights**2).sum())
     fitted = evidence.fitted.residuals
-    within = squares(fitted - np.outer(fitted @ normal, normal), weights)
-    noise = touch_noise(evidence.sigma, within, evidence.fitted.freedom - count)
-    if noise is not None and noise.chance(squared, count) < SIGNIFICANCE_LEVEL:
-        worst, mm = int(np.argmax(weights * out**2)), 1e3 * evidence.place.robot_size
+    squares_in_plane = sum_of_squares(fitted - np.outer(fitted @ normal, normal), weights)
+    noise = touch_noise(evidence.sigma, squares_in_plane, evidence.fitted.freedom - count)
+    if noise is not None and noise.chance(squares_of_heights, count) < SIGNIFICANCE_LEVEL:
+        worst, mm = int(np.argmax(weights * heights**2)), 1e3 * evidence.place.robot_size
         yield Code.NOT_PLANAR.remark(
-            f"the touched points lie {mm * math.sqrt(squared / count):.3g} mm rms out of a plane, "
-            f"where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
-            f"point {evidence.numbers[worst]} is the furthest, "
-            f"{mm * abs(float(out[worst])):.3g} mm"
+            f"the touched points lie {mm * math.sqrt(squares_of_heights / count):.3g} mm rms "
+            f"out of a plane, where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
+            f"point {evidence.point_numbers[worst]} is the furthest, "
+            f"{mm * abs(float(heights[worst])):.3g} mm"
         )
 
 
-def _fit(evidence: Evidence) -> Iterator[Remark]:
+def _test_residuals(evidence: Evidence) -> Iterator[Remark]:
     """Test for one point that is far worse than the others, then test all of them together."""
     fitted, weights = evidence.fitted, evidence.pairs.weights
-    total = squares(fitted.residuals, weights)
-    chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]
+    total = sum_of_squares(fitted.residuals, weights)
+    chances = [
+        _residual_chance(evidence, squared, total) for squared in _studentized_squares(fitted)
+    ]
     worst = int(np.argmin(chances))
     if chances[worst] * len(chances) < SIGNIFICANCE_LEVEL:
         residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
         yield Code.OUTLIER.remark(
-            f"point {evidence.numbers[worst]} fits far worse than the others: its residual of "
-            f"{residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
+            f"point {evidence.point_numbers[worst]} fits far worse than the others: its residual "
+            f"of {residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
             "touches"
         )
         return
-    most = max(evidence.most, ROUNDING_RATIO)
-    if fitted.freedom and Noise(most**2).chance(total, fitted.freedom) < SIGNIFICANCE_LEVEL:
+    max_sigma = max(evidence.max_sigma, ROUNDING_RATIO)
+    if fitted.freedom and Noise(max_sigma**2).chance(total, fitted.freedom) < SIGNIFICANCE_LEVEL:
         mm = 1e3 * evidence.place.robot_size
-        given = "was given" if evidence.sigma is not None else "is the most that is taken for noise"
+        how = "was given" if evidence.sigma is not None else "is the most that is taken for noise"
         yield Code.POOR_FIT.remark(
             "the residuals speak of touches with a sigma of "
-            f"{mm * math.sqrt(total / fitted.freedom):.3g} mm, where {mm * most:.3g} mm {given}"
+            f"{mm * math.sqrt(total / fitted.freedom):.3g} mm, where {mm * max_sigma:.3g} mm {how}"
         )
 
 
-def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
-    """Test whether one or two wrong touches explain as much as a tilted camera."""
+def _test_wrong_touches(evidence: Evidence) -> Iterator[Remark]:
+    """Test whether one or two wrong touches explain the residuals as well as a tilted camera."""
     fitted, pairs = evidence.fitted, evidence.pairs
     count = len(pairs.camera)
     if (
@@ -195,69 +207,77 @@ def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
         or count > MAX_POINTS_FOR_PAIRS
     ):
         return
-    noise = touch_noise(evidence.sigma, squares(fitted.residuals, pairs.weights), fitted.freedom)
-    better: list[tuple[float, tuple[int, ...]]] = []
-    for few in (1, 2):
-        for out in itertools.combinations(
-            range(count), few if count - few > MIN_POINTS_LEFT else 0
+    noise = touch_noise(
+        evidence.sigma, sum_of_squares(fitted.residuals, pairs.weights), fitted.freedom
+    )
+    explanations: list[tuple[float, tuple[int, ...]]] = []
+    for removed_count in (1, 2):
+        for removed in itertools.combinations(
+            range(count), removed_count if count - removed_count > MIN_POINTS_LEFT else 0
         ):
             try:
-                simple = fit("similarity", pairs.without(*out))
+                similarity = fit("similarity", pairs.leave_out(*removed))
             except CalibrationError:  # the others lie in a line
                 continue
-            squared = squares(simple.residuals, np.delete(pairs.weights, out))
-            better.append((0.0 if noise is None else noise.chance(squared, simple.freedom), out))
-    chance, out = max(better, default=(0.0, ()))
-    if out and chance > SIGNIFICANCE_LEVEL:
-        points = " and ".join(str(evidence.numbers[i]) for i in out)
+            squared = sum_of_squares(similarity.residuals, np.delete(pairs.weights, removed))
+            explanations.append(
+                (0.0 if noise is None else noise.chance(squared, similarity.freedom), removed)
+            )
+    chance, removed = max(explanations, default=(0.0, ()))
+    if removed and chance > SIGNIFICANCE_LEVEL:
+        points = " and ".join(str(evidence.point_numbers[i]) for i in removed)
         yield Code.OUTLIER.remark(
-            f"point{'s' * (len(out) > 1)} {points} may be wrong: without, one scale fits all "
+            f"point{'s' * (len(removed) > 1)} {points} may be wrong: without, one scale fits all "
             f"others as well as the model {fitted.model} does with them"
         )
 
 
-def _chance_among(evidence: Evidence, squared: float, total: float) -> float:
-    """Return the probability of one residual's square, from the others if they are enough."""
+def _residual_chance(evidence: Evidence, squared: float, total: float) -> float:
+    """Return a residual's p-value; the noise is estimated from the others if these suffice."""
     freedom = evidence.fitted.freedom - 3
     sigma = evidence.sigma if freedom < MIN_DEGREES_OF_FREEDOM else None
     noise = touch_noise(sigma, max(total - squared, 0.0), freedom)
     return 1.0 if noise is None else noise.chance(squared, 3)
 
 
-def _studentized(fitted: Fit) -> Array:
-    """Return each residual's square over its own variance (N,), 0 if that is 0."""
+def _studentized_squares(fitted: Fit) -> Array:
+    """Return each residual's square over its variance (N,); 0 where the variance is 0."""
     values, vectors = np.linalg.eigh(fitted.blocks)
-    along = np.einsum("nij,ni->nj", vectors, fitted.residuals)
-    good = values > _TINY * values.max()
-    squared: Array = np.where(good, along**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
-    return squared
+    components = np.einsum("nij,ni->nj", vectors, fitted.residuals)
+    is_determined = values > MIN_VARIANCE_RATIO * values.max()
+    squares: Array = np.where(
+        is_determined, components**2 / np.where(is_determined, values, 1.0), 0.0
+    ).sum(axis=1)
+    return squares
 
 
-def _model(evidence: Evidence) -> Iterator[Remark]:
-    """Warn if the field has no single scale, or if another model than the chosen one fits."""
+def _test_model(evidence: Evidence) -> Iterator[Remark]:
+    """Warn if the field has no single scale, or if the points justify another model."""
     used, preferred = evidence.fitted.model, evidence.preferred
-    if preferred not in {"affine", "homography"} or (evidence.asked and used == preferred):
+    if preferred not in {"affine", "homography"} or (evidence.is_model_given and used == preferred):
         return
-    simple: ModelName = used if evidence.asked else "similarity"
+    simple_model: ModelName = used if evidence.is_model_given else "similarity"
     errors = [
         1e3 * evidence.place.robot_size * evidence.candidates.error(name)
-        for name in (simple, preferred)
+        for name in (simple_model, preferred)
     ]
     text = (
-        f"held-out error with the model {simple} {errors[0]:.3g} mm, with {preferred} "
+        f"held-out error with the model {simple_model} {errors[0]:.3g} mm, with {preferred} "
         f"{errors[1]:.3g} mm: the camera is tilted or its lens distorts"
     )
-    yield Code.NOT_SIMILAR.remark(f"{text}; {used} was asked for" if evidence.asked else text)
+    yield Code.NOT_SIMILAR.remark(
+        f"{text}; {used} was asked for" if evidence.is_model_given else text
+    )
 
 
-def _scale(evidence: Evidence) -> Iterator[Remark]:
-    similar = evidence.candidates.get("similarity")
-    if evidence.nominal_scale is None or similar is None:
+def _test_scale(evidence: Evidence) -> Iterator[Remark]:
+    similarity = evidence.candidates.get("similarity")
+    if evidence.nominal_scale is None or similarity is None:
         return
     unit = evidence.place.robot_size / evidence.place.camera_size
-    measured = unit * float(np.linalg.norm(similar.matrix[:3, 0]))
-    total = squares(similar.residuals, evidence.pairs.weights)
-    noise = touch_noise(evidence.sigma, total, similar.freedom)
+    measured = unit * float(np.linalg.norm(similarity.matrix[:3, 0]))
+    total = sum_of_squares(similarity.residuals, evidence.pairs.weights)
+    noise = touch_noise(evidence.sigma, total, similarity.freedom)
     weight = float(evidence.pairs.weights.sum())
     uncertainty = 0.0 if noise is None else math.sqrt(noise.variance / weight)
     exact = evidence.fitted.model == "rigid"
@@ -266,7 +286,7 @@ def _scale(evidence: Evidence) -> Iterator[Remark]:
         yield Code.SCALE_MISMATCH.remark(text)
 
 
-def _held_out(evidence: Evidence) -> Iterator[Remark]:
+def _test_held_out(evidence: Evidence) -> Iterator[Remark]:
     missing = np.flatnonzero(np.isnan(evidence.held_out).any(axis=1))
     if len(missing) == len(evidence.held_out):
         yield Code.NOT_HELD_OUT.remark(
@@ -275,12 +295,12 @@ def _held_out(evidence: Evidence) -> Iterator[Remark]:
         )
     elif len(missing):
         yield Code.NOT_HELD_OUT.remark(
-            f"without point {evidence.numbers[missing[0]]} the others give no calibration: "
+            f"without point {evidence.point_numbers[missing[0]]} the others give no calibration: "
             "nothing checks it"
         )
 
 
-def _touches(evidence: Evidence) -> Iterator[Remark]:
+def _test_sigma(evidence: Evidence) -> Iterator[Remark]:
     freedom = evidence.fitted.freedom
     if evidence.sigma is None and freedom < MIN_DEGREES_OF_FREEDOM:
         how = f"is estimated from {freedom} degrees of freedom only" if freedom else "is not known"
@@ -289,16 +309,16 @@ def _touches(evidence: Evidence) -> Iterator[Remark]:
         )
 
 
-def _side(evidence: Evidence) -> Iterator[Remark]:
-    return remark_side(evidence.side)
+def _test_side(evidence: Evidence) -> Iterator[Remark]:
+    return side_remarks(evidence.tool_cosine)
 
 
-def remark_side(side: float | None) -> Iterator[Remark]:
-    """Warn that the tool's axis does not show the side of the plane.
+def side_remarks(tool_cosine: float | None) -> Iterator[Remark]:
+    """Yield a remark if the tool's axis does not show the side of the plane.
 
-    ``side``: the cosine between tool and normal, None if the tool's axis was not given.
+    ``tool_cosine``: the cosine between tool and normal, None if the tool's axis was not given.
     """
-    if side is None or abs(side) <= MIN_TOOL_COSINE:
+    if tool_cosine is None or abs(tool_cosine) <= MIN_TOOL_COSINE:
         yield Code.SIDE_UNKNOWN.remark(
             "the tool's axis does not tell from which side the plane is touched: that the camera's "
             "y axis points the right way is not checked"

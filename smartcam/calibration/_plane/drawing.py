@@ -1,7 +1,7 @@
 """Draw a plane calibration as SVG: the touched points, their residuals, the predicted error.
 
-It shows the camera's plane as the camera sees it, x to the right and y up. Errors are too small to
-see, so residuals and ellipses are enlarged by a factor that the picture names.
+The picture shows the camera's plane as the camera sees it, x to the right and y up. Errors are too
+small to see, so residuals and ellipses are enlarged by a factor that the picture names.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ LEGEND_HEIGHT_PX: Final = 130.0
 MARGIN_RATIO: Final = 0.15
 """Free margin around the points, as a part of their extent."""
 
-MAX_COLUMNS: Final = 30
-"""The heat map has at most this many cells across, and at most twice as many down, so that they are
-square."""
+HEAT_COLUMNS: Final = 30
+"""Number of columns of the heat map; it has at most twice as many rows, to keep cells square."""
 
 ELLIPSE_SIGMAS: Final = math.sqrt(-2.0 * math.log(0.05))
-"""Standard deviations in which 95 % of a plane's normal distribution lie."""
+"""Radius, in standard deviations, that holds 95 % of a normal distribution in a plane."""
 
 ELLIPSE_POINTS: Final = 24
 """An ellipse is drawn with this many points."""
@@ -43,7 +42,7 @@ ELLIPSE_POINTS: Final = 24
 MIN_ENLARGED_RATIO: Final = 1e-9
 """Errors below this part of the field's width are not enlarged."""
 
-LOW_COLOUR, HIGH_COLOUR = (240, 247, 252), (246, 196, 140)
+LOW_ERROR_COLOUR, HIGH_ERROR_COLOUR = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
 
 STYLE: Final = """\
@@ -69,18 +68,18 @@ class _DrawnPlane:
     """The part of the camera's plane that is drawn, and its map to pixels of the picture.
 
     Args:
-        shown: (N, 2), points that must be inside of the drawn part.
+        visible_points: (N, 2), points that must be inside of the drawn part.
     """
 
-    def __init__(self, shown: Array) -> None:
-        low, high = shown.min(axis=0), shown.max(axis=0)
+    def __init__(self, visible_points: Array) -> None:
+        low, high = visible_points.min(axis=0), visible_points.max(axis=0)
         margin = MARGIN_RATIO * float((high - low).max())
         self.low: Array = low - margin
         self.high: Array = high + margin
         width, height = (self.high - self.low).tolist()
         self.zoom: float = FIELD_WIDTH_PX / width
         self.height: float = height * self.zoom
-        self.foot: float = 2 * BORDER_PX + self.height
+        self.bottom: float = 2 * BORDER_PX + self.height
 
     def pixels(self, points: Array) -> Array:
         """Map points (..., 2) to pixels."""
@@ -96,25 +95,26 @@ def draw(
 
     The camera's frame is grey, the directions of the robot's axes in the plane are blue: an axis
     that rises from the plane is shorter. Touched points are black; the red line from each is its
-    residual. The background shows the predicted error, and violet ellipses hold 95 % of it. Both
-    are missing if the touches' sigma is not known. Points that a robust fit left out are grey
-    crosses without residual and ellipse; one that lies far beyond the others is not shown.
+    residual. The background shows the predicted error, and violet ellipses hold 95 % of
+    the errors. Both are missing if the touches' sigma is not known. Points that a robust fit left
+    out are grey crosses without residual and ellipse; one that lies far beyond the others is not
+    shown.
 
     ``parts`` are localizations in the camera's frame, drawn in green. ``title`` is a line on top.
     The SVG document has a fixed size and loads no other file; lines end with a line feed.
     """
     elements = list(parts)
-    counted = calibration.weights > 0.0
-    points, left_out = calibration.camera_points[counted], calibration.camera_points[~counted]
-    places = np.array([part.pose.position[:2] for part in elements]).reshape(-1, 2)
-    both = np.concatenate([points, places])
-    low, high = both.min(axis=0), both.max(axis=0)
+    is_used = calibration.weights > 0.0
+    points, left_out = calibration.camera_points[is_used], calibration.camera_points[~is_used]
+    part_places = np.array([part.pose.position[:2] for part in elements]).reshape(-1, 2)
+    points_and_parts = np.concatenate([points, part_places])
+    low, high = points_and_parts.min(axis=0), points_and_parts.max(axis=0)
     is_near = (np.abs(left_out - (low + high) / 2) < high - low).all(axis=1)
-    field = _DrawnPlane(np.concatenate([both, left_out[is_near]]))
-    residuals = calibration.inverse(calibration.robot_points[counted]) - points
-    outlines = _outlines(calibration, both)
-    sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
-    largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
+    field = _DrawnPlane(np.concatenate([points_and_parts, left_out[is_near]]))
+    residuals = calibration.inverse(calibration.robot_points[is_used]) - points
+    outlines = _ellipse_outlines(calibration, points_and_parts)
+    vectors = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
+    largest = field.zoom * float(np.linalg.norm(vectors, axis=1).max())
     enlargement = (
         round_down(0.06 * FIELD_WIDTH_PX / largest)
         if largest > MIN_ENLARGED_RATIO * FIELD_WIDTH_PX
@@ -122,68 +122,75 @@ def draw(
     )
     shapes = [
         f"<defs>{ARROW_HEADS}</defs>",
-        *_heat(calibration, field),
+        *_heat_map(calibration, field),
         *_axes(calibration, field),
         *(
             polygon(field.pixels(outline), "ellipse")
-            for outline in both[: len(outlines), None] + enlargement * outlines
+            for outline in points_and_parts[: len(outlines), None] + enlargement * outlines
         ),
-        *_touches(calibration, field, points + enlargement * residuals),
-        *(_part(part, place) for part, place in zip(elements, field.pixels(places), strict=True)),
+        *_touch_marks(calibration, field, points + enlargement * residuals),
+        *(
+            _part_mark(part, place)
+            for part, place in zip(elements, field.pixels(part_places), strict=True)
+        ),
         *_legend(calibration, field, enlargement, title),
     ]
-    return document(FIELD_WIDTH_PX + 2 * BORDER_PX, field.foot + LEGEND_HEIGHT_PX, shapes, STYLE)
+    return document(FIELD_WIDTH_PX + 2 * BORDER_PX, field.bottom + LEGEND_HEIGHT_PX, shapes, STYLE)
 
 
-def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
+def _ellipse_outlines(calibration: PlaneCalibration, points: Array) -> Array:
     """Return the outlines of the 95 % ellipses around points, in the camera's plane.
 
-    They are (N, ELLIPSE_POINTS, 2), relative to each point; empty if the touches' sigma is not
-    known.
+    The outlines are (N, ELLIPSE_POINTS, 2), relative to each point; empty if the touches' sigma is
+    not known.
     """
     if calibration.touch_sigma is None:
         return np.zeros((0, ELLIPSE_POINTS, 2))
-    inside = calibration.rotation[:, :2]
-    covariances = inside.T @ calibration.covariance_at(points) @ inside
+    plane_axes = calibration.rotation[:, :2]
+    covariances = plane_axes.T @ calibration.covariance_at(points) @ plane_axes
     values, vectors = np.linalg.eigh(covariances)
     lengths = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
     # the symmetric root, since eigenvectors alone may point to either side
-    half = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
+    roots = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
     angles = np.linspace(0.0, math.tau, ELLIPSE_POINTS, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles)])
-    outlines = (half @ circle).swapaxes(1, 2) @ inside.T  # metres in the robot's space
+    unit_circle = np.stack([np.cos(angles), np.sin(angles)])
+    outlines = (roots @ unit_circle).swapaxes(1, 2) @ plane_axes.T  # metres in the robot's space
     centres = calibration.transform(points)
-    seen = calibration.inverse((centres[:, None] + outlines).reshape(-1, 3))
-    return seen.reshape(len(points), ELLIPSE_POINTS, 2) - points[:, None]
+    camera_points = calibration.inverse((centres[:, None] + outlines).reshape(-1, 3))
+    return camera_points.reshape(len(points), ELLIPSE_POINTS, 2) - points[:, None]
 
 
-def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
+def _heat_map(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the predicted error as coloured cells."""
     if calibration.touch_sigma is None:
         return
-    cell = FIELD_WIDTH_PX / MAX_COLUMNS
-    rows = min(2 * MAX_COLUMNS, max(1, round(field.height / cell)))
+    cell = FIELD_WIDTH_PX / HEAT_COLUMNS
+    rows = min(2 * HEAT_COLUMNS, max(1, round(field.height / cell)))
     height = field.height / rows
-    corners = [[x * cell, y * height] for y in range(rows) for x in range(MAX_COLUMNS)]
-    middles = np.array(corners) + np.array([cell / 2, height / 2])
-    seen = field.low + np.column_stack([middles[:, 0], field.height - middles[:, 1]]) / field.zoom
-    errors = calibration.predicted_error(seen)
+    corners = [[x * cell, y * height] for y in range(rows) for x in range(HEAT_COLUMNS)]
+    centres = np.array(corners) + np.array([cell / 2, height / 2])
+    camera_points = (
+        field.low + np.column_stack([centres[:, 0], field.height - centres[:, 1]]) / field.zoom
+    )
+    errors = calibration.predicted_error(camera_points)
     low, high = float(errors.min()), float(errors.max())
-    parts = (errors - low) / (high - low) if high > low else np.zeros_like(errors)
+    fractions = (errors - low) / (high - low) if high > low else np.zeros_like(errors)
     yield '<g shape-rendering="crispEdges">'
-    for (x, y), part in zip(corners, parts.tolist(), strict=True):
-        yield _cell(BORDER_PX + x, BORDER_PX + y, cell, height, part)
+    for (x, y), fraction in zip(corners, fractions.tolist(), strict=True):
+        yield _cell(BORDER_PX + x, BORDER_PX + y, cell, height, fraction)
     yield "</g>"
     for step in range(11):
-        yield _cell(BORDER_PX + 20 * step, field.foot + 45, 20, 14, step / 10)
+        yield _cell(BORDER_PX + 20 * step, field.bottom + 45, 20, 14, step / 10)
     label = f"predicted error: {1e3 * low:.3f} mm to {1e3 * high:.3f} mm rms"
-    yield _text((BORDER_PX + 232, field.foot + 57), label)
+    yield _text((BORDER_PX + 232, field.bottom + 57), label)
 
 
-def _cell(x: float, y: float, width: float, height: float, part: float) -> str:
-    """Return a cell, in one of 21 colours: tiny differences of an error do not change it."""
-    level = round(20 * part) / 20
-    channels = (round(a + level * (b - a)) for a, b in zip(LOW_COLOUR, HIGH_COLOUR, strict=True))
+def _cell(x: float, y: float, width: float, height: float, fraction: float) -> str:
+    """Return a cell, in one of 21 colours, so that rounding errors do not change the picture."""
+    level = round(20 * fraction) / 20
+    channels = (
+        round(a + level * (b - a)) for a, b in zip(LOW_ERROR_COLOUR, HIGH_ERROR_COLOUR, strict=True)
+    )
     colour = "".join(f"{channel:02x}" for channel in channels)
     return rectangle((x, y), (width, height), f'fill="#{colour}"')
 
@@ -191,48 +198,48 @@ def _cell(x: float, y: float, width: float, height: float, part: float) -> str:
 def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the axes of the camera and of the robot.
 
-    The camera's axes are at its origin if that is shown, else at a corner; the robot's, projected
-    into the plane, are below the field's lower right corner.
+    The camera's axes are at its origin if the origin is in the picture, else at a corner. The
+    robot's axes, projected into the plane, are below the field's lower right corner.
     """
     start = field.pixels(np.clip(np.zeros(2), field.low, field.high))
     yield from _axis(start, np.array([70.0, 0.0]), "camera", "camera x")
     yield from _axis(start, np.array([0.0, -70.0]), "camera", "y")
-    start = np.array([BORDER_PX + FIELD_WIDTH_PX - 90, field.foot + 35])
+    start = np.array([BORDER_PX + FIELD_WIDTH_PX - 90, field.bottom + 35])
     for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
         if np.linalg.norm(axis) < 0.05:  # the axis is at a right angle to the plane
             yield circle(start, 4, "robot")
-            yield _text(start, name, "robot-name", beside=(7, 15))
+            yield _text(start, name, "robot-name", offset=(7, 15))
         else:
             yield from _axis(start, 60 * axis * [1, -1], "robot", name)
 
 
-def _axis(start: Array, along: Array, kind: str, name: str) -> Iterator[str]:
-    end = start + along
-    yield line(start, end, kind, f' marker-end="url(#{kind}-head)"')
-    yield _text(end + 8 * along / np.linalg.norm(along), name, f"{kind}-name", beside=(0, 4))
+def _axis(start: Array, vector: Array, css_class: str, name: str) -> Iterator[str]:
+    end = start + vector
+    yield line(start, end, css_class, f' marker-end="url(#{css_class}-head)"')
+    yield _text(end + 8 * vector / np.linalg.norm(vector), name, f"{css_class}-name", offset=(0, 4))
 
 
-def _touches(calibration: PlaneCalibration, field: _DrawnPlane, ends: Array) -> Iterator[str]:
-    counted = calibration.weights > 0.0
+def _touch_marks(calibration: PlaneCalibration, field: _DrawnPlane, ends: Array) -> Iterator[str]:
+    is_used = calibration.weights > 0.0
     places = field.pixels(calibration.camera_points)
-    numbers = np.flatnonzero(counted)
-    for number, place, end in zip(numbers, places[counted], field.pixels(ends), strict=True):
+    numbers = np.flatnonzero(is_used)
+    for number, place, end in zip(numbers, places[is_used], field.pixels(ends), strict=True):
         yield line(place, end, "residual")
         yield circle(place, 4, "touch")
-        yield _text(place, str(1 + number), beside=(7, -7))
+        yield _text(place, str(1 + number), offset=(7, -7))
     for index in calibration.outliers:
         point, place = calibration.camera_points[index], places[index]
         if (point > field.low).all() and (point < field.high).all():
-            for stroke in (np.array([5.0, 5.0]), np.array([5.0, -5.0])):
-                yield line(place - stroke, place + stroke, "left-out")
-            yield _text(place, str(1 + index), beside=(7, -7))
+            for diagonal in (np.array([5.0, 5.0]), np.array([5.0, -5.0])):
+                yield line(place - diagonal, place + diagonal, "left-out")
+            yield _text(place, str(1 + index), offset=(7, -7))
 
 
-def _part(part: Localization, place: Array) -> str:
+def _part_mark(part: Localization, place: Array) -> str:
     theta = part.pose.orientation.theta
-    along = 18 * np.array([math.cos(theta), -math.sin(theta)])
-    name = _text(place, part.feature_id, "part-name", beside=(10, 20))
-    return circle(place, 7, "part") + line(place, place + along, "part") + name
+    direction = 18 * np.array([math.cos(theta), -math.sin(theta)])
+    name = _text(place, part.feature_id, "part-name", offset=(10, 20))
+    return circle(place, 7, "part") + line(place, place + direction, "part") + name
 
 
 def _legend(
@@ -243,28 +250,28 @@ def _legend(
     error, count = calibration.held_out_error, len(calibration.camera_points)
     left_out = len(calibration.outliers)
     yield _text(
-        (BORDER_PX, field.foot),
+        (BORDER_PX, field.bottom),
         f"{calibration.model}, {f'{count - left_out} of ' if left_out else ''}{count} touches; "
         f"held-out error {'not known' if error is None else f'{1e3 * error:.3f} mm rms'}",
     )
     yield _text(
-        (BORDER_PX, field.foot + 25),
+        (BORDER_PX, field.bottom + 25),
         f"residuals (red) and 95 % ellipses (violet) {enlargement:g} times larger than they are"
         f"{'; crosses: left out' if left_out else ''}",
     )
     per_metre = field.zoom / calibration.scale
     metres = round_down(0.2 * FIELD_WIDTH_PX / per_metre)
-    end = np.array([BORDER_PX + FIELD_WIDTH_PX - 220, field.foot])
+    end = np.array([BORDER_PX + FIELD_WIDTH_PX - 220, field.bottom])
     start = end - [metres * per_metre, 0.0]
     yield line(start, end, "camera")
-    yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))
+    yield _text(start, f"{1e3 * metres:g} mm", offset=(0, 18))
 
 
 def _text(
     place: Array | tuple[float, float],
     label: str,
-    kind: str = "",
+    css_class: str = "",
     *,
-    beside: tuple[float, float] = (0.0, 0.0),
+    offset: tuple[float, float] = (0.0, 0.0),
 ) -> str:
-    return text((place[0] + beside[0], place[1] + beside[1]), label, kind)
+    return text((place[0] + offset[0], place[1] + offset[1]), label, css_class)

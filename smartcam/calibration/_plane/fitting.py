@@ -5,9 +5,9 @@ plane in the robot's space that is one matrix: ``w (x, y, z, 1) = matrix (u, v, 
 degrees of freedom. The models are special cases: affine (9) has ``w = 1``, similarity (7) has axes
 of equal length at right angles, rigid (6) has a scale that is known beforehand.
 
-All four are fitted by least squares in the robot's space, which is the most likely answer if the
-noise of the touches is independent and equal on each axis; noise of the camera counts as noise of
-the touch. Points are centred and scaled first. The covariance is that of the matrix' 12 elements,
+All four are fitted by least squares in the robot's space, which is the most likely map if the noise
+of the touches is independent and equal on each axis; noise of the camera counts as noise of the
+touch. Points are centred and scaled first. The covariance is that of the matrix' 12 elements,
 for every model.
 """
 
@@ -40,24 +40,22 @@ MAX_STEPS = 50
 """The refinement of a homography takes at most this many steps; it usually takes 3 to 8."""
 
 MAX_HALVINGS = 20
-"""A step that makes the sum of squares larger is halved at most this many times; after that,
-rounding allows no smaller sum."""
+"""A step that increases the sum of squares is halved at most this many times; then rounding errors
+prevent a smaller sum."""
 
 MIN_STEP = 1e-13
 """The refinement ends when a step changes the matrix' elements, which are about 1, by less than
 this; the next step would be a thousand times smaller."""
 
 MAX_FULL_REFITS = 200
-"""With at most this many points, a homography is fitted again without each of them.
-
-With more, the residuals are corrected by their leverage, which is below 0.1 then; the error is its
-square.
-"""
+"""With at most this many points, a homography is fitted again without each point. With more, the
+residuals are corrected by their leverages, which are below 0.1; the relative error of that is their
+square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normalization(storage.Stored):
-    """The frames in which the fit is made: centres and sizes that bring the points near to 1."""
+    """Centres and sizes of the points; for a fit, points are centred and divided by their size."""
 
     camera: storage.Vector2  # centre of the camera's points (2,)
     # RMS distance of the camera's points from their centre, in the camera's unit
@@ -65,22 +63,24 @@ class Normalization(storage.Stored):
     robot: storage.Vector3  # centre of the robot's points (3,), metres
     robot_size: storage.Positive  # RMS distance of the robot's points from their centre, metres
 
-    def outward(self, matrix: Array) -> Array:
-        """Convert the fit's matrix into the one (4, 3) between the original points."""
-        result = np.concatenate([self.robot_size * matrix[:3], matrix[3:]]) @ self._shrink()
+    def to_original(self, matrix: Array) -> Array:
+        """Return the matrix (4, 3) between original points from that between normalized points."""
+        result = (
+            np.concatenate([self.robot_size * matrix[:3], matrix[3:]]) @ self._normalizing_matrix()
+        )
         result[:3] += np.outer(self.robot, result[3])
         return result
 
-    def inward(self, matrix: Array) -> Array:
-        """Return the matrix (4, 3) between centred and scaled points; undoes ``outward``."""
+    def to_normalized(self, matrix: Array) -> Array:
+        """Return the matrix (4, 3) between normalized points from that between original points."""
         result = matrix.copy()
         result[:3] = (result[:3] - np.outer(self.robot, result[3])) / self.robot_size
-        return result @ np.linalg.inv(self._shrink())
+        return result @ np.linalg.inv(self._normalizing_matrix())
 
-    def _shrink(self) -> Array:
-        shrink = np.diag([1.0 / self.camera_size, 1.0 / self.camera_size, 1.0])
-        shrink[:2, 2] = -self.camera / self.camera_size
-        return shrink
+    def _normalizing_matrix(self) -> Array:
+        matrix = np.diag([1.0 / self.camera_size, 1.0 / self.camera_size, 1.0])
+        matrix[:2, 2] = -self.camera / self.camera_size
+        return matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +91,8 @@ class Pairs:
     robot: Array  # (N, 3), robot's points, centred, of RMS length 1
     weights: Array  # (N,), one over the relative variance of each pair
 
-    def without(self, *index: int) -> Pairs:
-        """Return all pairs but some."""
+    def leave_out(self, *index: int) -> Pairs:
+        """Return the pairs without those at some indices."""
         keep = ~np.isin(np.arange(len(self.camera)), index)
         return Pairs(self.camera[keep], self.robot[keep], self.weights[keep])
 
@@ -117,10 +117,10 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One kind of map."""
+    """A kind of map, with the functions that fit it."""
 
     parameters: int  # degrees of freedom
-    least: int  # least number of points
+    min_points: int  # least number of points
     # function of pairs and of a scale, used by ``rigid`` only, that returns the matrix
     solve: Callable[[Pairs, float], Array]
     # function that returns the directions (12, parameters) in which a matrix may change
@@ -137,14 +137,14 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     model = MODELS[name]
     matrix = model.solve(pairs, scale)
     tangent = model.tangent(matrix)
-    scaled, lengths = _scaled_jacobian(name, matrix, pairs)
-    # A matrix moves along T: m + T d, so the Jacobian by d is J T. With W^(1/2) J T = U S V^T (its
-    # columns divided by their lengths l) the covariance of m is T (T^T J^T W J T)^-1 T^T = H H^T,
-    # H = T diag(1/l) V S^-1, and the hat matrix of the residuals is U U^T: what is left of a
-    # residual's variance is I - U_i U_i^T, over its weight.
+    scaled_jacobian, lengths = _scaled_jacobian(name, matrix, pairs)
+    # The elements m of a matrix change by T d, so the Jacobian by d is J T. With W^(1/2) J T = U S
+    # V^T (its columns divided by their lengths l) the covariance of m is T (T^T J^T W J T)^-1 T^T =
+    # H H^T, H = T diag(1/l) V S^-1, and the hat matrix of the residuals is U U^T: a residual's
+    # variance is I - U_i U_i^T, divided by its weight.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2; Cook and
     # Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    left, singular, right = np.linalg.svd(scaled, full_matrices=False)
+    left, singular, right = np.linalg.svd(scaled_jacobian, full_matrices=False)
     condition = float(singular[-1] / singular[0]) if singular[0] > 0.0 else 0.0
     if condition < MIN_CONDITION:
         raise Code.COLLINEAR.refusal(
@@ -153,14 +153,14 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
             MIN_CONDITION,
             condition,
         )
-    half = tangent @ (right.T / singular / lengths[:, None])
-    rows = left.reshape(-1, 3, model.parameters)
-    hat = rows @ rows.swapaxes(1, 2)
+    root = tangent @ (right.T / singular / lengths[:, None])
+    left_blocks = left.reshape(-1, 3, model.parameters)
+    hat = left_blocks @ left_blocks.swapaxes(1, 2)
     return Fit(
         name,
         matrix,
         pairs.robot - apply_homography(matrix, pairs.camera),
-        half @ half.T,
+        root @ root.T,
         (np.eye(3) - hat) / pairs.weights[:, None, None],
         3 * len(pairs.camera) - model.parameters,
     )
@@ -183,32 +183,34 @@ def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Arra
 def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
     """Return each point minus the place that a fit of all others predicts, (N, 3).
 
-    NaN if the others alone determine no map. Without fitting again, ``affine`` uses leverages and
-    ``rigid`` and ``similarity`` take the point out of the sums; a ``homography`` is fitted again.
+    NaN if the others alone determine no map. ``affine`` uses leverages, ``rigid`` and
+    ``similarity`` subtract the point from the sums, and only a ``homography`` is fitted again.
     """
-    if len(pairs.camera) <= MODELS[fitted.model].least:
+    if len(pairs.camera) <= MODELS[fitted.model].min_points:
         return np.full_like(pairs.robot, np.nan)
     if fitted.model in {"rigid", "similarity"}:
-        return _held_out_of_sums(pairs, scale if fitted.model == "rigid" else None)
+        return _held_out_by_sums(pairs, scale if fitted.model == "rigid" else None)
     if fitted.model == "homography" and len(pairs.camera) <= MAX_FULL_REFITS:
-        return np.stack([_held_out_anew(fitted, pairs, i) for i in range(len(pairs.camera))])
+        return np.stack([_held_out_by_refit(fitted, pairs, i) for i in range(len(pairs.camera))])
     return _held_out_by_leverage(fitted, pairs)
 
 
 def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
     # Without point i the residual there is (I - H_ii)^-1 e_i, exactly so in a linear fit.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    weighed = fitted.blocks * pairs.weights[:, None, None]
-    least = np.linalg.eigvalsh(weighed)[:, 0]
+    weighted_blocks = fitted.blocks * pairs.weights[:, None, None]
+    smallest = np.linalg.eigvalsh(weighted_blocks)[:, 0]
     result = np.full_like(pairs.robot, np.nan)
-    good = least > MIN_CONDITION**2
-    result[good] = np.linalg.solve(weighed[good], fitted.residuals[good][..., None])[..., 0]
+    is_determined = smallest > MIN_CONDITION**2
+    result[is_determined] = np.linalg.solve(
+        weighted_blocks[is_determined], fitted.residuals[is_determined][..., None]
+    )[..., 0]
     return result
 
 
-def _held_out_anew(fitted: Fit, pairs: Pairs, index: int) -> Array:
-    others = pairs.without(index)
-    matrix = _refined_homography(others, fitted.matrix)
+def _held_out_by_refit(fitted: Fit, pairs: Pairs, index: int) -> Array:
+    others = pairs.leave_out(index)
+    matrix = _refine_homography(others, fitted.matrix)
     singular = np.linalg.svd(_scaled_jacobian(fitted.model, matrix, others)[0], compute_uv=False)
     if singular[-1] < MIN_CONDITION * singular[0]:
         return np.full(3, np.nan)
@@ -217,11 +219,11 @@ def _held_out_anew(fitted: Fit, pairs: Pairs, index: int) -> Array:
     return residual
 
 
-def _held_out_of_sums(pairs: Pairs, scale: float | None) -> Array:
-    """Fit all subsets at once, from the sums over all points minus one point's share."""
+def _held_out_by_sums(pairs: Pairs, scale: float | None) -> Array:
+    """Fit all points but each, from the sums over all points minus the part of that point."""
     u, p, w = pairs.camera, pairs.robot, pairs.weights[:, None]
     # sum w (p - p') (u - u')^T = sum w p u^T - W p' u'^T, with the means p' and u' and W = sum w;
-    # for each subset these are the sums over all points minus one point's share.
+    # without a point these are the sums over all points minus the part of that point.
     total = w.sum() - w
     mean_u, mean_p = ((w * u).sum(0) - w * u) / total, ((w * p).sum(0) - w * p) / total
     cross = np.einsum("ni,nj->nij", w * p, u)
@@ -242,8 +244,8 @@ def scaled_axes(cross: Array, square: Array, scale: float | None) -> Array:
     # Source: Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point
     # Patterns (1991).
     left, singular, right = np.linalg.svd(cross, full_matrices=False)
-    size = singular.sum(-1) / square if scale is None else np.full(square.shape, scale)
-    axes: Array = size[..., None, None] * (left @ right)
+    scales = singular.sum(-1) / square if scale is None else np.full(square.shape, scale)
+    axes: Array = scales[..., None, None] * (left @ right)
     return axes
 
 
@@ -254,10 +256,10 @@ def _solve_similarity(pairs: Pairs, scale: float | None) -> Array:
     centred = w * (u - mean_u)
     cross = (p - mean_p).T @ centred
     axes = scaled_axes(cross, (centred * (u - mean_u)).sum(), scale)
-    return _matrix(axes, mean_p - axes @ mean_u)
+    return _affine_matrix(axes, mean_p - axes @ mean_u)
 
 
-def _matrix(axes: Array, offset: Array) -> Array:
+def _affine_matrix(axes: Array, offset: Array) -> Array:
     matrix = np.zeros((4, 3))
     matrix[:3, :2], matrix[:3, 2], matrix[3, 2] = axes, offset, 1.0
     return matrix
@@ -267,32 +269,32 @@ def _solve_affine(pairs: Pairs, _scale: float) -> Array:
     root = np.sqrt(pairs.weights)[:, None]
     left, right = root * pairs.homogeneous, root * pairs.robot
     solution = np.asarray(np.linalg.lstsq(left, right, rcond=None)[0], dtype=np.float64)
-    return _matrix(solution[:2].T, solution[2])
+    return _affine_matrix(solution[:2].T, solution[2])
 
 
 def _solve_homography(pairs: Pairs, scale: float) -> Array:
-    return _refined_homography(pairs, _linear_homography(pairs, scale))
+    return _refine_homography(pairs, _linear_homography(pairs, scale))
 
 
-def _refined_homography(pairs: Pairs, matrix: Array) -> Array:
+def _refine_homography(pairs: Pairs, matrix: Array) -> Array:
     """Refine a solution until the sum of squares no longer decreases."""
     root = np.sqrt(pairs.weights)[:, None]
     residuals = root * (pairs.robot - apply_homography(matrix, pairs.camera))
     tangent = _homography_tangent(matrix)
     for _ in range(MAX_STEPS):
-        moves = element_derivatives(matrix, pairs.camera) @ tangent
-        jacobian = (root[..., None] * moves).reshape(-1, 11)
+        derivatives = element_derivatives(matrix, pairs.camera) @ tangent
+        jacobian = (root[..., None] * derivatives).reshape(-1, 11)
         step = tangent @ np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
         for halving in range(MAX_HALVINGS):
-            following = matrix + 0.5**halving * step.reshape(4, 3)
-            if (pairs.homogeneous @ following[3]).min() <= 0.0:  # a point beyond the horizon
+            candidate = matrix + 0.5**halving * step.reshape(4, 3)
+            if (pairs.homogeneous @ candidate[3]).min() <= 0.0:  # a point beyond the horizon
                 continue
-            after = root * (pairs.robot - apply_homography(following, pairs.camera))
-            if (after**2).sum() < (residuals**2).sum():
+            candidate_residuals = root * (pairs.robot - apply_homography(candidate, pairs.camera))
+            if (candidate_residuals**2).sum() < (residuals**2).sum():
                 break
         else:
             return matrix
-        matrix, residuals = following, after
+        matrix, residuals = candidate, candidate_residuals
         if np.abs(step).max() < MIN_STEP:
             return matrix
     return matrix
@@ -307,12 +309,12 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
     root = np.sqrt(pairs.weights)[:, None]
     mean = (pairs.weights[:, None] * pairs.robot).sum(0) / pairs.weights.sum()
     axes = np.linalg.svd(root * (pairs.robot - mean), full_matrices=False)[2][:2].T
-    inside = (pairs.robot - mean) @ axes
-    u, zero = pairs.homogeneous, np.zeros((len(inside), 3))
+    in_plane = (pairs.robot - mean) @ axes
+    u, zero = pairs.homogeneous, np.zeros((len(in_plane), 3))
     equations = np.concatenate(
         [
-            root * np.column_stack([u, zero, -inside[:, :1] * u]),
-            root * np.column_stack([zero, u, -inside[:, 1:] * u]),
+            root * np.column_stack([u, zero, -in_plane[:, :1] * u]),
+            root * np.column_stack([zero, u, -in_plane[:, 1:] * u]),
         ]
     )
     solution = np.linalg.svd(equations, full_matrices=False)[2][-1].reshape(3, 3)
@@ -320,25 +322,25 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
     if abs(solution[2, 2]) < MIN_CONDITION or w.min() * w.max() <= 0:
         return _solve_affine(pairs, scale)  # a point beyond the horizon comes from noise
     solution = solution / solution[2, 2]
-    top = axes @ solution[:2] + np.outer(mean, solution[2])
-    return np.concatenate([top, solution[2:]])
+    upper_rows = axes @ solution[:2] + np.outer(mean, solution[2])
+    return np.concatenate([upper_rows, solution[2:]])
 
 
 def rigid_tangent(matrix: Array) -> Array:
-    """Return derivatives of a matrix' elements by a shift and a turn about the centre, (12, 6)."""
+    """Return derivatives (12, 6) of a matrix' elements by a shift and a turn about the centre."""
     # exp([w]x) a = a + w x a to first order: for the columns a, while the centre only shifts
     tangent = np.zeros((4, 3, 6))
     for axis in range(3):
         tangent[axis, 2, axis] = 1.0
-        turned = np.cross(np.eye(3)[axis], matrix[:3, :2].T)
-        tangent[:3, :2, 3 + axis] = turned.T
+        by_turn = np.cross(np.eye(3)[axis], matrix[:3, :2].T)
+        tangent[:3, :2, 3 + axis] = by_turn.T
     return tangent.reshape(12, 6)
 
 
 def _similarity_tangent(matrix: Array) -> Array:
-    growth = np.zeros((4, 3))
-    growth[:3, :2] = matrix[:3, :2]
-    return np.column_stack([rigid_tangent(matrix), growth.ravel()])
+    by_scale = np.zeros((4, 3))
+    by_scale[:3, :2] = matrix[:3, :2]
+    return np.column_stack([rigid_tangent(matrix), by_scale.ravel()])
 
 
 def _homography_tangent(_matrix: Array) -> Array:

@@ -1,6 +1,6 @@
 """Choose the model that the points justify.
 
-The rule, from the simplest model upwards: a more general one is taken if its held-out error is
+The rule, from the simplest model upwards: a more general model is chosen if its held-out error is
 smaller, and if noise alone would reduce the sum of squared residuals by as much in fewer than three
 of 1000 calibrations. A general model always fits better, but it must also predict better.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 SIGNIFICANCE_LEVEL = 0.003
-"""Probability with which noise alone may choose a more general model. The value comes from a
+"""Probability with which noise alone leads to a more general model. The value comes from a
 simulation of nine touches in the middle third of a field: wrong choices cost 1 % of the error at
 this level and 4 % at 0.01; both levels find a tilt of one degree."""
 
@@ -29,24 +29,24 @@ ROUNDING_RATIO = 1e-9
 """Residuals below this part of the points' extent are rounding errors, not noise."""
 
 
-def squares(residuals: Array, weights: Array) -> float:
+def sum_of_squares(residuals: Array, weights: Array) -> float:
     """Return the weighted sum of squares of residuals (N, 3)."""
     return float((weights[:, None] * residuals**2).sum())
 
 
 def rms(residuals: Array, weights: Array) -> float:
     """Return the weighted RMS length of residuals (N, 3); NaN if one of them is NaN."""
-    return math.sqrt(squares(residuals, weights) / float(weights.sum()))
+    return math.sqrt(sum_of_squares(residuals, weights) / float(weights.sum()))
 
 
-def touch_noise(sigma: float | None, squared: float, freedom: int) -> Noise | None:
-    """Return the touches' noise from ``sigma``, or else from a sum of squares and its freedom.
+def touch_noise(sigma: float | None, squares: float, freedom: int) -> Noise | None:
+    """Return the touches' noise from ``sigma`` or, if it is None, from a sum of squared residuals.
 
-    None if both are missing.
+    ``freedom``: degrees of freedom of the sum; with 0 the result is None.
     """
     if sigma is not None:
         return Noise(max(sigma, ROUNDING_RATIO) ** 2)
-    return Noise(max(squared / freedom, ROUNDING_RATIO**2), freedom) if freedom > 0 else None
+    return Noise(max(squares / freedom, ROUNDING_RATIO**2), freedom) if freedom > 0 else None
 
 
 class Candidates:
@@ -65,7 +65,7 @@ class Candidates:
         self.names: list[ModelName] = [
             name
             for name, model in MODELS.items()
-            if len(pairs.camera) >= model.least and (name != "rigid" or scale is not None)
+            if len(pairs.camera) >= model.min_points and (name != "rigid" or scale is not None)
         ]
         """Models for which there are enough points, the simplest first."""
 
@@ -88,8 +88,8 @@ class Candidates:
         """Return a model's fit; raise COLLINEAR if the points do not determine it."""
         return self.get(name) or fit(name, self._pairs, self._scale)
 
-    def simplest(self) -> ModelName:
-        """Return the simplest model that can be judged; a rigid one needs a held-out error."""
+    def simplest_model(self) -> ModelName:
+        """Return the simplest model that has a held-out error, or else ``similarity``."""
         first = self.names[0]
         return "similarity" if math.isnan(self.error(first)) else first
 
@@ -98,34 +98,37 @@ class Candidates:
         fitted = self.get(name)
         return math.nan if fitted is None else rms(self.held_out(fitted), self._pairs.weights)
 
-    def choose(self, sigma: float | None, first: ModelName) -> ModelName:
-        """Return the model that the points justify, ``first`` or a more general one.
+    def choose(self, sigma: float | None, start: ModelName) -> ModelName:
+        """Return the model that the points justify: ``start`` or a more general one.
 
         ``sigma``: standard deviation of a touch, in the units of ``pairs``.
         """
-        chosen = first
-        for name in self.names[self.names.index(first) + 1 :]:
-            simple, general = self.get(chosen), self.get(name)
-            if simple is None or general is None:
+        best = start
+        for name in self.names[self.names.index(start) + 1 :]:
+            current, general = self.get(best), self.get(name)
+            if current is None or general is None:
                 continue
-            if better(simple, general, self._pairs.weights, sigma) and (
-                self.error(name) < self.error(chosen)
+            if fits_better(current, general, self._pairs.weights, sigma) and (
+                self.error(name) < self.error(best)
             ):
-                chosen = name
-        return chosen
+                best = name
+        return best
 
     def errors(self, names: Sequence[ModelName]) -> dict[ModelName, float]:
         """Return the held-out errors of models; NaN for a model without one."""
         return {name: self.error(name) for name in names}
 
 
-def better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bool:
+def fits_better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bool:
     """Return True if noise alone would hardly make ``general`` fit that much better."""
-    before, after = squares(simple.residuals, weights), squares(general.residuals, weights)
-    noise = touch_noise(sigma, after, general.freedom)
+    simple_squares, general_squares = (
+        sum_of_squares(simple.residuals, weights),
+        sum_of_squares(general.residuals, weights),
+    )
+    noise = touch_noise(sigma, general_squares, general.freedom)
     if noise is None:
         return False
     return (
-        noise.chance(max(before - after, 0.0), simple.freedom - general.freedom)
+        noise.chance(max(simple_squares - general_squares, 0.0), simple.freedom - general.freedom)
         < SIGNIFICANCE_LEVEL
     )

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class Moved:
-    """A rigid motion of everything, in the frame that the poses are in."""
+class RigidMotion:
+    """A solver that moves all poses by one rigid motion, in the frame of the poses."""
 
     motion: Transform  # motion from the robot's frame into the robot's frame
 
@@ -89,8 +89,8 @@ class MovingCamera:
                 got=float(spread[1]),
             )
         self._normal: Array = axes[2]
-        height = (points - self._centre) @ self._normal
-        self._field = points - np.outer(height, self._normal)  # without the touches' noise
+        heights = (points - self._centre) @ self._normal
+        self._field = points - np.outer(heights, self._normal)  # without the touches' noise
 
     def now(self, pose: Transform, image_at: datetime | None = None) -> Chain:
         """Return the chain of solvers for an image that was taken at a pose.
@@ -114,20 +114,20 @@ class MovingCamera:
             self._check_time(pose, image_at)
         motion = pose.undated() @ self._calibrated_at.undated().inverse()
         self._check_plane(motion)
-        static = self._static if isinstance(self._static, Chain) else Chain([self._static])
+        chain = self._static if isinstance(self._static, Chain) else Chain([self._static])
         return Chain(
-            [self._static, Moved(motion)],
+            [self._static, RigidMotion(motion)],
             frame=pose.target,
-            camera_frame=static.camera_frame,
-            y_down=static.y_down,
+            camera_frame=chain.camera_frame,
+            y_down=chain.y_down,
         )
 
     def _check_frames(self, pose: Transform) -> None:
-        wanted = self._calibrated_at
-        if (pose.target, pose.source) != (wanted.target, wanted.source):
+        expected = self._calibrated_at
+        if (pose.target, pose.source) != (expected.target, expected.source):
             raise Code.WRONG_FRAME.unexpected(
-                f"moving camera: expected {wanted.label}, as it was calibrated",
-                wanted.label,
+                f"moving camera: expected {expected.label}, as it was calibrated",
+                expected.label,
                 pose.label,
             )
 
@@ -154,7 +154,7 @@ class MovingCamera:
             )
 
     def _check_plane(self, motion: Transform) -> None:
-        """Raise if a motion moves the plane out of itself, or turns it upside down."""
+        """Raise PLANE_MOVED if a motion shifts, tilts or turns over the plane."""
         distance = float(np.abs((motion.apply(self._field) - self._centre) @ self._normal).max())
         cosine = float((motion.rotation @ self._normal) @ self._normal)
         if distance <= self._tolerance and cosine > 0:

@@ -1,4 +1,4 @@
-"""Find touches that were given for the wrong marks: exchanged or shifted ones.
+"""Find touches that were given for the wrong marks, because they were exchanged or shifted.
 
 If the touches of two marks are exchanged, or all of them are shifted by one, least squares spread
 the mistake over all points. This module searches for the right order. It starts from the order as
@@ -25,31 +25,30 @@ if TYPE_CHECKING:
     Order = NDArray[np.intp]
 
 SIGNIFICANCE_LEVEL = 1e-6
-"""Another order is reported only if noise alone would make it look that much better with at most
-this probability."""
+"""Another order is reported only if the probability that noise alone makes it look so much better
+is at most this value."""
 
 MIN_NOISE_CHANCE = 0.001
-"""Another order is reported only if the touches' noise leaves residuals as large with at least this
+"""Another order is reported only if the touches' noise explains its residuals with at least this
 probability."""
 
 MAX_POINTS_TO_ORDER = 40
 """The order of at most this many points is searched: the work of a step grows with the square of
 their number."""
 
-SURE_ORDER_RATIO = 2
+MIN_SURE_ORDER_RATIO = 2
 """An order is sure if every other order that fits as well moves at least this many times as many
 touches."""
 
 MIN_POINTS_FOR_AFFINE = 6
-"""An affine map explains another order only with at least this many points: it nearly fits any
-four."""
+"""An affine map is used only with at least this many points: it nearly fits any four points."""
 
 
 class Reordered(NamedTuple):
-    """An order that explains the touches better than the given one.
+    """An order of the touches that explains them better than the given order.
 
     Attributes:
-        order: (N,), for each mark the index of the touch that belongs to it.
+        order: (N,), index of the touch that belongs to each mark.
         before: sigma of a touch, estimated with the order as given, metres.
         after: sigma of a touch, estimated with the better order, metres.
         sure: True if every other order that fits as well moves far more touches: marks in a regular
@@ -72,17 +71,18 @@ class Reordered(NamedTuple):
         ``numbers`` (N,): numbers of the points in messages.
         """
         moved = [int(numbers[i]) for i in self.moved]
-        which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
-        how = "exchanged" if len(moved) == 2 else "in the wrong order"
-        several = "" if self.sure else "; more than one order does as well: touch them again"
+        points_text = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
+        problem = "exchanged" if len(moved) == 2 else "in the wrong order"
+        note = "" if self.sure else "; more than one order does as well: touch them again"
         return Code.WRONG_ORDER.remark(
-            f"the touches of points {which} look {how}: as given they speak of a touch with a "
-            f"sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{several}"
+            f"the touches of points {points_text} look {problem}: as given they speak of a touch "
+            f"with a sigma of {1e3 * self.before:.3g} mm, put right of "
+            f"{1e3 * self.after:.3g} mm{note}"
         )
 
 
 def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
-    """Return an order of touches that explains them far better than the given one, if there is one.
+    """Return an order that explains the touches far better than the given one; None without one.
 
     ``camera`` (N, 2), ``robot`` (N, 3), metres, in the order as given. ``sigma``: largest
     plausible standard deviation of a touch's coordinate, metres.
@@ -94,44 +94,55 @@ def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
     if count >= MIN_POINTS_FOR_AFFINE:
         models.append(_Affine(camera, robot))
     for model in models:
-        given, freedom = model.squares(np.arange(count)[None])[0], 3 * count - model.parameters
-        if Noise(sigma**2).chance(given, freedom) > SIGNIFICANCE_LEVEL:
-            return None  # a simple map explains the given order already
-        orders, squares = model.search()
-        scale = max(squares.min() / freedom, (ROUNDING_RATIO * model.extent) ** 2)
-        noise = Noise(scale, freedom)
-        if Noise(sigma**2).chance(squares.min(), freedom) < MIN_NOISE_CHANCE or (
-            noise.chance(given, freedom) > SIGNIFICANCE_LEVEL
+        squares_as_given, freedom = (
+            model.squares(np.arange(count)[None])[0],
+            3 * count - model.parameters,
+        )
+        if Noise(sigma**2).chance(squares_as_given, freedom) > SIGNIFICANCE_LEVEL:
+            return None  # a simple map already explains the given order
+        orders, squares_of_orders = model.search()
+        variance = max(squares_of_orders.min() / freedom, (ROUNDING_RATIO * model.extent) ** 2)
+        noise = Noise(variance, freedom)
+        if Noise(sigma**2).chance(squares_of_orders.min(), freedom) < MIN_NOISE_CHANCE or (
+            noise.chance(squares_as_given, freedom) > SIGNIFICANCE_LEVEL
         ):
             continue
-        alike = np.array([noise.chance(square, freedom) > MIN_NOISE_CHANCE for square in squares])
-        moved = np.where(alike, (orders != np.arange(count)).sum(axis=1), 2 * count)
-        first, *others = np.argsort(moved, kind="stable").tolist()
-        sure = all(SURE_ORDER_RATIO * moved[first] <= moved[other] for other in others)
-        after = max(squares[first] / freedom, scale)
-        return Reordered(orders[first], float((given / freedom) ** 0.5), float(after**0.5), sure)
+        is_equivalent = np.array(
+            [noise.chance(square, freedom) > MIN_NOISE_CHANCE for square in squares_of_orders]
+        )
+        moved_counts = np.where(is_equivalent, (orders != np.arange(count)).sum(axis=1), 2 * count)
+        best, *others = np.argsort(moved_counts, kind="stable").tolist()
+        is_sure = all(
+            MIN_SURE_ORDER_RATIO * moved_counts[best] <= moved_counts[other] for other in others
+        )
+        after = max(squares_of_orders[best] / freedom, variance)
+        return Reordered(
+            orders[best], float((squares_as_given / freedom) ** 0.5), float(after**0.5), is_sure
+        )
     return None
 
 
 class _Similarity:
-    """Sums of squares of the residuals from similarities, for many orders at once."""
+    """Computes the squared residuals that similarities leave, for many orders at once."""
 
     parameters = 7
 
     def __init__(self, camera: Array, robot: Array) -> None:
         self._marks, self._touches = camera - camera.mean(axis=0), robot - robot.mean(axis=0)
-        self._camera = self._basis()
+        self._scaled_marks = self._scale_marks()
         self._total = float((self._touches**2).sum())
         self.extent = self._total**0.5
 
-    def _basis(self) -> Array:
+    def _scale_marks(self) -> Array:
         return np.asarray(self._marks / np.linalg.norm(self._marks))
 
     def squares(self, orders: Order) -> Array:
         """Return the sums of squares (K,) of orders (K, N)."""
-        return self._left(np.einsum("kni,nj->kij", self._touches[orders], self._camera))
+        return self._remaining_squares(
+            np.einsum("kni,nj->kij", self._touches[orders], self._scaled_marks)
+        )
 
-    def _left(self, cross: Array) -> Array:
+    def _remaining_squares(self, cross: Array) -> Array:
         """Return the sums of squares that similarities leave, from products (..., 3, 2)."""
         # If the squares of the marks add up to 1, the best scale is the sum of the singular values
         # of C = sum p u^T, and the fit removes its square. (s1 + s2)^2 = tr C^T C + 2
@@ -139,42 +150,42 @@ class _Similarity:
         # (1991).
         inner = np.swapaxes(cross, -1, -2) @ cross
         root = np.sqrt(np.maximum(np.linalg.det(inner), 0.0))
-        left = self._total - np.trace(inner, axis1=-2, axis2=-1) - 2.0 * root
-        return np.asarray(np.maximum(left, 0.0))
+        remaining = self._total - np.trace(inner, axis1=-2, axis2=-1) - 2.0 * root
+        return np.asarray(np.maximum(remaining, 0.0))
 
     def search(self) -> tuple[Order, Array]:
         """Return the orders (K, N) that no exchange improves, and their sums of squares (K,)."""
         rows = np.arange(len(self._marks))
         starts = [np.roll(order, by) for order in (rows, rows[::-1]) for by in rows]
-        orders = np.unique([self._descended(start) for start in starts], axis=0)
+        orders = np.unique([self._descend(start) for start in starts], axis=0)
         return orders, self.squares(orders)
 
-    def _descended(self, order: Order) -> Order:
-        """Return an order after all exchanges that lower its sum of squares."""
+    def _descend(self, order: Order) -> Order:
+        """Return the order after the exchanges that lower its sum of squares."""
         first, second = np.triu_indices(len(order), 1)
-        order, least = order.copy(), float(self.squares(order[None])[0])
+        order, best_squares = order.copy(), float(self.squares(order[None])[0])
         while True:
-            touched = self._touches[order]
-            cross = touched.T @ self._camera
+            touches = self._touches[order]
+            cross = touches.T @ self._scaled_marks
             # exchanging the touches of i and j adds (p_j - p_i) (u_i - u_j)^T
-            moves = (touched[second] - touched[first])[:, :, None] * (
-                self._camera[first] - self._camera[second]
+            changes = (touches[second] - touches[first])[:, :, None] * (
+                self._scaled_marks[first] - self._scaled_marks[second]
             )[:, None, :]
-            squares = self._left(cross + moves)
+            squares = self._remaining_squares(cross + changes)
             best = int(np.argmin(squares))
-            if not squares[best] < least * (1.0 - 1e-9):
+            if not squares[best] < best_squares * (1.0 - 1e-9):
                 return order
-            least, (i, j) = float(squares[best]), (first[best], second[best])
+            best_squares, (i, j) = float(squares[best]), (first[best], second[best])
             order[[i, j]] = order[[j, i]]
 
 
 class _Affine(_Similarity):
-    """Sums of squares of the residuals from affine maps, as of a tilted camera, for many orders."""
+    """Computes the squared residuals that affine maps leave, as those of a tilted camera."""
 
     parameters = 9
 
-    def _basis(self) -> Array:
+    def _scale_marks(self) -> Array:
         return np.linalg.qr(self._marks)[0]
 
-    def _left(self, cross: Array) -> Array:
+    def _remaining_squares(self, cross: Array) -> Array:
         return np.asarray(np.maximum(self._total - (cross**2).sum(axis=(-2, -1)), 0.0))

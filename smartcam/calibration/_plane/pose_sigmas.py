@@ -1,4 +1,4 @@
-"""Compute the errors of poses in the robot's space, from those of camera and calibration."""
+"""Compute the sigmas of poses in the robot's space, from those of the camera and calibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STEP_SHARE: Final = 1e-4
 
 
 def robot_sigmas(
-    seen: list[Localization],
+    localizations: list[Localization],
     transform: Callable[[Array], Array],
     normal: Array,
     by_matrix: Callable[[Array], Array],
@@ -29,10 +29,10 @@ def robot_sigmas(
     *,
     flip: bool,
 ) -> list[PoseSigma]:
-    """Return the errors of poses in the robot's space.
+    """Return the sigmas of poses in the robot's space.
 
     Args:
-        seen: localizations of the camera, whose poses have sigmas.
+        localizations: localizations of the camera, whose poses have sigmas.
         transform: function that maps points of the camera (N, 2) to the robot's space.
         normal: the plane's normal (3,).
         by_matrix: derivatives of mapped points by the calibration's parameters, (N, 3, K).
@@ -40,45 +40,51 @@ def robot_sigmas(
         size: size of the touched field, in the camera's unit.
         flip: whether the poses are turned about their x axis.
     """
-    points = np.array([localization.pose.position[:2] for localization in seen])
-    angles = np.array([localization.pose.orientation.theta for localization in seen])
+    points = np.array([localization.pose.position[:2] for localization in localizations])
+    angles = np.array([localization.pose.orientation.theta for localization in localizations])
     step = STEP_SHARE * size
 
-    def ahead(at: Array, turn: Array) -> Array:
-        return at + step * np.column_stack([np.cos(turn), np.sin(turn)])
+    def points_ahead(points: Array, angles: Array) -> Array:
+        return points + step * np.column_stack([np.cos(angles), np.sin(angles)])
 
-    def directions(at: Array, turn: Array) -> Array:
-        return transform(ahead(at, turn)) - transform(at)
+    def mapped_headings(points: Array, angles: Array) -> Array:
+        return transform(points_ahead(points, angles)) - transform(points)
 
-    along = directions(points, angles)
-    lengths = np.linalg.norm(along, axis=1)
-    left = np.cross(normal, along) / lengths[:, None]
+    headings = mapped_headings(points, angles)
+    lengths = np.linalg.norm(headings, axis=1)
+    left_normals = np.cross(normal, headings) / lengths[:, None]
 
-    def pose_change(off_place: Array, off_along: Array) -> Array:
+    def pose_change(shift: Array, heading_change: Array) -> Array:
         """Return the changes of x, y, z and the angle, (N, 4)."""
-        angle = (left * off_along).sum(axis=1) / lengths
-        return np.column_stack([off_place, angle])
+        angle = (left_normals * heading_change).sum(axis=1) / lengths
+        return np.column_stack([shift, angle])
 
     columns = []
     for axis in np.eye(2):
-        ends = [points + sign * step * axis for sign in (1, -1)]
-        place = (transform(ends[0]) - transform(ends[1])) / (2 * step)
-        turned = (directions(ends[0], angles) - directions(ends[1], angles)) / (2 * step)
-        columns.append(pose_change(place, turned))
-    turned = (directions(points, angles + STEP_SHARE) - directions(points, angles - STEP_SHARE)) / (
-        2 * STEP_SHARE
-    )
-    columns.append(pose_change(np.zeros_like(turned), turned))
+        shifted = [points + sign * step * axis for sign in (1, -1)]
+        position_change = (transform(shifted[0]) - transform(shifted[1])) / (2 * step)
+        heading_change = (
+            mapped_headings(shifted[0], angles) - mapped_headings(shifted[1], angles)
+        ) / (2 * step)
+        columns.append(pose_change(position_change, heading_change))
+    heading_change = (
+        mapped_headings(points, angles + STEP_SHARE) - mapped_headings(points, angles - STEP_SHARE)
+    ) / (2 * STEP_SHARE)
+    columns.append(pose_change(np.zeros_like(heading_change), heading_change))
     slopes = np.stack(columns, axis=2)
-    covariances = np.array([_covariance(localization.pose.sigma) for localization in seen])
-    at, front = by_matrix(points), by_matrix(ahead(points, angles))
-    turns = np.einsum("ni,nik->nk", left, front - at) / lengths[:, None]
-    rows = np.concatenate([at, turns[:, None]], axis=1)
+    covariances = np.array(
+        [_pose_covariance(localization.pose.sigma) for localization in localizations]
+    )
+    rows_at_points, rows_ahead = by_matrix(points), by_matrix(points_ahead(points, angles))
+    angle_rows = (
+        np.einsum("ni,nik->nk", left_normals, rows_ahead - rows_at_points) / lengths[:, None]
+    )
+    rows = np.concatenate([rows_at_points, angle_rows[:, None]], axis=1)
     totals = slopes @ covariances @ slopes.swapaxes(1, 2) + rows @ covariance @ rows.swapaxes(1, 2)
-    return [_sigma(total, -1.0 if flip else 1.0) for total in totals]
+    return [_pose_sigma(total, -1.0 if flip else 1.0) for total in totals]
 
 
-def _covariance(sigma: PoseSigma | None) -> Array:
+def _pose_covariance(sigma: PoseSigma | None) -> Array:
     """Return the covariance (3, 3) of x, y and theta; NaN without a sigma."""
     if sigma is None:
         return np.full((3, 3), np.nan)
@@ -89,8 +95,8 @@ def _covariance(sigma: PoseSigma | None) -> Array:
     return covariance
 
 
-def _sigma(covariance: Array, sign: float) -> PoseSigma:
-    """Return the sigmas of a covariance (4, 4) of x, y, z and theta; ``sign`` is that of theta."""
+def _pose_sigma(covariance: Array, sign: float) -> PoseSigma:
+    """Return the sigmas of a covariance (4, 4) of x, y, z and theta; ``sign`` -1 negates theta."""
     x, y, z, theta = np.sqrt(np.diag(covariance).clip(0)).tolist()
 
     def correlation(first: int, second: int) -> float:

@@ -1,4 +1,4 @@
-"""Measure a tool: its tip from touches of one point.
+"""Compute the position of a tool's tip from touches of one point.
 
 A wrong tip moves every touch by the same vector *in the flange's frame*. That cancels only as long
 as the flange always has the same orientation: an error of 1 mm is 2 mm between two touches that are
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from smartcam.geometry import Transform
     from smartcam.geometry._inside import Array
 
-_MIN_ORIENTATION_SPREAD: Final = 0.17
-"""Least spread of the orientations: that of two touches 20 degrees apart."""
+MIN_ORIENTATION_SPREAD: Final = 0.17
+"""Least singular value of the rotations' differences: that of two touches 20 degrees apart."""
 
 
 class ToolTip(NamedTuple):
@@ -72,22 +72,22 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
                 label,
                 flange.label,
             )
-    turns = np.array([flange.rotation for flange in flanges])
-    places = np.array([flange.translation for flange in flanges])
-    mean_turn, mean_place = turns.mean(axis=0), places.mean(axis=0)
-    matrix = (turns - mean_turn).reshape(-1, 3)
+    rotations = np.array([flange.rotation for flange in flanges])
+    positions = np.array([flange.translation for flange in flanges])
+    mean_rotation, mean_position = rotations.mean(axis=0), positions.mean(axis=0)
+    matrix = (rotations - mean_rotation).reshape(-1, 3)
     _, values, axes = np.linalg.svd(matrix / np.sqrt(len(flanges)), full_matrices=False)
-    seen = int((values > _MIN_ORIENTATION_SPREAD).sum())
-    if seen < 2:  # turns about one axis have two equal eigenvalues
+    rank = int((values > MIN_ORIENTATION_SPREAD).sum())
+    if rank < 2:  # turns about one axis have two equal eigenvalues
         raise Code.INSUFFICIENT_ROTATION.refusal(
             f"tool tip: expected the flange at orientations that differ, got a spread of "
-            f"{values[1]:.3g}, which must be above {_MIN_ORIENTATION_SPREAD:g}",
-            _MIN_ORIENTATION_SPREAD,
+            f"{values[1]:.3g}, which must be above {MIN_ORIENTATION_SPREAD:g}",
+            MIN_ORIENTATION_SPREAD,
             float(values[1]),
         )
-    right = -(places - mean_place).reshape(-1)
-    scaled = (axes[:seen] @ (matrix.T @ right)) / (values[:seen] ** 2 * len(flanges))
-    tip = axes[:seen].T @ scaled
-    touched = turns @ tip + places
-    point = touched.mean(axis=0)
-    return ToolTip(tip, point, touched - point, None if seen == 3 else axes[2])
+    right = -(positions - mean_position).reshape(-1)
+    components = (axes[:rank] @ (matrix.T @ right)) / (values[:rank] ** 2 * len(flanges))
+    tip = axes[:rank].T @ components
+    touched_points = rotations @ tip + positions
+    point = touched_points.mean(axis=0)
+    return ToolTip(tip, point, touched_points - point, None if rank == 3 else axes[2])

@@ -19,8 +19,8 @@ from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
 from smartcam.calibration._plane.diagnostics import (
     TYPICAL_SIGMA_M,
     check_side,
-    remark_side,
-    sigma_of,
+    estimate_sigma,
+    side_remarks,
 )
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
@@ -46,7 +46,7 @@ class _FittedRays(NamedTuple):
 
     origin: Array  # (3,), origin, metres
     frame: Array  # (3, 3): rays A and B and the normal as columns
-    along: Array  # (N,), place of each touch along its ray, metres
+    positions: Array  # (N,), position of each touch along its ray, metres
     residuals: Array  # (N, 3), residuals, metres
     covariance: Array  # (6, 6), covariance of shift and turn, for touches with a variance of 1 m^2
 
@@ -115,108 +115,115 @@ def fit_touches(
             theta_sigma,
         )
     groups = [
-        _touches(touches, name) for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
+        _as_touches(touches, name)
+        for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
     ]
-    touched = np.concatenate(groups)
-    check_field(touched)
-    ray = np.repeat([0, 1, 2], [len(group) for group in groups])
+    all_touches = np.concatenate(groups)
+    check_field(all_touches)
+    ray_index = np.repeat([0, 1, 2], [len(group) for group in groups])
     levers = [float(np.linalg.norm(group.mean(0) - groups[0].mean(0))) for group in groups[1:]]
-    sheet = _fit(touched, ray)
+    sheet = _fit_rays(all_touches, ray_index)
     for lever in levers if touch_sigma is not None else ():
         check_lever(lever, touch_sigma or 0.0)
-    axis = None if tool_z is None else mean_axis(tool_z, len(touched))
-    side = None if axis is None else check_side(sheet.frame[:, 2], axis)
+    tool_axis = None if tool_z is None else mean_axis(tool_z, len(all_touches))
+    tool_cosine = None if tool_axis is None else check_side(sheet.frame[:, 2], tool_axis)
     freedom = 3 * len(groups[0]) + 2 * len(groups[1]) + 2 * len(groups[2]) - 6
-    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
+    sigma = estimate_sigma(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))
     place = Normalization(centre, size / nominal_scale, sheet.origin, size)
-    local = np.zeros((4, 3))
-    local[:3, :2] = rotate_ccw(sheet.frame[:, :2], theta)
-    local[3, 2] = 1.0
+    normalized_matrix = np.zeros((4, 3))
+    normalized_matrix[:3, :2] = rotate_ccw(sheet.frame[:, :2], theta)
+    normalized_matrix[3, 2] = 1.0
     directions = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    places = directions[ray] * (sheet.along / nominal_scale)[:, None]
-    shift = rigid_tangent(local)
-    scaled = shift / [size, size, size, 1.0, 1.0, 1.0]
-    covariance = scaled @ sheet.covariance @ scaled.T
+    places = directions[ray_index] * (sheet.positions / nominal_scale)[:, None]
+    tangent = rigid_tangent(normalized_matrix)
+    scaled_tangent = tangent / [size, size, size, 1.0, 1.0, 1.0]
+    covariance = scaled_tangent @ sheet.covariance @ scaled_tangent.T
     if touch_sigma is not None:
-        yaw = shift[:, 3:] @ sheet.frame[:, 2] * (theta_sigma / touch_sigma)
-        covariance += np.outer(yaw, yaw)
+        theta_effect = tangent[:, 3:] @ sheet.frame[:, 2] * (theta_sigma / touch_sigma)
+        covariance += np.outer(theta_effect, theta_effect)
     return PlaneCalibration(
         model="touches",
         camera_points=centre + rotate_ccw(places, theta),
-        robot_points=touched,
-        weights=np.ones(len(touched)),
-        matrix=place.outward(local),
+        robot_points=all_touches,
+        weights=np.ones(len(all_touches)),
+        matrix=place.to_original(normalized_matrix),
         place=place,
         unit_covariance=covariance,
         residuals=sheet.residuals,
-        leave_one_out=np.full_like(touched, np.nan),
+        leave_one_out=np.full_like(all_touches, np.nan),
         freedom=freedom,
         touch_sigma=sigma if touch_sigma is None else touch_sigma,
         sigma_given=touch_sigma is not None,
         candidates={},
         nominal_scale=nominal_scale,
-        tool_z=axis,
+        tool_z=tool_axis,
         robot_frame=robot_frame,
         camera_frame=camera_frame,
         y_down=y_down,
-        warnings=_remarks(sheet, freedom, touch_sigma, nominal_scale, side),
+        warnings=_remarks(sheet, freedom, touch_sigma, nominal_scale, tool_cosine),
     )
 
 
-def _touches(values: ArrayLike, name: str) -> Array:
+def _as_touches(values: ArrayLike, name: str) -> Array:
     touches = as_points(np.atleast_2d(np.asarray(values)), 3, f"touches of {name}")
     if not len(touches):
         raise Code.TOO_FEW.refusal(f"touches of {name}: expected one or more, got none", 1, 0)
     return touches
 
 
-def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
-    """Return the most likely sheet; the place of each touch along its ray is free."""
+def _fit_rays(touches: Array, ray_index: NDArray[np.intp]) -> _FittedRays:
+    """Return the most likely sheet; the position of each touch along its ray is free."""
     # Gauss and Newton's steps of shift and turn: 3 to 6 of them, in 2.5 ms; SciPy's least_squares
     # takes 6 ms (measured).
-    origin = touched[ray == 0].mean(axis=0)
-    frame = frame_from_axes(*(touched[ray == number].mean(axis=0) - origin for number in (1, 2)))
+    origin = touches[ray_index == 0].mean(axis=0)
+    frame = frame_from_axes(
+        *(touches[ray_index == index].mean(axis=0) - origin for index in (1, 2))
+    )
     for _ in range(MAX_STEPS):
-        along, residuals, jacobian = _linear(touched, ray, origin, frame)
+        positions, residuals, jacobian = _linearize(touches, ray_index, origin, frame)
         step = np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
         origin = origin + step[:3]
-        first, second = (frame[:, axis] + np.cross(step[3:], frame[:, axis]) for axis in (0, 1))
-        second = second - first * (first @ second) / (first @ first)
-        frame = frame_from_axes(first, second)
+        x_axis, y_axis = (frame[:, axis] + np.cross(step[3:], frame[:, axis]) for axis in (0, 1))
+        y_axis = y_axis - x_axis * (x_axis @ y_axis) / (x_axis @ x_axis)
+        frame = frame_from_axes(x_axis, y_axis)
         if np.abs(step).max() < ROUNDING_RATIO**1.5 * (1.0 + np.abs(origin).max()):
             break
-    along, residuals, jacobian = _linear(touched, ray, origin, frame)
+    positions, residuals, jacobian = _linearize(touches, ray_index, origin, frame)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
-    return _FittedRays(origin, frame, along, residuals, covariance)
+    return _FittedRays(origin, frame, positions, residuals, covariance)
 
 
-def _linear(
-    touched: Array, ray: NDArray[np.intp], origin: Array, frame: Array
+def _linearize(
+    touches: Array, ray_index: NDArray[np.intp], origin: Array, frame: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the touches' places along their rays, residuals across, and the Jacobian (3N, 6)."""
+    """Return the touches' positions along their rays, the residuals, and the Jacobian (3N, 6)."""
     axes: Array = np.concatenate([np.zeros((1, 3)), frame[:, :2].T])
-    directions = axes[ray]
+    directions = axes[ray_index]
     # Off its ray with direction d a touch q is (I - d d^T) (q - o). A shift s of the origin and a
     # turn w move the ray's point beneath it, o + l d, by s + l w x d.
-    offsets = touched - origin
-    along = (offsets * directions).sum(axis=1)
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    turns = np.cross(np.eye(3)[None], directions[:, None], axis=2).swapaxes(1, 2)
-    moved = np.concatenate(
-        [np.broadcast_to(np.eye(3), turns.shape), along[:, None, None] * turns], axis=2
+    offsets = touches - origin
+    positions = (offsets * directions).sum(axis=1)
+    projections = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    by_turn = np.cross(np.eye(3)[None], directions[:, None], axis=2).swapaxes(1, 2)
+    by_sheet = np.concatenate(
+        [np.broadcast_to(np.eye(3), by_turn.shape), positions[:, None, None] * by_turn], axis=2
     )
-    jacobian = (across @ moved).reshape(-1, 6)
-    return along, (across @ offsets[..., None])[..., 0], jacobian
+    jacobian = (projections @ by_sheet).reshape(-1, 6)
+    return positions, (projections @ offsets[..., None])[..., 0], jacobian
 
 
 def _remarks(
-    sheet: _FittedRays, freedom: int, touch_sigma: float | None, scale: float, side: float | None
+    sheet: _FittedRays,
+    freedom: int,
+    touch_sigma: float | None,
+    scale: float,
+    tool_cosine: float | None,
 ) -> tuple[Remark, ...]:
     remarks: list[Remark] = []
-    squared = float((sheet.residuals**2).sum())
+    squares = float((sheet.residuals**2).sum())
     if touch_sigma is None:
         remarks.append(
             Code.UNVERIFIED.remark(
@@ -224,11 +231,12 @@ def _remarks(
                 "give touch_sigma"
             )
         )
-    elif Noise(touch_sigma**2).chance(squared, freedom) < SIGNIFICANCE_LEVEL:
+    elif Noise(touch_sigma**2).chance(squares, freedom) < SIGNIFICANCE_LEVEL:
         remarks.append(
             Code.POOR_FIT.remark(
-                f"the touches lie {1e3 * math.sqrt(squared / len(sheet.along)):.3g} mm rms beside "
-                f"rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was given"
+                f"the touches lie {1e3 * math.sqrt(squares / len(sheet.positions)):.3g} mm rms "
+                f"beside rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was "
+                "given"
             )
         )
     remarks.append(
@@ -242,4 +250,4 @@ def _remarks(
             "and the residuals do not tell"
         )
     )
-    return (*remarks, *remark_side(side))
+    return (*remarks, *side_remarks(tool_cosine))

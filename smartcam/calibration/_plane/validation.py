@@ -32,15 +32,14 @@ MAX_THICKNESS_RATIO = 0.2
 RMS."""
 
 SAME_MARK_RATIO = 0.01
-"""Points of one touch that are closer together than this part of the points' extent show one
-mark."""
+"""Camera points with the same touch show one mark if they are closer together than this part of all
+points' extent."""
 
 SAME_POINT_RATIO = 1e-9
 """Points that are closer together than this part of the extent of all points count as the same."""
 
 MIN_DIFFERENCE = 1e-100
-"""Two coordinates that differ by less than this are the same; the square of it is still a
-number."""
+"""Two coordinates that differ by less than this are the same; its square does not underflow."""
 
 
 def read_pairs(
@@ -60,54 +59,58 @@ def read_pairs(
         )
     if weights is None:
         return camera, robot, np.ones(len(camera))
-    given = as_points(np.reshape(weights, (-1, 1)), 1, "weights")[:, 0].copy()
-    if given.shape != (len(camera),) or (given <= 0).any():
+    values = as_points(np.reshape(weights, (-1, 1)), 1, "weights")[:, 0].copy()
+    if values.shape != (len(camera),) or (values <= 0).any():
         raise Code.SHAPE.refusal(
-            f"weights: expected {len(camera)} positive numbers, got {given.tolist()[:8]}",
+            f"weights: expected {len(camera)} positive numbers, got {values.tolist()[:8]}",
             len(camera),
-            given.tolist(),
+            values.tolist(),
         )
-    return camera, robot, given
+    return camera, robot, values
 
 
-class Distinct(NamedTuple):
-    """Points that count once each, even if they were touched several times."""
+class DistinctPoints(NamedTuple):
+    """Points after merging repeated touches."""
 
     camera: Array  # (M, 2), camera's points
     robot: Array  # (M, 3), robot's points
-    # (M,), weights of a single touch each, since an error of the point is in all of its touches
+    # (M,), each that of a single touch, since an error of the point is in all of its touches
     weights: Array
-    number: NDArray[np.intp]  # (N,), index of the distinct point that each given point belongs to
-    first: NDArray[np.intp]  # (M,), index of the first given point of each
+    point_index: NDArray[np.intp]  # (N,), index of the distinct point of each given point
+    first_index: NDArray[np.intp]  # (M,), index of the first given point of each distinct point
 
 
-def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
+def merge_repeated(camera: Array, robot: Array, weights: Array) -> DistinctPoints:
     """Merge repeated points into their means.
 
-    Repeated points are several touches of the same camera point, and several camera points close
-    together with the same touch, which are pictures of one mark.
+    Repeated points are touches of the same camera point, or camera points with the same touch that
+    are close together, which are pictures of one mark.
     """
-    number = np.unique(camera, axis=0, return_inverse=True)[1].ravel()
-    touch = np.unique(robot, axis=0, return_inverse=True)[1].ravel()
-    if len(camera) in {number.max(initial=-1) + 1, 0} and touch.max(initial=-1) + 1 == len(camera):
-        each = np.arange(len(camera), dtype=np.intp)
-        return Distinct(camera, robot, weights, each, each)
+    point_index = np.unique(camera, axis=0, return_inverse=True)[1].ravel()
+    touch_index = np.unique(robot, axis=0, return_inverse=True)[1].ravel()
+    if len(camera) in {point_index.max(initial=-1) + 1, 0} and touch_index.max(
+        initial=-1
+    ) + 1 == len(camera):
+        indices = np.arange(len(camera), dtype=np.intp)
+        return DistinctPoints(camera, robot, weights, indices, indices)
     tolerance = SAME_MARK_RATIO * float(np.linalg.norm(np.ptp(camera, axis=0)))
-    for mark in np.flatnonzero(np.bincount(touch) > 1):
-        same = np.flatnonzero(touch == mark)
-        if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < tolerance:
-            number[np.isin(number, number[same])] = number[same[0]]
-    first, number = np.unique(number, return_index=True, return_inverse=True)[1:]
-    order = np.argsort(first)  # numbers in the order of the given points
-    first, number = first[order], np.argsort(order)[number.ravel()]
-    share = weights / np.bincount(number, weights)[number]
+    for mark in np.flatnonzero(np.bincount(touch_index) > 1):
+        same_touch = np.flatnonzero(touch_index == mark)
+        if float(np.linalg.norm(np.ptp(camera[same_touch], axis=0))) < tolerance:
+            point_index[np.isin(point_index, point_index[same_touch])] = point_index[same_touch[0]]
+    first_index, point_index = np.unique(point_index, return_index=True, return_inverse=True)[1:]
+    order = np.argsort(first_index)  # numbers in the order of the given points
+    first_index, point_index = first_index[order], np.argsort(order)[point_index.ravel()]
+    shares = weights / np.bincount(point_index, weights)[point_index]
     means = [
-        np.column_stack([np.bincount(number, share * axis) for axis in points.T]).astype(float)
+        np.column_stack([np.bincount(point_index, shares * axis) for axis in points.T]).astype(
+            float
+        )
         for points in (camera, robot)
     ]
-    most = np.zeros(len(first))
-    np.maximum.at(most, number, weights)
-    return Distinct(means[0], means[1], most, number, first)
+    largest_weights = np.zeros(len(first_index))
+    np.maximum.at(largest_weights, point_index, weights)
+    return DistinctPoints(means[0], means[1], largest_weights, point_index, first_index)
 
 
 def check_positive(value: float | None, name: str, unit: str) -> None:
@@ -115,8 +118,8 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
     if value is None:
         return
     number: object = plain(value)
-    known = isinstance(number, (int, float)) and not isinstance(number, bool)
-    if not (known and 0 < value <= sys.float_info.max):
+    is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
+    if not (is_number and 0 < value <= sys.float_info.max):
         raise Code.NOT_FINITE.refusal(
             f"{name}: expected a positive number of {unit}, got {shown(value)}",
             "a positive number",
@@ -127,24 +130,26 @@ def check_positive(value: float | None, name: str, unit: str) -> None:
 def check_samples(
     camera: Array,
     robot: Array,
-    least: int,
+    min_count: int,
     touch_sigma: float | None,
     *,
-    strays: bool = False,
+    allow_strays: bool = False,
 ) -> None:
     """Raise if points do not determine a plane and a map onto it.
 
-    ``camera`` (N, 2); ``robot`` (N, 3), metres; the model needs ``least`` points; ``touch_sigma``
-    is that of one coordinate, metres, or None if it is not known. Raises TOO_FEW, UNIT_UNKNOWN,
-    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``strays``: some touches may be far off, so a
-    large field is no question of units.
+    ``camera`` (N, 2); ``robot`` (N, 3), metres. ``min_count``: number of points that the model
+    needs. ``touch_sigma``: standard deviation of one coordinate, metres; None: not known. Raises
+    TOO_FEW, UNIT_UNKNOWN, COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER. ``allow_strays``: some
+    touches may be far off, so a large field does not mean other units.
     """
-    if len(camera) < least:
-        raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
-    if not strays:
+    if len(camera) < min_count:
+        raise Code.TOO_FEW.unexpected(
+            f"expected at least {min_count} points", min_count, len(camera)
+        )
+    if not allow_strays:
         check_field(robot)
     for points, label in ((camera, "camera points"), (robot, "robot points")):
-        _check_distinct(points, label, least)
+        _check_distinct(points, label, min_count)
         _check_width(points, label)
     extents = _extents(robot)
     if extents[2] > MAX_THICKNESS_RATIO * extents[1]:
@@ -159,7 +164,7 @@ def check_samples(
 
 
 def check_field(robot: Array) -> None:
-    """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than in any cell."""
+    """Raise UNIT_UNKNOWN if touched points (N, 3) are farther apart than a robot's cell allows."""
     if (size := extent(robot)) > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
@@ -171,12 +176,12 @@ def check_field(robot: Array) -> None:
 
 def lever(robot: Array) -> float:
     """Return the extent of touched points (N, 3) across their longest direction, metres."""
-    return float(np.ptp(_turned(robot)[:, 1]))
+    return float(np.ptp(_in_principal_axes(robot)[:, 1]))
 
 
 def extent(points: Array) -> float:
     """Return the diagonal of the field that touched points (N, 3) span, metres."""
-    return float(np.linalg.norm(np.ptp(_turned(points)[:, :2], axis=0)))
+    return float(np.linalg.norm(np.ptp(_in_principal_axes(points)[:, :2], axis=0)))
 
 
 def check_lever(size: float, touch_sigma: float) -> None:
@@ -204,11 +209,11 @@ def normalize(camera: Array, robot: Array, weights: Array) -> tuple[Normalizatio
     return frame, Pairs(camera_centred / camera_size, robot_centred / robot_size, weights)
 
 
-def _turned(points: Array) -> Array:
-    """Return the points in their principal axes, the longest first."""
+def _in_principal_axes(points: Array) -> Array:
+    """Return the coordinates of points along their principal axes, the longest first."""
     centred = points - points.mean(axis=0)
-    turned: Array = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
-    return turned
+    rotated: Array = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    return rotated
 
 
 def _extents(points: Array) -> Array:
@@ -218,14 +223,14 @@ def _extents(points: Array) -> Array:
     return singular / math.sqrt(len(points))
 
 
-def _check_distinct(points: Array, label: str, least: int) -> None:
+def _check_distinct(points: Array, label: str, min_count: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
-    grain = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
-    distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
-    if distinct < least:
+    tolerance = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
+    distinct_count = len(np.unique(np.round((points - points[0]) / tolerance), axis=0))
+    if distinct_count < min_count:
         raise Code.COINCIDENT.unexpected(
-            f"{label}: expected at least {least} different ones", least, distinct
+            f"{label}: expected at least {min_count} different ones", min_count, distinct_count
         )
 
 

@@ -1,4 +1,4 @@
-"""Write black shapes on a page to scale, as SVG and as PDF.
+"""Write a page of black shapes to scale, as SVG and as PDF.
 
 A page's coordinates are millimetres from its lower left corner, y up. Shapes are filled and have no
 stroke, so the printed outline is exactly that of the coordinates. The same shapes always give the
@@ -28,7 +28,7 @@ part of the radius; the curve is off by at most 0.03 % of the radius."""
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A filled polygon; one that runs clockwise is a hole in the polygon around it."""
+    """A filled polygon; points in clockwise order make a hole in the polygon around it."""
 
     points: tuple[Point, ...]
 
@@ -43,12 +43,12 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A line of text from its lower left corner, as high as ``size``, upwards if ``turned``."""
+    """A line of text; ``place`` is its lower left corner, ``size`` its height."""
 
     place: Point
     text: str
     size: float
-    turned: bool = False
+    runs_upwards: bool = False
 
 
 Shape: TypeAlias = Polygon | Disc | Label
@@ -74,7 +74,7 @@ def rectangle(left: float, low: float, width: float, height: float) -> Polygon:
 
 def svg(page: PrintedPage) -> str:
     """Return an SVG document whose coordinates are in millimetres."""
-    width, height = _number(page.width), _number(page.height)
+    width, height = _length(page.width), _length(page.height)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
@@ -97,11 +97,11 @@ def _svg_paths(shapes: Sequence[Shape], height: float) -> Iterator[str]:
     for shape in shapes:
         match shape:
             case Polygon(points):
-                corners = " ".join(_pair(x, height - y) for x, y in points)
+                corners = " ".join(_lengths(x, height - y) for x, y in points)
                 yield f"M{corners}Z"
             case Disc((x, y), radius):
-                r = _number(radius)
-                left, right = (_pair(x + side * radius, height - y) for side in (-1, 1))
+                r = _length(radius)
+                left, right = (_lengths(x + side * radius, height - y) for side in (-1, 1))
                 yield f"M{left}A{r} {r} 0 0 0 {right}A{r} {r} 0 0 0 {left}Z"
             case Label():
                 pass
@@ -112,10 +112,10 @@ def _svg_paths(shapes: Sequence[Shape], height: float) -> Iterator[str]:
 def _svg_texts(shapes: Iterable[Shape], height: float) -> Iterator[str]:
     for shape in shapes:
         if isinstance(shape, Label):
-            x, y = _number(shape.place[0]), _number(height - shape.place[1])
-            turn = f' transform="rotate(-90 {x} {y})"' if shape.turned else ""
+            x, y = _length(shape.place[0]), _length(height - shape.place[1])
+            turn = f' transform="rotate(-90 {x} {y})"' if shape.runs_upwards else ""
             yield (
-                f'<text x="{x}" y="{y}" font-size="{_number(shape.size)}"{turn}>'
+                f'<text x="{x}" y="{y}" font-size="{_length(shape.size)}"{turn}>'
                 f"{escape(shape.text)}</text>"
             )
 
@@ -125,7 +125,7 @@ def pdf(page: PrintedPage) -> bytes:
     scale = f"{POINTS_PER_MM:.9f} 0 0 {POINTS_PER_MM:.9f} 0 0 cm"
     lines = [scale, *_pdf_paths(page.shapes), "f", *_pdf_texts(page.shapes)]
     content = "\n".join(lines).encode("latin-1", "replace")
-    size = " ".join(_number(POINTS_PER_MM * side) for side in (page.width, page.height))
+    size = " ".join(_length(POINTS_PER_MM * side) for side in (page.width, page.height))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -133,28 +133,28 @@ def pdf(page: PrintedPage) -> bytes:
         "/Resources << /Font << /F 5 0 R >> >> >>".encode(),
         b"<< /Length %d >>\nstream\n%b\nendstream" % (len(content), content),
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
-        f"<< /Title {_literal(page.title)} /Subject {_literal(page.description)} >>".encode(),
+        f"<< /Title {_pdf_string(page.title)} /Subject {_pdf_string(page.description)} >>".encode(),
     ]
-    written = bytearray(b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n")
-    places = []
+    document = bytearray(b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n")
+    offsets = []
     for number, body in enumerate(objects, 1):
-        places.append(len(written))
-        written += b"%d 0 obj\n%b\nendobj\n" % (number, body)
-    table = "".join(f"{place:010d} 00000 n \n" for place in places)
-    start = len(written)
-    written += (
+        offsets.append(len(document))
+        document += b"%d 0 obj\n%b\nendobj\n" % (number, body)
+    table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
+    table_offset = len(document)
+    document += (
         f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}"
         f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R /Info 6 0 R >>\n"
-        f"startxref\n{start}\n%%EOF\n"
+        f"startxref\n{table_offset}\n%%EOF\n"
     ).encode()
-    return bytes(written)
+    return bytes(document)
 
 
 def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
     for shape in shapes:
         match shape:
             case Polygon(points):
-                first, *others = (_pair(x, y) for x, y in points)
+                first, *others = (_lengths(x, y) for x, y in points)
                 yield " ".join([f"{first} m", *(f"{point} l" for point in others), "h"])
             case Disc((x, y), radius):
                 yield _pdf_circle(x, y, radius)
@@ -165,37 +165,37 @@ def _pdf_paths(shapes: Iterable[Shape]) -> Iterator[str]:
 
 
 def _pdf_circle(x: float, y: float, radius: float) -> str:
-    parts = [f"{_pair(x + radius, y)} m"]
-    for along, up in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-        before, after, end = (
-            _pair(x + radius * (along * a - up * b), y + radius * (up * a + along * b))
+    commands = [f"{_lengths(x + radius, y)} m"]
+    for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        first_control, second_control, end = (
+            _lengths(x + radius * (dx * a - dy * b), y + radius * (dy * a + dx * b))
             for a, b in ((1, ARC_CONTROL_RATIO), (ARC_CONTROL_RATIO, 1), (0, 1))
         )
-        parts.append(f"{before} {after} {end} c")
-    return " ".join([*parts, "h"])
+        commands.append(f"{first_control} {second_control} {end} c")
+    return " ".join([*commands, "h"])
 
 
 def _pdf_texts(shapes: Iterable[Shape]) -> list[str]:
     return [
-        f"BT /F {_number(shape.size)} Tf {'0 1 -1 0' if shape.turned else '1 0 0 1'} "
-        f"{_pair(*shape.place)} Tm {_literal(shape.text)} Tj ET"
+        f"BT /F {_length(shape.size)} Tf {'0 1 -1 0' if shape.runs_upwards else '1 0 0 1'} "
+        f"{_lengths(*shape.place)} Tm {_pdf_string(shape.text)} Tj ET"
         for shape in shapes
         if isinstance(shape, Label)
     ]
 
 
-def _literal(text: str) -> str:
-    """Return a text as a string of a PDF."""
+def _pdf_string(text: str) -> str:
+    """Return a text as a PDF string."""
     for sign in "\\()":
         text = text.replace(sign, f"\\{sign}")
     return f"({text})"
 
 
-def _pair(x: float, y: float) -> str:
-    return f"{_number(x)} {_number(y)}"
+def _lengths(x: float, y: float) -> str:
+    return f"{_length(x)} {_length(y)}"
 
 
-def _number(value: float) -> str:
-    """Return a length to a tenth of a micrometre."""
+def _length(value: float) -> str:
+    """Return a length as text, rounded to a tenth of a micrometre."""
     text = f"{value:.4f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text

@@ -1,7 +1,7 @@
 """Place a target, its rays, rulers and texts on a page; all lengths are millimetres.
 
 The target is at the lower left, so that the rays A and B are as long as the page allows. Rulers are
-left of it and below it, texts above it, right of the ray B.
+to its left and below it; texts are above it, to the right of the ray B.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ RULER_MM: Final = 100.0
 """Length of each of the two rulers, mm."""
 
 BORDER_MM: Final = 5.0
-"""Border of the page, mm, which many printers leave white."""
+"""Width of the page's border that many printers cannot print on, mm."""
 
 MAX_MOVE_MM: Final = 5.0
-"""Largest distance of a target from the border, mm; the rest of the space is for the rays."""
+"""Largest extra distance of a target from the border, mm; the other free space is for the rays."""
 
 MARGIN_RATIO: Final = 0.2
 """Width of the white margin around a target, as a part of a square's side or of the distance
@@ -62,10 +62,10 @@ LETTER_WIDTH_RATIO: Final = 0.6
 Arial."""
 
 AREA_REACH_SQUARES: Final = AREA_DISTANCE_SQUARES + AREA_DIAMETER_SQUARES / 2
-"""Distance that the areas outside of a checkerboard's outer corners reach, in sides of a square."""
+"""Distance from a checkerboard's outer corners to the round areas' outer ends, in squares."""
 
 AREA_GAP_MM: Final = 1.0
-"""Distance between a white area outside of a checkerboard and the parts beyond it, mm."""
+"""Distance between a white area outside of a checkerboard and the next printed part, mm."""
 
 
 class PageLayout:
@@ -74,8 +74,8 @@ class PageLayout:
     Args:
         box: rectangle around the target's pattern.
         pitch: a square's side, or the distance of two dots.
-        areas: distance that white areas outside of the pattern's corners reach, an origin mark
-            included.
+        area_reach: distance that the areas with and without an origin mark reach beyond the
+            pattern's corners; 0 without a mark.
         texts: lines of text to print.
         width: width of the page.
         height: height of the page.
@@ -91,7 +91,7 @@ class PageLayout:
         box: Box,
         *,
         pitch: float,
-        areas: float,
+        area_reach: float,
         texts: Sequence[str],
         width: float,
         height: float,
@@ -99,101 +99,113 @@ class PageLayout:
         self._box = box
         self.width = width
         self.height = height
-        self._quiet = min(max(MARGIN_RATIO * pitch, MIN_MARGIN_MM), MAX_MARGIN_MM)
-        self._areas = areas
-        ray = max(self._quiet + MIN_RAY_MM, self._areas)
-        x, needed_width = _along((box.left, box.right), (self._ruler_band(box.high), ray), width)
-        letters = max(
+        self._margin = min(max(MARGIN_RATIO * pitch, MIN_MARGIN_MM), MAX_MARGIN_MM)
+        self._area_reach = area_reach
+        ray_space = max(self._margin + MIN_RAY_MM, self._area_reach)
+        x, needed_width = _place_along_side(
+            (box.left, box.right), (self._ruler_space(box.high), ray_space), width
+        )
+        letters_per_line = max(
             int((width - BORDER_MM - x - TEXT_LEFT_MM) / (LETTER_WIDTH_RATIO * TEXT_MM)),
             MIN_LETTERS_PER_LINE,
         )
-        self._lines = [line for text in texts for line in textwrap.wrap(text, letters)]
-        self._longest = max(map(len, self._lines)) * LETTER_WIDTH_RATIO * TEXT_MM
-        text = self._clear(TEXT_LEFT_MM + self._longest, box.right) + LINE_MM * len(self._lines)
-        y, needed_height = _along(
-            (box.low, box.high), (self._ruler_band(box.right), max(ray, text)), height
+        self._lines = [
+            line for text_space in texts for line in textwrap.wrap(text_space, letters_per_line)
+        ]
+        self._text_width = max(map(len, self._lines)) * LETTER_WIDTH_RATIO * TEXT_MM
+        text_space = self._distance_from_target(
+            TEXT_LEFT_MM + self._text_width, box.right
+        ) + LINE_MM * len(self._lines)
+        y, needed_height = _place_along_side(
+            (box.low, box.high), (self._ruler_space(box.right), max(ray_space, text_space)), height
         )
         self.origin: Point = (x, y)
         self.needed_width: float = needed_width
         self.needed_height: float = needed_height
 
-    def _ruler_band(self, edge: float) -> float:
-        """Return the width of a ruler beside a target that reaches from its origin to ``edge``."""
-        return max(self._clear(RULER_SPAN_MM, edge) + TICK_MM[1], self._areas)
+    def _ruler_space(self, edge: float) -> float:
+        """Return the space for a ruler along a target that reaches from its origin to ``edge``."""
+        return max(self._distance_from_target(RULER_SPAN_MM, edge) + TICK_MM[1], self._area_reach)
 
-    def _clear(self, end: float, edge: float) -> float:
-        """Return the distance from the target of a part that reaches from the origin to ``end``.
+    def _distance_from_target(self, end: float, edge: float) -> float:
+        """Return the distance from the target to a part that reaches from the origin to ``end``.
 
-        The part is placed between the areas at the corners, or beyond them if it does not fit.
+        The part is between the areas at the corners, or beyond them if it does not fit between.
         """
-        return self._quiet if end <= edge else max(self._quiet, self._areas + AREA_GAP_MM)
+        return self._margin if end <= edge else max(self._margin, self._area_reach + AREA_GAP_MM)
 
     @property
     def excess(self) -> float:
         """Length by which the layout is too large for the page; zero if it fits."""
         return max(self.needed_width - self.width, 0.0) + max(self.needed_height - self.height, 0.0)
 
-    def furniture(self) -> Iterator[Shape]:
+    def extra_shapes(self) -> Iterator[Shape]:
         """Yield rays, rulers and texts."""
         x, y = self.origin
         box = self._box
-        end = self.width - BORDER_MM - (x + box.right + self._quiet)
-        yield from _ray(x + box.right + self._quiet, y, end, "A")
+        length_a = self.width - BORDER_MM - (x + box.right + self._margin)
+        yield from _ray_shapes(x + box.right + self._margin, y, length_a, "A")
         top = self.height - BORDER_MM
-        upward = top - (y + box.high + self._quiet)
-        yield from map(_upright, _ray(y + box.high + self._quiet, x, upward, "B"))
-        yield from _ruler(x, y + box.low - self._clear(RULER_SPAN_MM, box.right) - TICK_MM[1])
-        beside = x + box.left - self._clear(RULER_SPAN_MM, box.high) - TICK_MM[1]
-        yield from map(_upright, _ruler(y, beside))
+        length_b = top - (y + box.high + self._margin)
+        yield from map(
+            _mirror_diagonally, _ray_shapes(y + box.high + self._margin, x, length_b, "B")
+        )
+        yield from _ruler_shapes(
+            x, y + box.low - self._distance_from_target(RULER_SPAN_MM, box.right) - TICK_MM[1]
+        )
+        ruler_left = x + box.left - self._distance_from_target(RULER_SPAN_MM, box.high) - TICK_MM[1]
+        yield from map(_mirror_diagonally, _ruler_shapes(y, ruler_left))
         for number, line in enumerate(self._lines):
-            low = top - TEXT_MM - LINE_MM * number
-            yield rectangle(x + TEXT_LEFT_MM, low, self._longest, RULE_MM)
-            yield Label((x + TEXT_LEFT_MM, low), line, TEXT_MM)
+            baseline = top - TEXT_MM - LINE_MM * number
+            yield rectangle(x + TEXT_LEFT_MM, baseline, self._text_width, RULE_MM)
+            yield Label((x + TEXT_LEFT_MM, baseline), line, TEXT_MM)
 
 
-def _along(
-    pattern: tuple[float, float], bands: tuple[float, float], side: float
+def _place_along_side(
+    pattern: tuple[float, float], spaces: tuple[float, float], page_side: float
 ) -> tuple[float, float]:
-    """Return the origin's place along a side of the page, and the least length of that side.
+    """Return the origin's position along a side of the page, and the least length of that side.
 
-    ``pattern``: begin and end of the pattern, from its origin. ``bands``: space needed before and
+    ``pattern``: start and end of the pattern, from its origin. ``spaces``: space needed before and
     after the pattern.
     """
     low, high = pattern
-    needed = 2 * BORDER_MM + bands[0] + max(high - low + bands[1], RULER_SPAN_MM - low)
-    spare = min(max(side - needed, 0.0) / 2, MAX_MOVE_MM)
-    return BORDER_MM + spare + bands[0] - low, needed
+    needed = 2 * BORDER_MM + spaces[0] + max(high - low + spaces[1], RULER_SPAN_MM - low)
+    shift = min(max(page_side - needed, 0.0) / 2, MAX_MOVE_MM)
+    return BORDER_MM + shift + spaces[0] - low, needed
 
 
-def _ray(start: float, across: float, length: float, letter: str) -> Iterator[Polygon | Label]:
-    """Yield a ray along x."""
+def _ray_shapes(start: float, y: float, length: float, letter: str) -> Iterator[Polygon | Label]:
+    """Yield the shapes of a ray along x."""
     tip = start + length
     neck, notch = tip - RAY_HEAD_MM[0], tip - (1 - NOTCH_RATIO) * RAY_HEAD_MM[0]
-    yield rectangle(start, across - RAY_WIDTH / 2, notch - start, RAY_WIDTH)
+    yield rectangle(start, y - RAY_WIDTH / 2, notch - start, RAY_WIDTH)
     yield Polygon(
         (
-            (neck, across - RAY_HEAD_MM[1]),
-            (tip, across),
-            (neck, across + RAY_HEAD_MM[1]),
-            (notch, across),
+            (neck, y - RAY_HEAD_MM[1]),
+            (tip, y),
+            (neck, y + RAY_HEAD_MM[1]),
+            (notch, y),
         )
     )
-    yield Label((neck, across + RAY_HEAD_MM[1] + 1), letter, LETTER_MM)
+    yield Label((neck, y + RAY_HEAD_MM[1] + 1), letter, LETTER_MM)
 
 
-def _ruler(start: float, low: float) -> Iterator[Polygon | Label]:
-    """Yield a ruler along x; it reaches from the outer side of its first tick to the last one's."""
-    thick, high = TICK_MM
-    yield rectangle(start, low, RULER_MM, thick)
+def _ruler_shapes(start: float, low: float) -> Iterator[Polygon | Label]:
+    """Yield the shapes of a ruler along x, measured between the outer sides of its outer ticks."""
+    thickness, height = TICK_MM
+    yield rectangle(start, low, RULER_MM, thickness)
     for tick in range(11):
-        middle = min(max(RULER_MM / 10 * tick, thick / 2), RULER_MM - thick / 2)
-        yield rectangle(start + middle - thick / 2, low + thick, thick, high - thick)
+        offset = min(max(RULER_MM / 10 * tick, thickness / 2), RULER_MM - thickness / 2)
+        yield rectangle(
+            start + offset - thickness / 2, low + thickness, thickness, height - thickness
+        )
     yield rectangle(start + RULER_MM + 1, low, RULER_SPAN_MM - RULER_MM - 1, RULE_MM)
     yield Label((start + RULER_MM + 1, low), f"{RULER_MM:g} mm", TEXT_MM)
 
 
-def _upright(shape: Polygon | Label) -> Shape:
-    """Turn a shape along x into one along y: mirrored, except for its letters.
+def _mirror_diagonally(shape: Polygon | Label) -> Shape:
+    """Return a shape along x mirrored to one along y; letters are not mirrored.
 
     A single letter stays upright, a longer text runs upwards.
     """
@@ -202,4 +214,4 @@ def _upright(shape: Polygon | Label) -> Shape:
     x, y = shape.place
     if len(shape.text) == 1:
         return Label((y, x), shape.text, shape.size)
-    return Label((y + shape.size, x), shape.text, shape.size, turned=True)
+    return Label((y + shape.size, x), shape.text, shape.size, runs_upwards=True)

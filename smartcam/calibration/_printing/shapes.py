@@ -34,8 +34,8 @@ class Box(NamedTuple):
     high: float
 
 
-def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return the shapes of a target, those of an origin mark last, and their bounds.
+def pattern_shapes(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    """Return the black shapes of a target, those of an origin mark last, and their bounds.
 
     Raises SHAPE if OpenCV has no such dictionary or it has too few markers; MissingExtraError: a
     marker's pattern needs OpenCV.
@@ -68,7 +68,7 @@ def _checkerboard(target: Checkerboard) -> Iterator[Polygon | Disc]:
 
 
 def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
-    """Yield squares and markers; OpenCV counts both from the upper left."""
+    """Yield squares and markers, in OpenCV's order: from the upper left."""
     side, marker = MM_PER_METRE * target.square, MM_PER_METRE * target.marker
     first_black = 1 if target.legacy_pattern and target.rows % 2 == 0 else 0
     cells = [
@@ -77,7 +77,7 @@ def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
         for column in range(target.columns)
     ]
     inset = (side - marker) / 2
-    patterns = _patterns(target)
+    patterns = _marker_modules(target)
     for column, row, left, low in cells:
         if (column + row) % 2 == first_black:
             yield rectangle(left, low, side, side)
@@ -91,9 +91,9 @@ def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
 
 
 def _marker_box(target: MarkerGrid) -> Box:
-    around = MM_PER_METRE * target.gap if target.kalibr else 0.0
+    border = MM_PER_METRE * target.gap if target.kalibr else 0.0
     right, high = (MM_PER_METRE * target.points[-1, :2]).tolist()
-    return Box(-around, -around, right + around, high + around)
+    return Box(-border, -border, right + border, high + border)
 
 
 def _markers(target: MarkerGrid) -> Iterator[Polygon]:
@@ -112,8 +112,8 @@ def _markers(target: MarkerGrid) -> Iterator[Polygon]:
                 yield rectangle(left, low, gap, gap)
 
 
-def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
-    """Yield each marker's black modules, its border included, by id."""
+def _marker_modules(target: Charuco) -> Iterator[NDArray[np.bool_]]:
+    """Yield the black modules of each marker, including its border, in the order of ids."""
     cv2 = load("cv2")
     dictionary: Any = charuco_board(target).getDictionary()
     modules = dictionary.markerSize + 2
@@ -124,38 +124,42 @@ def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
 def outlines(cells: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
     """Return the outlines of the black areas among cells (rows, columns), the upper row first.
 
-    Corners are x to the right and y up, counted in cells from the lower left one's; outer outlines
+    Corners are (x, y), x right and y up, in cells from the lower left corner. Outer outlines run
     counter-clockwise, those of holes clockwise.
     """
     black = {(int(x), int(y)) for y, x in np.argwhere(cells[::-1])}
-    ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    next_corners: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for x, y in sorted(black):
-        around = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
-        beside = [(x, y - 1), (x + 1, y), (x, y + 1), (x - 1, y)]
-        for side, other in enumerate(beside):
-            if other not in black:
-                ahead.setdefault(around[side], []).append(around[(side + 1) % 4])
+        cell_corners = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
+        neighbours = [(x, y - 1), (x + 1, y), (x, y + 1), (x - 1, y)]
+        for side, neighbour in enumerate(neighbours):
+            if neighbour not in black:
+                next_corners.setdefault(cell_corners[side], []).append(cell_corners[(side + 1) % 4])
     loops = []
-    while ahead:
-        start = place = next(iter(ahead))
+    while next_corners:
+        start = corner = next(iter(next_corners))
         loop = []
         while True:
-            ends = ahead[place]
-            following = ends.pop()
-            if not ends:
-                del ahead[place]
-            loop.append(place)
-            place = following
-            if place == start:
+            candidates = next_corners[corner]
+            next_corner = candidates.pop()
+            if not candidates:
+                del next_corners[corner]
+            loop.append(corner)
+            corner = next_corner
+            if corner == start:
                 break
-        loops.append(_corners(loop))
+        loops.append(_turning_points(loop))
     return loops
 
 
-def _corners(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the points of a loop at which it turns."""
-    around = zip([loop[-1], *loop[:-1]], loop, [*loop[1:], loop[0]], strict=True)
-    return [at for before, at, after in around if after[0] != before[0] and after[1] != before[1]]
+def _turning_points(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the points at which a loop changes its direction."""
+    triples = zip([loop[-1], *loop[:-1]], loop, [*loop[1:], loop[0]], strict=True)
+    return [
+        point
+        for previous, point, following in triples
+        if following[0] != previous[0] and following[1] != previous[1]
+    ]
 
 
 def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
@@ -171,27 +175,31 @@ def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
     return dots, Box(*low.tolist(), *high.tolist())
 
 
-def quartered(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return a disc around the origin with two black quarters, the first with a white dot.
+def origin_mark_shapes(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    """Return an origin mark: a disc with two black quarters, the first with a white dot.
 
-    The quarters meet in the point to touch; the dot distinguishes the sheet from a turned one.
+    The quarters meet in the point to touch; the dot shows how the sheet is turned.
     """
-    hole = 0.18 * radius
-    at = 0.6 * radius * math.sqrt(0.5)
-    shapes = (_pie(radius, 0), _pie(radius, 180), _circle((at, at), hole, clockwise=True))
+    dot_radius = 0.18 * radius
+    dot_offset = 0.6 * radius * math.sqrt(0.5)
+    shapes = (
+        _quarter_disc(radius, 0),
+        _quarter_disc(radius, 180),
+        _circle((dot_offset, dot_offset), dot_radius, clockwise=True),
+    )
     return shapes, Box(-radius, -radius, radius, radius)
 
 
-def _pie(radius: float, start: int) -> Polygon:
-    turns = [math.radians(start + degrees) for degrees in range(91)]
+def _quarter_disc(radius: float, start: int) -> Polygon:
+    angles = [math.radians(start + degrees) for degrees in range(91)]
     return Polygon(
-        ((0.0, 0.0), *((radius * math.cos(turn), radius * math.sin(turn)) for turn in turns))
+        ((0.0, 0.0), *((radius * math.cos(angle), radius * math.sin(angle)) for angle in angles))
     )
 
 
 def _circle(centre: Point, radius: float, *, clockwise: bool) -> Polygon:
-    turns = [math.radians(-degrees if clockwise else degrees) for degrees in range(0, 360, 3)]
+    angles = [math.radians(-degrees if clockwise else degrees) for degrees in range(0, 360, 3)]
     x, y = centre
     return Polygon(
-        tuple((x + radius * math.cos(turn), y + radius * math.sin(turn)) for turn in turns)
+        tuple((x + radius * math.cos(angle), y + radius * math.sin(angle)) for angle in angles)
     )

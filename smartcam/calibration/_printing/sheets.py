@@ -37,7 +37,12 @@ from smartcam.calibration._printing.page_layout import (
     RULER_MM,
     PageLayout,
 )
-from smartcam.calibration._printing.shapes import MM_PER_METRE, Box, ink, quartered
+from smartcam.calibration._printing.shapes import (
+    MM_PER_METRE,
+    Box,
+    origin_mark_shapes,
+    pattern_shapes,
+)
 from smartcam.calibration._targets import (
     Charuco,
     Checkerboard,
@@ -46,7 +51,7 @@ from smartcam.calibration._targets import (
     resized,
     target_from_data,
 )
-from smartcam.calibration._views import checked
+from smartcam.calibration._views import check_type
 from smartcam.geometry._inside import Code
 
 if TYPE_CHECKING:
@@ -75,12 +80,12 @@ MAX_PAGE_MM: Final = 3000.0
 MAX_SCALE_CHANGE: Final = 0.05
 """Largest deviation of a printer's scale, as a part of it."""
 
-MAX_UNEQUAL_SCALES: Final = 0.005
-"""Largest difference between the scales along x and y, as a part: about that of reading a ruler
-twice."""
+MAX_SCALE_DIFFERENCE: Final = 0.005
+"""Largest difference between the scales along x and y, as a part of them: about the error of
+reading a ruler twice."""
 
-DIGITS: Final = 9
-"""Digits of a length in metres: nanometres."""
+LENGTH_DIGITS: Final = 9
+"""Number of decimals of a length in metres: nanometres."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +102,8 @@ class Rays:
     diameter: float = 0.02
 
     def __post_init__(self) -> None:
-        number = isinstance(self.diameter, int | float) and not isinstance(self.diameter, bool)
-        if not (number and math.isfinite(self.diameter) and self.diameter > 0):
+        is_number = isinstance(self.diameter, int | float) and not isinstance(self.diameter, bool)
+        if not (is_number and math.isfinite(self.diameter) and self.diameter > 0):
             raise Code.SHAPE.refusal(
                 f"rays: expected diameter to be a length in metres, got {self.diameter!r}",
                 "metres",
@@ -131,12 +136,12 @@ class Sheet:
     @property
     def data(self) -> dict[str, Any]:
         """Description of the target, as JSON takes it."""
-        return _data(self.target)
+        return _description(self.target)
 
     @property
     def id(self) -> str:
         """Eight hexadecimal digits, printed on the sheet; the same for every page and format."""
-        return _identity(self.target)
+        return _sheet_id(self.target)
 
     @property
     def title(self) -> str:
@@ -171,49 +176,49 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
             is, or it has too few.
         MissingExtraError: a ChArUco target needs OpenCV.
     """
-    pattern, box = _pattern(target)
+    pattern, box = _shapes_of(target)
     width, height = page_size(page)
-    turns = [(width, height), (height, width)] if page in PAGES_MM else [(width, height)]
-    marked = isinstance(target, Checkerboard) and target.origin_mark
+    formats = [(width, height), (height, width)] if page in PAGES_MM else [(width, height)]
+    has_mark = isinstance(target, Checkerboard) and target.origin_mark
     pitch = _pitch(target)
     layouts = [
         PageLayout(
             box,
             pitch=pitch,
-            areas=AREA_REACH_SQUARES * pitch if marked else 0.0,
+            area_reach=AREA_REACH_SQUARES * pitch if has_mark else 0.0,
             texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER_MM)),
-            width=wide,
-            height=high,
+            width=format_width,
+            height=format_height,
         )
-        for wide, high in turns
+        for format_width, format_height in formats
     ]
     layout = min(layouts, key=lambda layout: layout.excess)
     if layout.excess > 0:
         raise _page_too_small_error(target, page, layout)
-    moved = (_moved(shape, *layout.origin) for shape in pattern)
+    moved_shapes = (_move_shape(shape, *layout.origin) for shape in pattern)
     return Sheet(
         target=target,
         width=layout.width,
         height=layout.height,
         origin=layout.origin,
-        shapes=(*moved, *layout.furniture()),
+        shapes=(*moved_shapes, *layout.extra_shapes()),
     )
 
 
 def _page_too_small_error(target: Target | Rays, page: str, layout: PageLayout) -> CalibrationError:
     needed = (layout.needed_width, layout.needed_height)
     size = (layout.width, layout.height)
-    over = [
-        f"{need - available:.1f} mm too {side}"
-        for need, available, side in zip(needed, size, ("wide", "high"), strict=True)
-        if need > available
+    excesses = [
+        f"{needed_side - available:.1f} mm too {side}"
+        for needed_side, available, side in zip(needed, size, ("wide", "high"), strict=True)
+        if needed_side > available
     ]
-    text = f"{size[0]:g} x {size[1]:g} mm"
-    named = f"{page} ({text})" if page in PAGES_MM else text
+    size_text = f"{size[0]:g} x {size[1]:g} mm"
+    page_text = f"{page} ({size_text})" if page in PAGES_MM else size_text
     return Code.PAGE_TOO_SMALL.refusal(
-        f"{_title(target).partition(': ')[2]}: does not fit on {named}: with rays, rulers and a "
-        f"border of {BORDER_MM:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
-        f"{' and '.join(over)}",
+        f"{_title(target).partition(': ')[2]}: does not fit on {page_text}: with rays, rulers and "
+        f"a border of {BORDER_MM:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
+        f"{' and '.join(excesses)}",
         needed,
         size,
     )
@@ -265,60 +270,60 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
                 RULER_MM,
                 RULER_MM * factor,
             )
-    if abs(factors[0] - factors[1]) > MAX_UNEQUAL_SCALES:
+    if abs(factors[0] - factors[1]) > MAX_SCALE_DIFFERENCE:
         raise Code.SCALE_MISMATCH.refusal(
-            f"rulers: expected the same length along x and y within {MAX_UNEQUAL_SCALES:.1%}, "
+            f"rulers: expected the same length along x and y within {MAX_SCALE_DIFFERENCE:.1%}, "
             f"got {measured_ruler[0]:g} and {measured_ruler[1]:g} mm; measure again, or print "
             "with another printer",
-            MAX_UNEQUAL_SCALES,
+            MAX_SCALE_DIFFERENCE,
             tuple(measured_ruler),
         )
-    return resized(target, sum(factors) / 2, DIGITS)
+    return resized(target, sum(factors) / 2, LENGTH_DIGITS)
 
 
 # ---------------------------------------------------------------------- texts
 
 
-def _data(target: Target | Rays) -> dict[str, Any]:
+def _description(target: Target | Rays) -> dict[str, Any]:
     return {"kind": target.kind, **dataclasses.asdict(target)}
 
 
-def _identity(target: Target | Rays) -> str:
-    text = json.dumps(_data(target), sort_keys=True)
+def _sheet_id(target: Target | Rays) -> str:
+    text = json.dumps(_description(target), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def _title(target: Target | Rays) -> str:
     match target:
         case Checkerboard():
-            marked = ", marked origin" if target.origin_mark else ""
-            about = (
+            mark_text = ", marked origin" if target.origin_mark else ""
+            description = (
                 f"checkerboard, {target.columns} x {target.rows} corners, "
-                f"squares of {_mm(target.square)}{marked}"
+                f"squares of {_mm(target.square)}{mark_text}"
             )
         case Charuco():
-            legacy = ", legacy pattern" if target.legacy_pattern else ""
-            about = (
+            legacy_text = ", legacy pattern" if target.legacy_pattern else ""
+            description = (
                 f"ChArUco, {target.columns} x {target.rows} squares of {_mm(target.square)}, "
-                f"markers of {_mm(target.marker)}, {target.dictionary}{legacy}"
+                f"markers of {_mm(target.marker)}, {target.dictionary}{legacy_text}"
             )
         case CircleGrid():
             kind = "asymmetric circles" if target.asymmetric else "circles"
             origin = target.origin_diameter
-            larger = "" if origin is None else f", origin {_mm(origin)}"
-            about = (
+            origin_text = "" if origin is None else f", origin {_mm(origin)}"
+            description = (
                 f"{kind}, {target.columns} x {target.rows}, {_mm(target.spacing)} apart, "
-                f"diameter {_mm(target.diameter)}{larger}"
+                f"diameter {_mm(target.diameter)}{origin_text}"
             )
         case MarkerGrid():
             kind = "AprilGrid of Kalibr" if target.kalibr else "grid of markers"
-            about = (
+            description = (
                 f"{kind}, {target.columns} x {target.rows} of {_mm(target.marker)}, "
                 f"{_mm(target.gap)} apart, {target.dictionary} from {target.first_id}"
             )
         case Rays():
-            about = f"rays A and B, origin mark of {_mm(target.diameter)}"
-    return f"smartcam sheet {_identity(target)}: {about}"
+            description = f"rays A and B, origin mark of {_mm(target.diameter)}"
+    return f"smartcam sheet {_sheet_id(target)}: {description}"
 
 
 ORIGINS: Final[Mapping[type[Target | Rays], str]] = {
@@ -341,11 +346,11 @@ def _mm(metres: float) -> str:
 # ---------------------------------------------------------------------- shapes
 
 
-def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    checked(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
+def _shapes_of(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
+    check_type(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
-        return quartered(MM_PER_METRE * target.diameter / 2)
-    return ink(target)
+        return origin_mark_shapes(MM_PER_METRE * target.diameter / 2)
+    return pattern_shapes(target)
 
 
 def _pitch(target: Target | Rays) -> float:
@@ -361,7 +366,7 @@ def _pitch(target: Target | Rays) -> float:
             return MM_PER_METRE * target.diameter
 
 
-def _moved(shape: Polygon | Disc, x: float, y: float) -> Shape:
+def _move_shape(shape: Polygon | Disc, x: float, y: float) -> Shape:
     if isinstance(shape, Polygon):
-        return Polygon(tuple((x + one, y + other) for one, other in shape.points))
+        return Polygon(tuple((x + px, y + py) for px, py in shape.points))
     return Disc((x + shape.centre[0], y + shape.centre[1]), shape.radius)

@@ -46,17 +46,18 @@ if TYPE_CHECKING:
     from smartcam.models import PoseSigma
 
 KIND = "sheet"
-"""Name of these calibrations' files in the store."""
+"""Kind of these calibrations, as their files name it."""
 
 MAX_UNEXPLAINED_PX = {True: 0.3, False: 0.1}
-"""Largest residual, pixels, beyond the points' noise without a remark. With a lens (True) it allows
-for errors of print, edges and lens; without a lens it is a tenth of usual distortion."""
+"""A larger residual in addition to the points' noise, pixels, is remarked on. With a lens (True)
+the limit allows for errors of print, edges and lens; without a lens it is a tenth of usual
+distortion."""
 
 ONE_SCALE_MODELS = frozenset({"rigid", "similarity", "touches"})
-"""Models of a plane that do not change the shape of a sheet."""
+"""Models of a plane that keep the shape of a sheet."""
 
 
-PLANE = storage.Form(
+PLANE_FORM = storage.Form(
     dict[str, Any],
     read=lambda data, _: PlaneCalibration.from_data(data),
     write=lambda plane: plane.to_data(),
@@ -99,7 +100,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     view: TargetView
     sheet: SheetPlane
-    plane: Annotated[PlaneCalibration, PLANE]
+    plane: Annotated[PlaneCalibration, PLANE_FORM]
     rms: storage.NonNegative
     lens_covariance: Annotated[Array, storage.matrix()] | None = None
     camera_frame: str | None = None
@@ -172,10 +173,10 @@ class SheetCalibration(storage.SavedCalibration):
 
     @cached_property
     def lens_planes(self) -> tuple[SheetPlane, ...]:
-        """Maps from pixels to the sheet, by lenses that are one standard deviation off.
+        """Maps from pixels to the sheet, for lenses with an error of one standard deviation each.
 
-        The errors of these lenses are independent, and their squares add up to ``lens_covariance``.
-        Each map has the sheet located anew by its lens, from the same view.
+        The errors of these lenses are independent; their outer products add up to
+        ``lens_covariance``. For each lens the sheet is located again, from the same view.
         """
         if self.camera is None or self.lens_covariance is None:
             return ()
@@ -235,17 +236,21 @@ class SheetCalibration(storage.SavedCalibration):
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
         """
         if isinstance(localizations, Localization):
-            return self._to_robot([localizations], tool_flip)[0]
-        return self._to_robot(list(localizations), tool_flip)
+            return self._map_localizations([localizations], tool_flip)[0]
+        return self._map_localizations(list(localizations), tool_flip)
 
-    def _to_robot(self, parts: list[Localization], flip: bool) -> list[Localization]:
+    def _map_localizations(self, parts: list[Localization], flip: bool) -> list[Localization]:
         check_frames(parts, self.camera_frame)
-        flat = self.sheet.solve(Poses.of(parts)).put(parts)
-        rows = [n for n, part in enumerate(parts) if part.pose.sigma is not None]
+        on_sheet = self.sheet.solve(Poses.of(parts)).put(parts)
+        rows = [index for index, part in enumerate(parts) if part.pose.sigma is not None]
         if rows and self.plane.touch_sigma is not None:
-            for n, sigma in zip(rows, self._sigmas([parts[n] for n in rows]), strict=True):
-                flat[n] = flat[n]._replace(pose=flat[n].pose.with_sigma(sigma))
-        return self.plane.to_robot(flat, tool_flip=flip)
+            for index, sigma in zip(
+                rows, self._sigmas([parts[index] for index in rows]), strict=True
+            ):
+                on_sheet[index] = on_sheet[index]._replace(
+                    pose=on_sheet[index].pose.with_sigma(sigma)
+                )
+        return self.plane.to_robot(on_sheet, tool_flip=flip)
 
     def _sigmas(self, parts: list[Localization]) -> list[PoseSigma]:
         """Return the sigmas of poses on the sheet: errors of localizations, view and lens."""
@@ -256,18 +261,18 @@ class SheetCalibration(storage.SavedCalibration):
             flat = self.sheet.near_sheet(points * y_up)
             return np.column_stack([flat, np.zeros(len(flat))])
 
-        def slopes(points: Array) -> Array:
+        def parameter_slopes(points: Array) -> Array:
             flat = self.sheet.near_sheet(points * y_up)
-            rows = np.zeros((len(flat), 3, 9 + len(lenses)))
-            rows[:, :2, :9] = self.sheet.element_slopes(flat)
-            for number, lens in enumerate(lenses, start=9):
-                rows[:, :2, number] = lens.near_sheet(points * y_up) - flat
-            return rows
+            slopes = np.zeros((len(flat), 3, 9 + len(lenses)))
+            slopes[:, :2, :9] = self.sheet.element_slopes(flat)
+            for column, lens in enumerate(lenses, start=9):
+                slopes[:, :2, column] = lens.near_sheet(points * y_up) - flat
+            return slopes
 
         covariance = np.eye(9 + len(lenses))
         covariance[:9, :9] = self.sheet.covariance
         normal, size = np.array([0.0, 0.0, 1.0]), float(max(self.sheet.size))
-        return robot_sigmas(parts, on_sheet, normal, slopes, covariance, size, flip=False)
+        return robot_sigmas(parts, on_sheet, normal, parameter_slopes, covariance, size, flip=False)
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
         """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
@@ -283,15 +288,15 @@ class SheetCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: as :meth:`transform`; UNVERIFIED: the touches' sigma is not known.
         """
-        flat = self.sheet.on_sheet(pixels)
+        sheet_points = self.sheet.on_sheet(pixels)
         # to first order: D C D^T with the map's derivative D
-        slopes = derivatives(self.plane.matrix, flat)
-        on_sheet = self.sheet.covariance_at(pixels)
+        slopes = derivatives(self.plane.matrix, sheet_points)
+        sheet_covariance = self.sheet.covariance_at(pixels)
         for plane in self.lens_planes:
-            deviation = plane.on_sheet(pixels) - flat
-            on_sheet = on_sheet + deviation[:, :, None] * deviation[:, None, :]
-        seen = slopes @ on_sheet @ slopes.swapaxes(1, 2)
-        covariance: Array = self.plane.covariance_at(flat) + seen
+            deviation = plane.on_sheet(pixels) - sheet_points
+            sheet_covariance = sheet_covariance + deviation[:, :, None] * deviation[:, None, :]
+        camera_part = slopes @ sheet_covariance @ slopes.swapaxes(1, 2)
+        covariance: Array = self.plane.covariance_at(sheet_points) + camera_part
         return covariance
 
     def predicted_error(self, pixels: ArrayLike) -> Array:
@@ -355,11 +360,11 @@ def calibrate_sheet(
             )
         )
     if fit.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
-        whose = "the lens distorts" if camera is None else "the lens is another one"
+        cause = "the lens distorts" if camera is None else "the lens is another one"
         remarks.append(
             Code.POOR_FIT.remark(
                 f"the target's points lie {fit.rms:.2g} px beside a plane, of which noise does "
-                f"not explain {fit.unexplained:.2g} px: {whose}, or the sheet is not flat"
+                f"not explain {fit.unexplained:.2g} px: {cause}, or the sheet is not flat"
             )
         )
     return SheetCalibration(
@@ -393,7 +398,7 @@ def fit_corners(
 
     A sheet that lies flat keeps its shape. If touches do not fit that shape, a warning says so
     (NOT_SIMILAR), and the shape is kept. If the scale is not the target's, a warning says so, too
-    (SCALE_MISMATCH), and the touches' scale is used: the printed rulers were not measured right.
+    (SCALE_MISMATCH), and the touches' scale is used: the print was not measured correctly.
 
     Args:
         target: target with its lengths as they are on paper.
@@ -410,19 +415,19 @@ def fit_corners(
         CalibrationError: SHAPE: the target has no point of that number; SCALE_MISMATCH: the scale
             is off by more than a tenth; and those of :func:`~smartcam.calibration.fit_plane`.
     """
-    points = target.points[:, :2]
-    wrong = [ident for ident in ids if not 0 <= ident < len(points)]
-    if wrong:
+    target_points = target.points[:, :2]
+    unknown_ids = [point_id for point_id in ids if not 0 <= point_id < len(target_points)]
+    if unknown_ids:
         raise Code.SHAPE.unexpected(
-            f"touched points: expected numbers from 0 to {len(points) - 1}",
-            len(points) - 1,
-            wrong[0],
+            f"touched points: expected numbers from 0 to {len(target_points) - 1}",
+            len(target_points) - 1,
+            unknown_ids[0],
         )
-    seen = points[np.asarray(ids, dtype=np.intp)]
+    sheet_points = target_points[np.asarray(ids, dtype=np.intp)]
 
-    def fitted(model: Any) -> PlaneCalibration:
+    def fit_model(model: Any) -> PlaneCalibration:
         return fit_plane(
-            seen,
+            sheet_points,
             touches,
             model=model,
             touch_sigma=touch_sigma,
@@ -432,5 +437,5 @@ def fit_corners(
             robot_frame=robot_frame,
         )
 
-    plane = fitted("auto")
-    return plane if plane.model in ONE_SCALE_MODELS else fitted("similarity")
+    plane = fit_model("auto")
+    return plane if plane.model in ONE_SCALE_MODELS else fit_model("similarity")

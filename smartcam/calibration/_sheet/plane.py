@@ -1,9 +1,9 @@
 """Map pixels to the metres of a sheet in front of a camera.
 
-With a lens, pixels are corrected for its distortion, and their rays are cut with the plane where
-the target was located. Without a lens, a homography is fitted to all points of the target: it is
-right for any tilt, but does not correct distortion, whose error is least between the points and
-larger outside of them.
+With a lens, pixels are corrected for its distortion, and their rays are intersected with the plane
+in which the target was located. Without a lens, a homography is fitted to all points of the target:
+it is right for any tilt, but does not correct distortion, whose error is least between the points
+and larger outside of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from smartcam.calibration._homography import (
 )
 from smartcam.calibration._least_squares import inverse_scaled, unit_diagonal
 from smartcam.calibration._lens.poses import check_view, locate
-from smartcam.calibration._lens.projection import excess, whitening
+from smartcam.calibration._lens.projection import excess_variance, whitening
 from smartcam.calibration._solvers import Poses
 from smartcam.geometry._inside import (
     Code,
@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 MAX_STEPS = 20
 """The fit of the homography takes at most this many steps; it usually takes 2 or 3."""
 
-SETTLED_SIGMAS = 1e-6
+MAX_FINAL_STEP_SIGMAS = 1e-6
 """The fit ends when a step changes each element of the homography by less than this part of its
-standard deviation for fixed others; the next step would change it a million times less."""
+standard deviation (the others being fixed); the next step would be a million times smaller."""
 
 DIRECTION_STEP_PX = 0.5
-"""The direction of a point on the sheet is computed from points this many pixels to both sides."""
+"""A direction on the sheet is computed from points this many pixels ahead and behind."""
 
 
 class SheetPlane:
@@ -79,7 +79,7 @@ class SheetPlane:
         self.matrix: Array = np.array(matrix, dtype=np.float64).reshape(3, 3)
         self.covariance: Array = np.array(covariance, dtype=np.float64).reshape(9, 9)
         self.camera: CameraModel | None = camera
-        self._back = _inverse(self.matrix)
+        self._inverse_matrix = _invert_matrix(self.matrix)
 
     def on_sheet(self, pixels: ArrayLike) -> Array:
         """Map pixels (N, 2), v down, to the sheet (N, 2), metres.
@@ -88,20 +88,20 @@ class SheetPlane:
             CalibrationError: SHAPE or NOT_FINITE; OUT_OF_FIELD: outside of the image, or behind the
                 sheet's horizon.
         """
-        given = self._checked_pixels(pixels)
-        return self._mapped(self._straight(given), given)
+        pixel_array = self._check_pixels(pixels)
+        return self._map_to_sheet(self._undistort(pixel_array), pixel_array)
 
     def in_image(self, points: ArrayLike) -> Array:
         """Map points (N, 2) of the sheet, metres, to pixels (N, 2), v down.
 
         NaN for points behind the camera.
         """
-        flat = as_points(points, 2, "points of the sheet")
-        mapped = flat @ self.matrix[:, :2].T + self.matrix[:, 2]
+        sheet_points = as_points(points, 2, "points of the sheet")
+        homogeneous = sheet_points @ self.matrix[:, :2].T + self.matrix[:, 2]
         if self.camera is not None:
-            return self.camera.project(mapped)
-        mapped[mapped[:, 2] <= 0] = np.nan
-        pixels: Array = mapped[:, :2] / mapped[:, 2:]
+            return self.camera.project(homogeneous)
+        homogeneous[homogeneous[:, 2] <= 0] = np.nan
+        pixels: Array = homogeneous[:, :2] / homogeneous[:, 2:]
         return pixels
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
@@ -110,24 +110,24 @@ class SheetPlane:
         Raises:
             CalibrationError: as :meth:`on_sheet`.
         """
-        moves = self.element_slopes(self.on_sheet(pixels))
-        covariance: Array = moves @ self.covariance @ moves.swapaxes(1, 2)
+        by_elements = self.element_slopes(self.on_sheet(pixels))
+        covariance: Array = by_elements @ self.covariance @ by_elements.swapaxes(1, 2)
         return covariance
 
-    def element_slopes(self, flat: Array) -> Array:
+    def element_slopes(self, sheet_points: Array) -> Array:
         """Return the derivatives (N, 2, 9) of points (N, 2) of the sheet by the matrix' elements.
 
         Each pixel stays fixed.
         """
         # The pixel does not change: 0 = D dx + E dm, with the derivatives D by the point and E by
         # the elements, so dx = -D^-1 E dm.
-        by_elements = element_derivatives(self.matrix, flat)
-        moves = np.linalg.solve(derivatives(self.matrix, flat), by_elements)
-        return np.asarray(-moves, dtype=np.float64)
+        by_elements = element_derivatives(self.matrix, sheet_points)
+        slopes = np.linalg.solve(derivatives(self.matrix, sheet_points), by_elements)
+        return np.asarray(-slopes, dtype=np.float64)
 
     def near_sheet(self, pixels: Array) -> Array:
-        """Map pixels (N, 2), v down, as :meth:`on_sheet`, some beside the image, too."""
-        return self._mapped(self._straight(pixels), pixels)
+        """Map pixels (N, 2), v down, as :meth:`on_sheet`, but also pixels outside of the image."""
+        return self._map_to_sheet(self._undistort(pixels), pixels)
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses on the sheet.
@@ -142,59 +142,62 @@ class SheetPlane:
                 "sheet: expected poses in the image, turned about its z only, got some with a "
                 "height or a tilt"
             )
-        pixels = self._checked_pixels(poses.points[:, :2] * [1.0, -1.0])
-        ahead = np.column_stack([w * w - z * z, -2.0 * z * w])
-        middles, ends, starts = (
-            self._mapped(self._straight(at), at)
-            for at in (
+        pixels = self._check_pixels(poses.points[:, :2] * [1.0, -1.0])
+        headings = np.column_stack([w * w - z * z, -2.0 * z * w])
+        points, ends, starts = (
+            self._map_to_sheet(self._undistort(shifted_pixels), shifted_pixels)
+            for shifted_pixels in (
                 pixels,
-                pixels + DIRECTION_STEP_PX * ahead,
-                pixels - DIRECTION_STEP_PX * ahead,
+                pixels + DIRECTION_STEP_PX * headings,
+                pixels - DIRECTION_STEP_PX * headings,
             )
         )
         directions = ends - starts
         return Poses(
-            np.column_stack([middles, np.zeros(len(middles))]),
+            np.column_stack([points, np.zeros(len(points))]),
             quaternion_about_z(np.arctan2(directions[:, 1], directions[:, 0])),
         )
 
-    def _checked_pixels(self, pixels: ArrayLike) -> Array:
-        given = as_points(pixels, 2, "pixels")
+    def _check_pixels(self, pixels: ArrayLike) -> Array:
+        pixel_array = as_points(pixels, 2, "pixels")
         width, height = self.size
-        outside = (
-            (given < -DIRECTION_STEP_PX)
-            | (given > [width - DIRECTION_STEP_PX, height - DIRECTION_STEP_PX])
+        is_outside = (
+            (pixel_array < -DIRECTION_STEP_PX)
+            | (pixel_array > [width - DIRECTION_STEP_PX, height - DIRECTION_STEP_PX])
         ).any(axis=1)
-        if outside.any():
-            at = given[int(np.argmax(outside))].tolist()
+        if is_outside.any():
+            pixel = pixel_array[int(np.argmax(is_outside))].tolist()
             raise Code.OUT_OF_FIELD.unexpected(
-                f"sheet: expected pixels of an image of {width} x {height}, v down", self.size, at
+                f"sheet: expected pixels of an image of {width} x {height}, v down",
+                self.size,
+                pixel,
             )
-        return given
+        return pixel_array
 
-    def _straight(self, pixels: Array) -> Array:
+    def _undistort(self, pixels: Array) -> Array:
         return pixels if self.camera is None else self.camera.directions(pixels)
 
-    def _mapped(self, straight: Array, pixels: Array) -> Array:
-        mapped = straight @ self._back[:, :2].T + self._back[:, 2]
-        if not (mapped[:, 2] > 0).all():
-            at = pixels[int(np.argmin(mapped[:, 2]))].tolist()
+    def _map_to_sheet(self, undistorted: Array, pixels: Array) -> Array:
+        homogeneous = undistorted @ self._inverse_matrix[:, :2].T + self._inverse_matrix[:, 2]
+        if not (homogeneous[:, 2] > 0).all():
+            pixel = pixels[int(np.argmin(homogeneous[:, 2]))].tolist()
             raise Code.OUT_OF_FIELD.refusal(
-                f"sheet: expected pixels that show its plane, got {at}: behind its horizon", got=at
+                f"sheet: expected pixels that show its plane, got {pixel}: behind its horizon",
+                got=pixel,
             )
         with np.errstate(all="ignore"):
-            flat: Array = mapped[:, :2] / mapped[:, 2:]
-        check_finite(flat, "sheet: points")
-        return flat
+            points: Array = homogeneous[:, :2] / homogeneous[:, 2:]
+        check_finite(points, "sheet: points")
+        return points
 
 
-def _inverse(matrix: Array) -> Array:
+def _invert_matrix(matrix: Array) -> Array:
     try:
-        back = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     except np.linalg.LinAlgError as exc:
         raise not_finite("sheet's matrix", matrix.tolist()) from exc
-    check_finite(back, "sheet's matrix")
-    return back
+    check_finite(inverse, "sheet's matrix")
+    return inverse
 
 
 class PlaneView(NamedTuple):
@@ -203,7 +206,7 @@ class PlaneView(NamedTuple):
     plane: SheetPlane
     # standard deviation of a coordinate of the target's points from their predicted places, pixels
     rms: float
-    # the part of it that the view's own noise does not explain, pixels; 0 if noise explains all
+    # part of ``rms`` that the noise of the view's points does not explain, pixels; 0 if it does
     unexplained: float
 
 
@@ -215,14 +218,14 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     Raises as :func:`~smartcam.calibration.locate`.
     """
     check_view(view, view.size if camera is None else camera.size)
-    flat = view.object_points[:, :2]
-    start = fit_homography(flat, view.points)
+    sheet_points = view.object_points[:, :2]
+    start = fit_homography(sheet_points, view.points)
     if start is None or not math.isfinite(float(np.abs(start).sum())):
         raise _no_fit_error(view)
     if camera is None:
-        return _by_homography(view, start)
+        return _fit_without_lens(view, start)
     pose = locate(view, camera)
-    more = excess(pose.residuals, view.covariance, 2 * len(flat) - 6)
+    extra_variance = excess_variance(pose.residuals, view.covariance, 2 * len(sheet_points) - 6)
     rotation, shift = pose.transform.rotation, pose.transform.translation
     first, second = rotation[:, 0], rotation[:, 1]
     # The matrix is (r1 r2 t) of T_camera_target. Its columns move with the pose's turn w by
@@ -230,41 +233,45 @@ def look_at_sheet(view: TargetView, camera: CameraModel | None = None) -> PlaneV
     by_pose = np.zeros((3, 3, 6))  # derivatives of rows, columns of the matrix, by turn and shift
     by_pose[:, 0, :3], by_pose[:, 1, :3] = -cross_matrix(first), -cross_matrix(second)
     by_pose[:, 2, 3:] = np.eye(3)
-    moved = by_pose.reshape(9, 6)
+    by_pose_rows = by_pose.reshape(9, 6)
     matrix = np.column_stack([first, second, shift])
     return PlaneView(
-        SheetPlane(view.size, matrix, moved @ pose.covariance @ moved.T, camera),
+        SheetPlane(view.size, matrix, by_pose_rows @ pose.covariance @ by_pose_rows.T, camera),
         pose.rms,
-        math.sqrt(more),
+        math.sqrt(extra_variance),
     )
 
 
-def _by_homography(view: TargetView, start: Array) -> PlaneView:
-    """Return the map by the most likely homography of a view."""
-    flat, pixels = view.object_points[:, :2], view.points
-    freedom = 2 * len(flat) - 8
+def _fit_without_lens(view: TargetView, start: Array) -> PlaneView:
+    """Return the map by the most likely homography to a view's pixels."""
+    sheet_points, pixels = view.object_points[:, :2], view.points
+    freedom = 2 * len(sheet_points) - 8
     if freedom <= 0:
         raise Code.TOO_FEW.unexpected(
-            "sheet: expected 5 points or more without a lens", 5, len(flat)
+            "sheet: expected 5 points or more without a lens", 5, len(sheet_points)
         )
-    to_flat = _scaling(flat)
-    source = apply_homography(to_flat, flat)
-    first = start @ np.linalg.inv(to_flat)
-    matrix, covariance = _fitted(first / first[2, 2], source, pixels, view.covariance)
+    normalizing = _normalizing_matrix(sheet_points)
+    source = apply_homography(normalizing, sheet_points)
+    start_matrix = start @ np.linalg.inv(normalizing)
+    matrix, covariance = _fit_homography(
+        start_matrix / start_matrix[2, 2], source, pixels, view.covariance
+    )
     residuals = pixels - apply_homography(matrix, source)
-    more = excess(residuals, view.covariance, freedom)
-    if more:
-        noise = view.covariance + more * np.eye(2)
-        matrix, covariance = _fitted(matrix, source, pixels, noise)
+    extra_variance = excess_variance(residuals, view.covariance, freedom)
+    if extra_variance:
+        noise = view.covariance + extra_variance * np.eye(2)
+        matrix, covariance = _fit_homography(matrix, source, pixels, noise)
         residuals = pixels - apply_homography(matrix, source)
     # Row by row the elements of M T are (I x T^T) times those of M (Kronecker's product).
-    outward = np.kron(np.eye(3), to_flat.T)
-    plane = SheetPlane(view.size, matrix @ to_flat, outward @ covariance @ outward.T)
+    to_original = np.kron(np.eye(3), normalizing.T)
+    plane = SheetPlane(view.size, matrix @ normalizing, to_original @ covariance @ to_original.T)
     rms = math.sqrt(float((residuals**2).sum()) / freedom)
-    return PlaneView(plane, rms, math.sqrt(more))
+    return PlaneView(plane, rms, math.sqrt(extra_variance))
 
 
-def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[Array, Array]:
+def _fit_homography(
+    matrix: Array, source: Array, pixels: Array, noise: Array
+) -> tuple[Array, Array]:
     """Return the homography and the covariance of its elements (9, 9); the last element is 1."""
     # Gauss and Newton's steps. From the linear solution, the second or third is the last; with 54
     # points they take 1.8 ms, SciPy's least_squares 2.2 ms (measured), in no fewer lines.
@@ -275,21 +282,21 @@ def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal, jacobian.T @ residuals.ravel())
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
-        if (np.abs(step) * unit_diagonal(normal)).max() < SETTLED_SIGMAS:
+        if (np.abs(step) * unit_diagonal(normal)).max() < MAX_FINAL_STEP_SIGMAS:
             break
     covariance = np.zeros((9, 9))
     covariance[:8, :8] = inverse_scaled(normal)
     return matrix, covariance
 
 
-def _scaling(points: Array) -> Array:
+def _normalizing_matrix(points: Array) -> Array:
     """Return the matrix (3, 3) that centres points, and scales them to distances of about 1."""
     # With the sheet's centre at the origin, the last element is the depth there, which is not 0, so
     # it can be set to 1; and the equations are well conditioned. Source: Hartley and Zisserman,
     # Multiple View Geometry, 2nd edition, section 4.4.4.
-    middle = points.mean(axis=0)
-    factor = 1.0 / math.sqrt(float(((points - middle) ** 2).sum(axis=1).mean()))
-    return np.array([[factor, 0, -factor * middle[0]], [0, factor, -factor * middle[1]], [0, 0, 1]])
+    centre = points.mean(axis=0)
+    factor = 1.0 / math.sqrt(float(((points - centre) ** 2).sum(axis=1).mean()))
+    return np.array([[factor, 0, -factor * centre[0]], [0, factor, -factor * centre[1]], [0, 0, 1]])
 
 
 def _no_fit_error(view: TargetView) -> CalibrationError:

@@ -1,4 +1,4 @@
-"""Calibrate two cameras that look at the same place: the pose of one in the other's frame."""
+"""Calibrate two cameras that look at the same place, and the pose of one in the other's frame."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from smartcam.calibration._lens.intrinsics import (
     worst_view,
 )
 from smartcam.calibration._lens.poses import TARGET, check_view, half_turned
-from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
+from smartcam.calibration._lens.sheet_shape import SheetOption, choose_shape
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._stereo import triangulation
-from smartcam.calibration._stereo.checks import check_fit, check_pairs, examined, remark_sides
+from smartcam.calibration._stereo.checks import check_fit, check_pairs, examine_pairs, side_remarks
 from smartcam.calibration._stereo.errors import PairErrors, pair_errors
 from smartcam.calibration._stereo.rectification import Rectification, rectify
 from smartcam.calibration._stereo.start import (
@@ -35,10 +35,10 @@ from smartcam.calibration._stereo.start import (
     Lenses,
     Moment,
     as_moments,
-    start,
+    guess_start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView, as_covariances, as_list, label
+from smartcam.calibration._views import TargetView, as_covariances, as_list, view_name
 from smartcam.geometry import CameraModel, Transform
 from smartcam.geometry._inside import Array, Code, Remark, as_points, check_choice
 
@@ -73,8 +73,8 @@ class PairFit(storage.Stored):
         held_out: RMS error of the distances between neighbouring points, as triangulated by cameras
             that were fitted without this pair, metres; NaN if a view is missing or bad, or if there
             are too few pairs.
-        epipolar: RMS distance from the epipolar lines of the same cameras, pixels; NaN as for
-            ``held_out``.
+        epipolar: RMS distance of the points from their epipolar lines, pixels, for the same cameras
+            as ``held_out``; NaN if ``held_out`` is.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -108,8 +108,8 @@ class StereoCalibration(storage.SavedCalibration):
         held_out: held-out error: RMS error, metres, of the distances between neighbouring points of
             the target, as triangulated by cameras that were fitted without the pair, over all
             pairs. NaN if there were too few pairs.
-        held_out_epipolar: RMS distance from the epipolar lines of cameras fitted without the pair,
-            pixels.
+        held_out_epipolar: RMS distance from the epipolar lines, pixels, of cameras that were
+            fitted without the pair.
         sheet: (T, 3), offsets of the target's points from their nominal places, metres; None
             if they are taken as exact.
         warnings: remarks to read before using the calibration.
@@ -118,7 +118,7 @@ class StereoCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = "stereo"
     _called: ClassVar[str] = "calibration of cameras"
     _extra_keys: ClassVar[storage.ExtraKeys] = {
-        "target": (storage.StoredTarget, lambda calibration: _target(calibration))
+        "target": (storage.StoredTarget, lambda calibration: _first_target(calibration))
     }
 
     left: CameraModel
@@ -138,7 +138,7 @@ class StereoCalibration(storage.SavedCalibration):
     def bad_views(self) -> tuple[str, ...]:
         """Names of the views that were left out."""
         return tuple(
-            label(view, number)
+            view_name(view, number)
             for number, pair in enumerate(self.pairs)
             for view, used in zip((pair.left, pair.right), pair.used, strict=True)
             if view is not None and not used
@@ -169,10 +169,10 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        pixels = self._pixels(left_pixels, right_pixels)
+        pixels = self._as_pixels(left_pixels, right_pixels)
         covariance = tuple(
-            _covariances(given, len(pixels[0]), side)
-            for given, side in zip((left_covariance, right_covariance), SIDES, strict=True)
+            _pixel_covariances(covariance, len(pixels[0]), side)
+            for covariance, side in zip((left_covariance, right_covariance), SIDES, strict=True)
         )
         both = covariance[0], covariance[1]
         return triangulation.triangulate(self._cameras, pixels, both).points
@@ -191,15 +191,18 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        given = as_points(points, 3, "points before the cameras")
+        all_points = as_points(points, 3, "points before the cameras")
         sigma = self.rms if pixel_sigma is None else pixel_sigma
-        seen = self.left.project(given), self.right.project(self.transform.apply(given))
-        known = np.isfinite(seen[0]).all(axis=1) & np.isfinite(seen[1]).all(axis=1)
-        each = np.tile(sigma**2 * np.eye(2), (int(known.sum()), 1, 1))
-        covariances = np.full((len(given), 3, 3), np.nan)
-        pixels = seen[0][known], seen[1][known]
-        covariances[known] = triangulation.triangulate(
-            self._cameras, pixels, (each, each)
+        projected = (
+            self.left.project(all_points),
+            self.right.project(self.transform.apply(all_points)),
+        )
+        is_seen = np.isfinite(projected[0]).all(axis=1) & np.isfinite(projected[1]).all(axis=1)
+        pixel_covariance = np.tile(sigma**2 * np.eye(2), (int(is_seen.sum()), 1, 1))
+        covariances = np.full((len(all_points), 3, 3), np.nan)
+        pixels = projected[0][is_seen], projected[1][is_seen]
+        covariances[is_seen] = triangulation.triangulate(
+            self._cameras, pixels, (pixel_covariance, pixel_covariance)
         ).covariance
         return covariances
 
@@ -216,7 +219,7 @@ class StereoCalibration(storage.SavedCalibration):
         Raises:
             CalibrationError: ``SHAPE`` or ``NOT_FINITE``.
         """
-        pixels = self._pixels(left_pixels, right_pixels)
+        pixels = self._as_pixels(left_pixels, right_pixels)
         return triangulation.epipolar_distances(self._cameras, pixels)
 
     def point_errors(
@@ -246,15 +249,15 @@ class StereoCalibration(storage.SavedCalibration):
             for moment in moments:
                 if (view := moment[side]) is not None:
                     check_view(view, camera.size)
-        return tuple(self._errors(*moment) for moment in moments)
+        return tuple(self._view_errors(*moment) for moment in moments)
 
-    def _errors(self, left: TargetView | None, right: TargetView | None) -> PairErrors:
+    def _view_errors(self, left: TargetView | None, right: TargetView | None) -> PairErrors:
         if left is None or right is None:
             return PairErrors(np.zeros(0), np.zeros((0, 2)))
-        ways = [right]
+        numberings = [right]
         if right.target.half_turn_symmetric:
-            ways.append(half_turned(right))
-        errors = [pair_errors(self._cameras, left, view) for view in ways]
+            numberings.append(half_turned(right))
+        errors = [pair_errors(self._cameras, left, view) for view in numberings]
         return min(errors, key=lambda errors_of_pair: _rms([errors_of_pair.epipolar]))
 
     def rectify(self, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Rectification:
@@ -274,7 +277,7 @@ class StereoCalibration(storage.SavedCalibration):
     def _cameras(self) -> CameraPair:
         return CameraPair(self.left, self.right, self.transform)
 
-    def _pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
+    def _as_pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
         first, second = as_points(left, 2, "left pixels"), as_points(right, 2, "right pixels")
         if len(first) != len(second):
             raise Code.SHAPE.refusal(
@@ -290,7 +293,7 @@ class StereoCalibration(storage.SavedCalibration):
             storage.check_shape(self.sheet, fields["target"].points.shape, called, "sheet")
 
 
-def _target(calibration: StereoCalibration) -> Target:
+def _first_target(calibration: StereoCalibration) -> Target:
     pairs = calibration.pairs
     return next(view.target for pair in pairs for view in (pair.left, pair.right) if view)
 
@@ -312,7 +315,7 @@ def calibrate_stereo(
     right: CameraModel | None = None,
     distortion_model: DistortionModel = "plumb_bob",
     fixed: Iterable[str] = (),
-    sheet: Sheet = "auto",
+    sheet: SheetOption = "auto",
     drop_bad: bool = True,
 ) -> StereoCalibration:
     """Calibrate both lenses and the pose of the left camera in the right one's frame.
@@ -348,31 +351,35 @@ def calibrate_stereo(
     """
     moments = as_moments(left_views, right_views)
     check_pairs(moments, (left, right))
-    check_choice(sheet, get_args(Sheet), "sheet")
-    least = MIN_PAIRS if left and right else MIN_VIEWS
-    both = [number for number, moment in enumerate(moments) if None not in moment]
-    if len(both) < least:
+    check_choice(sheet, get_args(SheetOption), "sheet")
+    min_pairs = MIN_PAIRS if left and right else MIN_VIEWS
+    complete = [number for number, moment in enumerate(moments) if None not in moment]
+    if len(complete) < min_pairs:
         raise Code.TOO_FEW.unexpected(
-            f"stereo: expected {least} pairs or more in which both cameras see the target",
-            least,
-            len(both),
+            f"stereo: expected {min_pairs} pairs or more in which both cameras see the target",
+            min_pairs,
+            len(complete),
         )
     lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
-    moments, bundle, apart = start(moments, lenses)
+    moments, bundle, mismatched = guess_start(moments, lenses)
     sights = [
         Sight(side, number, view)
         for number, moment in enumerate(moments)
         for side, view in enumerate(moment)
         if view is not None
     ]
-    most, bad = MAX_BAD_VIEW_SHARE * len(sights), list[Sight]()
-    bad += [sight for sight in sights if sight.camera == 1 and sight.pose in apart]
-    good = [sight for sight in sights if sight not in bad]
-    if drop_bad and len(bad) <= MAX_BAD_VIEW_SHARE * len(both) and len(_pairs(good)) >= least:
-        sights = good
+    max_bad, bad = MAX_BAD_VIEW_SHARE * len(sights), list[Sight]()
+    bad += [sight for sight in sights if sight.camera == 1 and sight.pose in mismatched]
+    others = [sight for sight in sights if sight not in bad]
+    if (
+        drop_bad
+        and len(bad) <= MAX_BAD_VIEW_SHARE * len(complete)
+        and len(_complete_pairs(others)) >= min_pairs
+    ):
+        sights = others
     while True:
         adjusted = adjust_weighted(bundle, sights)
-        if not math.isfinite(adjusted.weighted):
+        if not math.isfinite(adjusted.weighted_squares):
             raise Code.POOR_FIT.refusal(
                 "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
@@ -381,11 +388,11 @@ def calibrate_stereo(
             break
         if sights[worst] not in bad:
             bad.append(sights[worst])
-        good = sights[:worst] + sights[worst + 1 :]
-        if not drop_bad or len(bad) > most or len(_pairs(good)) < least:
+        others = sights[:worst] + sights[worst + 1 :]
+        if not drop_bad or len(bad) > max_bad or len(_complete_pairs(others)) < min_pairs:
             break
-        sights, bundle = good, adjusted.bundle
-    again = functools.partial(
+        sights, bundle = others, adjusted.bundle
+    recalibrate = functools.partial(
         calibrate_stereo,
         left=left,
         right=right,
@@ -394,25 +401,28 @@ def calibrate_stereo(
         sheet=sheet,
         drop_bad=drop_bad,
     )
-    calibration = _summary(_Found(moments, sights, bad, adjusted, least, apart), sheet)
-    return examined(calibration, again, known=(left, right), drop=drop_bad)
+    calibration = _build_calibration(
+        _StereoSolution(moments, sights, bad, adjusted, min_pairs, mismatched), sheet
+    )
+    return examine_pairs(calibration, recalibrate, known=(left, right), drop_strays=drop_bad)
 
 
-def _pairs(sights: Sequence[Sight]) -> list[int]:
+def _complete_pairs(sights: Sequence[Sight]) -> list[int]:
     """Return the indices of the moments at which both cameras see the target."""
     sides = [{sight.pose for sight in sights if sight.camera == side} for side in range(2)]
     return sorted(sides[0] & sides[1])
 
 
-class _Found(NamedTuple):
-    """Results that the summary is made from."""
+class _StereoSolution(NamedTuple):
+    """The fit from which a calibration is built."""
 
     moments: list[Moment]  # all views, the right ones numbered as the left ones
     sights: list[Sight]  # used views
     bad: list[Sight]  # views that fit badly, whether used or not
     adjusted: AdjustedBundle  # fitted cameras
-    least: int  # number of pairs that are needed
-    apart: Mapping[int, float]  # as in :class:`~smartcam.calibration._stereo.start.FirstGuess`
+    min_pairs: int  # number of pairs that are needed
+    # moments whose views do not belong together, as in :class:`FirstGuess`
+    mismatched: Mapping[int, float]
 
     def pair(self, number: int) -> tuple[TargetView, TargetView]:
         """Return the views of a moment that both cameras see."""
@@ -422,52 +432,63 @@ class _Found(NamedTuple):
         return left, right
 
 
-def _held_out(solution: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
-    """Return the errors of each pair with cameras that were fitted without it."""
-    pairs = _pairs(solution.sights)
-    if len(pairs) <= solution.least:
+def _held_out_errors(
+    solution: _StereoSolution, left_out: Sequence[LeftOut]
+) -> dict[int, PairErrors]:
+    """Return the errors of each pair, with cameras that were fitted without this pair."""
+    pairs = _complete_pairs(solution.sights)
+    if len(pairs) <= solution.min_pairs:
         return {}
     return {
-        fit.pose: pair_errors(_cameras(fit.bundle), *solution.pair(fit.pose))
+        fit.pose: pair_errors(_camera_pair(fit.bundle), *solution.pair(fit.pose))
         for fit in left_out
         if fit.pose in pairs
     }
 
 
-def _cameras(bundle: Bundle) -> CameraPair:
+def _camera_pair(bundle: Bundle) -> CameraPair:
     left, right = bundle.cameras
     return CameraPair(left, right, Transform(RIGHT, LEFT, *bundle.rig.subset(0)))
 
 
-def _summary(solution: _Found, sheet: Sheet) -> StereoCalibration:
+def _build_calibration(solution: _StereoSolution, sheet: SheetOption) -> StereoCalibration:
     check_fit(solution.adjusted.rms, solution.sights, solution.bad)
-    shape = choose_shape(solution.adjusted, solution.sights, sheet)
-    adjusted = shape.adjusted
-    solution, without = solution._replace(adjusted=adjusted), _held_out(solution, shape.left_out)
-    cameras = _cameras(adjusted.bundle)
-    epipolar = [pair_errors(cameras, *solution.pair(n)).epipolar for n in _pairs(solution.sights)]
+    sheet_fit = choose_shape(solution.adjusted, solution.sights, sheet)
+    adjusted = sheet_fit.adjusted
+    solution, held_out_errors = (
+        solution._replace(adjusted=adjusted),
+        _held_out_errors(solution, sheet_fit.left_out),
+    )
+    cameras = _camera_pair(adjusted.bundle)
+    epipolar = [
+        pair_errors(cameras, *solution.pair(n)).epipolar for n in _complete_pairs(solution.sights)
+    ]
     calibration = StereoCalibration(
         **cameras._asdict(),
-        covariance=camera_covariance(adjusted, shape.left_out)[-6:, -6:],
-        pairs=tuple(_pair(solution, number, without) for number in range(len(solution.moments))),
+        covariance=camera_covariance(adjusted, sheet_fit.left_out)[-6:, -6:],
+        pairs=tuple(
+            _pair_fit(solution, number, held_out_errors) for number in range(len(solution.moments))
+        ),
         rms=adjusted.rms,
-        sigma=math.sqrt(adjusted.more),
+        sigma=math.sqrt(adjusted.extra_variance),
         epipolar=_rms(epipolar),
-        held_out=_rms([errors.spacing for errors in without.values()]),
-        held_out_epipolar=_rms([errors.epipolar for errors in without.values()]),
-        sheet=shape.off,
+        held_out=_rms([errors.spacing for errors in held_out_errors.values()]),
+        held_out_epipolar=_rms([errors.epipolar for errors in held_out_errors.values()]),
+        sheet=sheet_fit.offsets,
         warnings=(),
     )
-    remarks = _remarks(calibration, solution, shape.remarks)
+    remarks = _remarks(calibration, solution, sheet_fit.remarks)
     return dataclasses.replace(calibration, warnings=tuple(remarks))
 
 
-def _rms(parts: Sequence[Array]) -> float:
-    values = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
+def _rms(arrays: Sequence[Array]) -> float:
+    values = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
-def _pair(solution: _Found, number: int, without: Mapping[int, PairErrors]) -> PairFit:
+def _pair_fit(
+    solution: _StereoSolution, number: int, held_out_errors: Mapping[int, PairErrors]
+) -> PairFit:
     rms = {
         sight.camera: _rms([residuals])
         for sight, residuals in zip(solution.sights, solution.adjusted.residuals, strict=True)
@@ -475,7 +496,7 @@ def _pair(solution: _Found, number: int, without: Mapping[int, PairErrors]) -> P
     }
     pose = Transform(LEFT, TARGET, *solution.adjusted.bundle.poses.subset(number))
     left, right = solution.moments[number]
-    errors = without.get(number)
+    errors = held_out_errors.get(number)
     return PairFit(
         left=left,
         right=right,
@@ -488,37 +509,37 @@ def _pair(solution: _Found, number: int, without: Mapping[int, PairErrors]) -> P
 
 
 def _remarks(
-    calibration: StereoCalibration, solution: _Found, of_sheet: list[Remark]
+    calibration: StereoCalibration, solution: _StereoSolution, sheet_remarks: list[Remark]
 ) -> Iterator[Remark]:
     for bad_sight in solution.bad:
-        used = any(bad_sight is sight for sight in solution.sights)
-        done = "is used all the same" if used else "was not used"
+        is_used = any(bad_sight is sight for sight in solution.sights)
+        outcome = "is used all the same" if is_used else "was not used"
         reason = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
-        if bad_sight.camera == 1 and bad_sight.pose in solution.apart:
-            pixels = solution.apart[bad_sight.pose]
+        if bad_sight.camera == 1 and bad_sight.pose in solution.mismatched:
+            pixels = solution.mismatched[bad_sight.pose]
             distance = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
             reason = (
                 f"is {distance} where the left view and the other pairs have it: the two are of "
                 "different moments, or swapped"
             )
-        name = f"{label(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
-        yield Code.BAD_VIEW.remark(f"{name}: {reason}; it {done}")
+        name = f"{view_name(bad_sight.view, bad_sight.pose)}, {SIDES[bad_sight.camera]}"
+        yield Code.BAD_VIEW.remark(f"{name}: {reason}; it {outcome}")
     if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
             f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR_FIT_RMS_PX:g} at most: "
             "a lens is not of its model, the sheet is not flat, or the pairs were not taken at the "
             "same moments"
         )
-    yield from remark_sides(calibration.transform)
-    yield from of_sheet
+    yield from side_remarks(calibration.transform)
+    yield from sheet_remarks
     if math.isnan(calibration.held_out):
         yield Code.NOT_HELD_OUT.remark(
-            f"{len(_pairs(solution.sights))} pairs are no more than the cameras have need of: none "
-            "can be left out to see how good they are"
+            f"{len(_complete_pairs(solution.sights))} pairs are no more than the cameras have need "
+            "of: none can be left out to see how good they are"
         )
 
 
-def _covariances(given: ArrayLike | None, count: int, side: str) -> Array:
-    if given is None:
+def _pixel_covariances(covariance: ArrayLike | None, count: int, side: str) -> Array:
+    if covariance is None:
         return np.tile(np.eye(2), (count, 1, 1))
-    return as_covariances(given, count, f"{side} covariance")
+    return as_covariances(covariance, count, f"{side} covariance")

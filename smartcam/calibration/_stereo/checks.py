@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._lens.misfit import (
-    COUNT,
     LENS,
     RIG,
     RIGHT_LENS,
-    Fitted,
+    UNKNOWN_COUNT,
+    FittedView,
     lens_remarks,
     misfit_remarks,
 )
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._lens.suspicions import (
-    most_rms,
+    find_strays,
+    max_plausible_rms,
+    remove_points,
     stray_remarks,
-    strays,
     view_remarks,
-    without,
 )
 from smartcam.calibration._stereo.start import SIDES
-from smartcam.calibration._views import checked, label
+from smartcam.calibration._views import check_type, view_name
 from smartcam.geometry import CameraModel
 from smartcam.geometry._inside import Code, Remark
 
@@ -48,19 +48,19 @@ MAX_RMS_SHARE: Final = 0.005
 """The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
 
 EXCHANGED_RESIDUAL_RATIO: Final = 1.05
-"""The lenses are exchanged if exchanging them makes the residuals this many times smaller: if they
-are not, the wrong order of two lenses of one model makes them 1.7 times larger or more (measured on
+"""Lenses were given in the wrong order if exchanging them makes the residuals this many times
+smaller. Two lenses of one model in the wrong order make them 1.7 times larger or more (measured on
 recorded pairs)."""
 
 MIN_SWAPPED_SHARE: Final = 0.75
-"""At least this part of the pairs must fit better with the lenses exchanged."""
+"""Lenses are swapped only if at least this part of the pairs fits better with them exchanged."""
 
 MIN_APART_CHI2: Final = 30.0
 """The cameras stand apart if their distance, squared and in standard deviations, is more than this:
 chance alone exceeds it, over three axes, once in a million."""
 
 RIGHT_ANGLE_TRACE: Final = 1.0
-"""Trace of the rotation between two cameras, one of which is turned by a right angle."""
+"""Trace of a rotation by a right angle."""
 
 
 def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]) -> None:
@@ -69,7 +69,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     Raises ``COINCIDENT`` if an image is given for both sides, and ``SWAPPED_LENSES``.
     """
     for side, lens in zip(SIDES, known, strict=True):
-        checked(lens, (CameraModel, type(None)), f"stereo: {side}")
+        check_type(lens, (CameraModel, type(None)), f"stereo: {side}")
     pairs = [
         (number, left, right)
         for number, (left, right) in enumerate(moments)
@@ -79,7 +79,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
             raise Code.COINCIDENT.refusal(
                 "stereo: expected images of two cameras, got the same image on both sides in "
-                f"{label(left, number)}",
+                f"{view_name(left, number)}",
                 "two cameras",
                 number,
             )
@@ -87,7 +87,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     if first is None or second is None or first.size != second.size or not pairs:
         return
     views = [(left, right) for _, left, right in pairs if left.size == right.size == first.size]
-    so, other = (
+    squares, exchanged_squares = (
         np.array(
             [
                 sum(_squares(view, lens) for view, lens in zip(pair, lenses, strict=True))
@@ -96,8 +96,15 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         )
         for lenses in ((first, second), (second, first))
     )
-    ratio = math.sqrt(float(so.sum() / other.sum())) if other.sum() > 0 else 1.0
-    if ratio > EXCHANGED_RESIDUAL_RATIO and (other < so).mean() >= MIN_SWAPPED_SHARE:
+    ratio = (
+        math.sqrt(float(squares.sum() / exchanged_squares.sum()))
+        if exchanged_squares.sum() > 0
+        else 1.0
+    )
+    if (
+        ratio > EXCHANGED_RESIDUAL_RATIO
+        and (exchanged_squares < squares).mean() >= MIN_SWAPPED_SHARE
+    ):
         raise Code.SWAPPED_LENSES.refusal(
             "stereo: expected the left camera's lens as left and the right one's as right, got "
             f"residuals {ratio:.3g} times as large as with the two exchanged",
@@ -110,15 +117,15 @@ def _squares(view: TargetView, camera: CameraModel) -> float:
     return float((locate(view, camera).residuals ** 2).sum())
 
 
-def check_apart(transform: Transform, covariance: Array) -> None:
-    """Raise ``COINCIDENT`` if the right camera is at the place of the left one.
+def check_cameras_apart(transform: Transform, covariance: Array) -> None:
+    """Raise ``COINCIDENT`` if both cameras are at the same place.
 
     ``covariance`` (6, 6) is that of ``T_right_left``.
     """
-    # by the variance along the distance, which few views determine even if they do not determine
+    # the variance along the shift is used, which few views determine even if they do not determine
     # the whole covariance
-    shift, spread = transform.translation, covariance[3:, 3:]
-    if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ spread @ shift):
+    shift, shift_covariance = transform.translation, covariance[3:, 3:]
+    if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ shift_covariance @ shift):
         raise Code.COINCIDENT.refusal(
             "stereo: expected two cameras that stand apart, got one "
             f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
@@ -128,66 +135,79 @@ def check_apart(transform: Transform, covariance: Array) -> None:
         )
 
 
-def examined(
+def examine_pairs(
     calibration: StereoCalibration,
-    again: Callable[..., StereoCalibration],
+    recalibrate: Callable[..., StereoCalibration],
     *,
     known: tuple[CameraModel | None, CameraModel | None],
-    drop: bool,
+    drop_strays: bool,
 ) -> StereoCalibration:
-    """Return the calibration without stray points, with remarks on them.
+    """Return the calibration with remarks on suspicious views, and without stray points.
 
-    ``again`` calibrates from other views of both sides. ``known`` are the known lenses. ``drop``
-    says whether stray points are left out. Raises ``COINCIDENT`` if the cameras do not stand apart.
+    ``recalibrate`` calibrates from other views of both sides. ``known``: the known lenses.
+    ``drop_strays``: whether stray points are left out. Raises ``COINCIDENT`` if the cameras do not
+    stand apart.
     """
-    check_apart(calibration.transform, calibration.covariance)
-    sides = [[pair.left for pair in calibration.pairs], [pair.right for pair in calibration.pairs]]
-    seen = list(_views_of(calibration))
-    fitted, used = [sight.fitted for sight in seen], [sight.used for sight in seen]
-    names = [f"{label(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in seen]
-    of_fit = list(view_remarks([fit.view for fit in fitted], names))
+    check_cameras_apart(calibration.transform, calibration.covariance)
+    views_by_side = [
+        [pair.left for pair in calibration.pairs],
+        [pair.right for pair in calibration.pairs],
+    ]
+    side_views = list(_side_views(calibration))
+    fitted, used = [sight.fitted for sight in side_views], [sight.used for sight in side_views]
+    names = [
+        f"{view_name(sight.fitted.view, sight.pair)}, {SIDES[sight.side]}" for sight in side_views
+    ]
+    fit_remarks = list(view_remarks([fit.view for fit in fitted], names))
     for side, name in enumerate(SIDES):
         if known[side] is not None:
-            fits = [sight.fitted for sight in seen if sight.used and sight.side == side]
-            of_fit += lens_remarks(fits, f"{name} lens", calibration.sigma**2)
-    pairs = [list(group) for _, group in itertools.groupby(seen, key=lambda sight: sight.pair)]
-    both = [
+            fits = [sight.fitted for sight in side_views if sight.used and sight.side == side]
+            fit_remarks += lens_remarks(fits, f"{name} lens", calibration.sigma**2)
+    pairs = [
+        list(group) for _, group in itertools.groupby(side_views, key=lambda sight: sight.pair)
+    ]
+    complete = [
         sights_of_pair
         for sights_of_pair in pairs
         if len(sights_of_pair) == 2 and all(sight.used for sight in sights_of_pair)
     ]
-    free = np.zeros(COUNT, dtype=np.bool_)
+    free = np.zeros(UNKNOWN_COUNT, dtype=np.bool_)
     free[LENS], free[RIGHT_LENS] = (lens is None for lens in known)
     free[RIG] = True
-    of_fit += misfit_remarks(
+    fit_remarks += misfit_remarks(
         [
             (left.fitted, right.fitted._replace(rig=calibration.transform.rigid))
-            for left, right in both
+            for left, right in complete
         ],
         calibration.sigma**2,
         free,
-        [label(left.fitted.view, left.pair) for left, _ in both],
+        [view_name(left.fitted.view, left.pair) for left, _ in complete],
     )
-    outliers = strays(fitted, calibration.sigma**2, used)
-    if outliers and drop:
-        for sight, view in zip(seen, without([fit.view for fit in fitted], outliers), strict=True):
-            sides[sight.side][sight.pair] = view
-        calibration, of_fit = again(*sides), []  # remarked on by check_fit
-    done = "was not used" if drop else "is used all the same"
-    remarks = stray_remarks(outliers, names, done)
-    return dataclasses.replace(calibration, warnings=(*remarks, *calibration.warnings, *of_fit))
+    outliers = find_strays(fitted, calibration.sigma**2, used)
+    if outliers and drop_strays:
+        for sight, view in zip(
+            side_views, remove_points([fit.view for fit in fitted], outliers), strict=True
+        ):
+            views_by_side[sight.side][sight.pair] = view
+        # the new calibration already has the remarks on its own fit
+        calibration, fit_remarks = recalibrate(*views_by_side), []
+    outcome = "was not used" if drop_strays else "is used all the same"
+    remarks = stray_remarks(outliers, names, outcome)
+    return dataclasses.replace(
+        calibration, warnings=(*remarks, *calibration.warnings, *fit_remarks)
+    )
 
 
-class _SeenFrom(NamedTuple):
-    """One view of a calibration."""
+class _SideView(NamedTuple):
+    """The view of one camera in a pair."""
 
     side: int
     pair: int
     used: bool
-    fitted: Fitted
+    fitted: FittedView
 
 
-def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
+def _side_views(calibration: StereoCalibration) -> Iterator[_SideView]:
     for number, pair in enumerate(calibration.pairs):
         if pair.transform is None:
             continue
@@ -198,40 +218,45 @@ def _views_of(calibration: StereoCalibration) -> Iterator[_SeenFrom]:
                     0.0 if calibration.sheet is None else calibration.sheet
                 )
                 camera = (calibration.left, calibration.right)[side]
-                yield _SeenFrom(
-                    side, number, pair.used[side], Fitted(view, camera, poses[side].rigid, points)
+                yield _SideView(
+                    side,
+                    number,
+                    pair.used[side],
+                    FittedView(view, camera, poses[side].rigid, points),
                 )
 
 
 def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:
     """Raise ``POOR_FIT`` if the views of pairs do not belong together.
 
-    ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
+    ``rms``: RMS of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
     views that fit worst.
     """
-    most = most_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
-    if rms <= most:
+    max_rms = max_plausible_rms([sight.view for sight in sights], MAX_RMS_PX, MAX_RMS_SHARE)
+    if rms <= max_rms:
         return
-    named = ", ".join(f"{label(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad)
+    names = ", ".join(
+        f"{view_name(sight.view, sight.pose)} ({SIDES[sight.camera]})" for sight in bad
+    )
     raise Code.POOR_FIT.refusal(
         "stereo: expected cameras that show the pairs as they are, got residuals of "
-        f"{rms:.3g} pixels rms, {most:.3g} at most expected: were the views of each pair taken at "
-        f"the same moment, and are they in the same order? Those that fit worst: "
-        f"{named or 'all alike'}",
-        most,
+        f"{rms:.3g} pixels rms, {max_rms:.3g} at most expected: were the views of each pair taken "
+        f"at the same moment, and are they in the same order? Those that fit worst: "
+        f"{names or 'all alike'}",
+        max_rms,
         rms,
     )
 
 
-def remark_sides(transform: Transform) -> list[Remark]:
+def side_remarks(transform: Transform) -> list[Remark]:
     """Return a remark if the right camera is left of the left one, by ``T_right_left``."""
-    along = transform.translation
-    beside = along[0] > 0 and along[0] == np.abs(along).max()
-    if not beside or float(np.trace(transform.rotation)) <= RIGHT_ANGLE_TRACE:
+    shift = transform.translation
+    is_swapped = shift[0] > 0 and shift[0] == np.abs(shift).max()
+    if not is_swapped or float(np.trace(transform.rotation)) <= RIGHT_ANGLE_TRACE:
         return []
     return [
         Code.SWAPPED_SIDES.remark(
             "left and right seem swapped: expected the right camera on the right of the left one, "
-            f"got it {1e3 * along[0]:.3g} mm on the left; if that is intended, ignore this"
+            f"got it {1e3 * shift[0]:.3g} mm on the left; if that is intended, ignore this"
         )
     ]

@@ -50,18 +50,18 @@ def pair_errors(cameras: CameraPair, left: TargetView, right: TargetView) -> Pai
 
 
 def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
-    """Return the errors of triangulated distances between neighbours on a target, (M,), metres.
+    """Return the errors (M,) of triangulated distances between neighbours on a target, metres.
 
     ``ids`` (N,): numbers of points on the target. ``points`` (N, 3): their places in space, metres;
-    those that are NaN have no neighbours.
+    points that are NaN are left out.
     """
-    seen = np.isfinite(points).all(axis=1)
-    flat, points = target.points[ids[seen]], points[seen]
-    if len(flat) < 2:
+    is_finite = np.isfinite(points).all(axis=1)
+    true_points, points = target.points[ids[is_finite]], points[is_finite]
+    if len(true_points) < 2:
         return np.zeros(0)
     spacing = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
-    tree = load("scipy.spatial").cKDTree(flat)
-    one, two = tree.query_pairs(NEIGHBOUR_DISTANCE_RATIO * spacing, output_type="ndarray").T
-    true = np.linalg.norm(flat[one] - flat[two], axis=1)
-    errors: Array = np.linalg.norm(points[one] - points[two], axis=1) - true
+    tree = load("scipy.spatial").cKDTree(true_points)
+    first, second = tree.query_pairs(NEIGHBOUR_DISTANCE_RATIO * spacing, output_type="ndarray").T
+    true_distances = np.linalg.norm(true_points[first] - true_points[second], axis=1)
+    errors: Array = np.linalg.norm(points[first] - points[second], axis=1) - true_distances
     return errors

@@ -1,4 +1,4 @@
-"""Rectify both images of a pair, as two parallel cameras would see them."""
+"""Rectify both images of a pair: show them as two parallel cameras would."""
 
 from __future__ import annotations
 
@@ -20,17 +20,15 @@ if TYPE_CHECKING:
 
 Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
 
-MIN_ACROSS_COSINE: Final = 0.1
-"""Least cosine of the angle by which a camera's viewing direction may be turned.
-
-Below it, a camera looks along the line to the other one, and rows would meet inside of its image.
-"""
+MIN_TURN_COSINE: Final = 0.1
+"""Least cosine of the angle by which a camera's viewing direction may be turned. Below it, a camera
+looks along the line to the other camera, and epipolar lines would meet inside of its image."""
 
 MAX_PIXELS: Final = 100_000_000
 """A rectified image has at most this many pixels; its two maps have 8 bytes for each pixel."""
 
 MAX_SAMPLES: Final = 50_000
-"""At most this many source pixels, evenly spread, are sampled to count how many are kept."""
+"""The part of source pixels that is kept is computed from at most this many of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,8 +69,8 @@ class Rectification:
         """Rectify both images, (H, W) or (H, W, C); pixels without a source are 0."""
         cv2 = load("cv2")
         first, second = (
-            np.asarray(cv2.remap(image, chart, None, cv2.INTER_LINEAR), dtype=np.uint8)
-            for image, chart in zip((left, right), self.maps, strict=True)
+            np.asarray(cv2.remap(image, map_, None, cv2.INTER_LINEAR), dtype=np.uint8)
+            for image, map_ in zip((left, right), self.maps, strict=True)
         )
         return first, second
 
@@ -100,45 +98,45 @@ def rectify(
             ``OUT_OF_FIELD``: the images would be empty, as for cameras one behind the other, or if
             one is upside down.
     """
-    output = _checked(left, right, alpha, size)
-    turns, projections, depth = _parallel(left, right, transform, alpha, output)
+    output_size = _check_arguments(left, right, alpha, size)
+    turns, projections, depth = _parallel_cameras(left, right, transform, alpha, output_size)
     cameras = (left, right)
     maps = tuple(
-        _map(camera, turn, projection, output)
+        _source_map(camera, turn, projection, output_size)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
-    masks = tuple(_inside(chart, camera.size) for chart, camera in zip(maps, cameras, strict=True))
-    across = min(float(turn[2, 2]) for turn in turns)
-    upright = min(float(projection[0, 0]) for projection in projections) > 0
-    if not (upright and across > MIN_ACROSS_COSINE and all(mask.any() for mask in masks)):
+    masks = tuple(_is_inside(map_, camera.size) for map_, camera in zip(maps, cameras, strict=True))
+    cosine = min(float(turn[2, 2]) for turn in turns)
+    is_upright = min(float(projection[0, 0]) for projection in projections) > 0
+    if not (is_upright and cosine > MIN_TURN_COSINE and all(mask.any() for mask in masks)):
         raise Code.OUT_OF_FIELD.refusal(
             f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
             "same place the same way up, got parallel images with nothing in them, or upside down "
-            f"(cosine between old and new viewing direction: {across:.2f})",
-            MIN_ACROSS_COSINE,
-            across,
+            f"(cosine between old and new viewing direction: {cosine:.2f})",
+            MIN_TURN_COSINE,
+            cosine,
         )
-    kept_parts = tuple(
-        _kept_part(camera, turn, projection, output)
+    kept_shares = tuple(
+        _kept_share(camera, turn, projection, output_size)
         for camera, turn, projection in zip(cameras, turns, projections, strict=True)
     )
     return Rectification(
-        size=output,
+        size=output_size,
         alpha=alpha,
         rotations=turns,
         projections=projections,
         depth=depth,
         maps=(maps[0], maps[1]),
         masks=(masks[0], masks[1]),
-        kept=(kept_parts[0], kept_parts[1]),
+        kept=(kept_shares[0], kept_shares[1]),
         invalid=(1.0 - float(masks[0].mean()), 1.0 - float(masks[1].mean())),
     )
 
 
-def _checked(
+def _check_arguments(
     left: CameraModel, right: CameraModel, alpha: float, size: tuple[int, int] | None
 ) -> tuple[int, int]:
-    """Return the size of the output."""
+    """Return the size of the output; raise the errors of :func:`rectify` about its arguments."""
     if not (math.isfinite(alpha) and 0.0 <= alpha <= 1.0):
         raise _shape_error("alpha", "0 to 1", alpha)
     if left.distortion_model != right.distortion_model:
@@ -160,21 +158,21 @@ def _shape_error(label: str, expected: str, actual: object) -> CalibrationError:
     return Code.SHAPE.unexpected(f"rectify: {label}: expected {expected}", expected, actual)
 
 
-def _parallel(
+def _parallel_cameras(
     left: CameraModel,
     right: CameraModel,
     transform: Transform,
     alpha: float,
-    output: tuple[int, int],
+    output_size: tuple[int, int],
 ) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
-    """Return rotations, projections and Q."""
+    """Return the rotations and projections of two parallel cameras, and the matrix Q."""
     # Each camera is turned by half of the rotation between them, in opposite senses, so that both
     # look in the same direction and neither image changes more than necessary; then both are turned
     # until the baseline is along x. A point at depth Z has the disparity d = f B / Z then, and Q
     # takes (u, v, d, 1) to (u - cx, v - cy, f, -d / Tx), which is (X, Y, Z, 1) times d / B. Source:
     # Bouguet's algorithm, as in Bradski and Kaehler, Learning OpenCV (2008), chapter 12.
     cv2 = load("cv2")
-    given = (
+    arguments = (
         left.matrix,
         left.distortion,
         right.matrix,
@@ -185,47 +183,47 @@ def _parallel(
     )
     if left.distortion_model == "equidistant":
         rectified: Any = cv2.fisheye.stereoRectify(
-            *given, cv2.CALIB_ZERO_DISPARITY, newImageSize=output, balance=alpha
+            *arguments, cv2.CALIB_ZERO_DISPARITY, newImageSize=output_size, balance=alpha
         )
     else:
         rectified = cv2.stereoRectify(
-            *given, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output
+            *arguments, flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha, newImageSize=output_size
         )
     first, second, first_projection, second_projection, depth = (
-        np.array(each, dtype=np.float64) for each in rectified[:5]
+        np.array(values, dtype=np.float64) for values in rectified[:5]
     )
     return (first, second), (first_projection, second_projection), depth
 
 
-def _map(
-    camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]
+def _source_map(
+    camera: CameraModel, turn: Array, projection: Array, output_size: tuple[int, int]
 ) -> NDArray[np.float32]:
     cv2 = load("cv2")
-    of_model = cv2.fisheye if camera.distortion_model == "equidistant" else cv2
-    both = of_model.initUndistortRectifyMap(
-        camera.matrix, camera.distortion, turn, projection[:, :3], output, cv2.CV_32FC1
+    module = cv2.fisheye if camera.distortion_model == "equidistant" else cv2
+    maps = module.initUndistortRectifyMap(
+        camera.matrix, camera.distortion, turn, projection[:, :3], output_size, cv2.CV_32FC1
     )
-    return np.stack(both, axis=-1).astype(np.float32)
+    return np.stack(maps, axis=-1).astype(np.float32)
 
 
-def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return True for each place (..., 2) that lies in an image."""
+def _is_inside(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask of the pixels (..., 2) that lie in an image."""
     with np.errstate(invalid="ignore"):
-        u, v = places[..., 0], places[..., 1]
+        u, v = pixels[..., 0], pixels[..., 1]
         return np.asarray((u >= 0) & (v >= 0) & (u <= size[0] - 1) & (v <= size[1] - 1))
 
 
-def _kept_part(
-    camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]
+def _kept_share(
+    camera: CameraModel, turn: Array, projection: Array, output_size: tuple[int, int]
 ) -> float:
-    """Return the part of the source pixels that are in the output."""
+    """Return the part of a camera's source pixels that is in the output."""
     width, height = camera.size
     step = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))
     u, v = np.meshgrid(np.arange(step // 2, width, step), np.arange(step // 2, height, step))
     rays = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
-    # from pixel to ray to the rectified camera's ray to its pixel: P (R K^-1 u)
+    # a pixel's ray, turned into the rectified camera's frame, and its pixel there: P (R K^-1 u)
     turned = np.column_stack([rays, np.ones(len(rays))]) @ turn.T
-    seen = turned @ projection[:, :3].T
+    homogeneous = turned @ projection[:, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
-        places = seen[:, :2] / seen[:, 2:]
-    return float((_inside(places, output) & (turned[:, 2] > 0)).mean())
+        pixels = homogeneous[:, :2] / homogeneous[:, 2:]
+    return float((_is_inside(pixels, output_size) & (turned[:, 2] > 0)).mean())

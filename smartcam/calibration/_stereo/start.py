@@ -1,4 +1,4 @@
-"""Find the start of a calibration of two cameras: lenses, poses, and the likeliest transform."""
+"""Guess lenses, poses and transform of two cameras, from which their calibration starts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, known_lens
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, empty_basis
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
 from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
@@ -28,18 +28,18 @@ RIGHT: Final = "right"
 """Name of the right camera's frame."""
 
 SIDES: Final = (LEFT, RIGHT)
-"""Names of the sides by number."""
+"""Names of the sides by their index."""
 
 MAX_GUESSES: Final = 20
 """At most this many pairs are tried for a first guess of the transform."""
 
-MIN_GROSS_ERROR_RATIO: Final = 10.0
+MIN_MISMATCH_RATIO: Final = 10.0
 """The views of a pair do not belong together if its error is more than this many times the median,
-and above MIN_FAR_SHARE as well."""
+and above MIN_MISMATCH_SHARE as well."""
 
-MIN_FAR_SHARE: Final = 0.01
-"""A pair is far off only if its points are off by more than this part of the longer side of the
-image: neither noise nor a lens that is not yet adjusted causes that."""
+MIN_MISMATCH_SHARE: Final = 0.01
+"""The views of a pair do not belong together only if its points are off by more than this part of
+the image's longer side: neither noise nor a lens that is not yet adjusted causes that."""
 
 
 class Lenses(NamedTuple):
@@ -48,13 +48,13 @@ class Lenses(NamedTuple):
     # left and right lens; None for one that is to be fitted
     known: tuple[CameraModel | None, CameraModel | None]
     model: DistortionModel  # model of the lenses that are to be fitted
-    # their coefficients that stay 0, as in :func:`~smartcam.calibration._lens.start.lens_basis`
+    # coefficients of these lenses that stay 0, as in :func:`lens_basis`
     fixed: tuple[str, ...]
 
     def basis(self, side: int) -> Array:
-        """Return the unknowns of a side's lens (4 + K, F)."""
+        """Return the basis (4 + K, F) of the unknowns of a side's lens."""
         known = self.known[side]
-        return lens_basis(self.model, self.fixed) if known is None else known_lens(known)
+        return lens_basis(self.model, self.fixed) if known is None else empty_basis(known)
 
 
 Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]
@@ -96,48 +96,58 @@ def as_moments(
 
 
 class FirstGuess(NamedTuple):
-    """A first guess of lenses, transform and poses."""
+    """A first guess of lenses, transform and poses, with the views numbered alike."""
 
     moments: list[Moment]  # the right views numbered as the left ones are
     bundle: Bundle  # lenses, transform and poses
     # moments whose views do not belong together, with the distance, pixels, of the right view from
     # its prediction by the left view and the other pairs; infinite behind the camera
-    apart: dict[int, float]
+    mismatched: dict[int, float]
 
 
-def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
+def guess_start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     """Return a first guess of lenses, transform and poses.
 
     Raises ``POOR_FIT`` if no lens or no transform fits the views; ``INSUFFICIENT_ROTATION``;
     ``WRONG_SIZE`` if views are from another camera than the known one.
     """
-    (left, ones), (right, twos) = (_side(moments, side, lenses) for side in range(2))
-    poses: list[Poses] = list(zip(ones, twos, strict=True))
+    (left, left_poses), (right, right_poses) = (
+        _fit_side(moments, side, lenses) for side in range(2)
+    )
+    poses: list[Poses] = list(zip(left_poses, right_poses, strict=True))
     target = next(view.target for moment in moments for view in moment if view is not None)
     turns = [IDENTITY]
     if target.half_turn_symmetric:
         turns.append(half_turn(target))
-    rig, apart, turned = _rig(moments, poses, right, turns)
-    for number in turned:
-        (one, two), (first, second) = poses[number], moments[number]
-        if two is not None and second is not None:
-            moments[number], poses[number] = (first, half_turned(second)), (one, two @ turns[1])
-    firsts = Rigid.stacked(
+    rig, mismatched, renumbered = _guess_rig(moments, poses, right, turns)
+    for moment_index in renumbered:
+        (left_pose, right_pose), (left_view, right_view) = (
+            poses[moment_index],
+            moments[moment_index],
+        )
+        if right_pose is not None and right_view is not None:
+            moments[moment_index], poses[moment_index] = (
+                (left_view, half_turned(right_view)),
+                (left_pose, right_pose @ turns[1]),
+            )
+    target_poses = Rigid.stacked(
         in_left or (rig.inverse() @ in_right if in_right else IDENTITY)
         for in_left, in_right in poses
     )
     basis = lenses.basis(0), lenses.basis(1)
-    return FirstGuess(moments, Bundle((left, right), Rigid.stacked([rig]), firsts, basis), apart)
+    return FirstGuess(
+        moments, Bundle((left, right), Rigid.stacked([rig]), target_poses, basis), mismatched
+    )
 
 
 Poses: TypeAlias = tuple["Rigid | None", "Rigid | None"]
 
 
-def _side(
+def _fit_side(
     moments: list[Moment], side: int, lenses: Lenses
 ) -> tuple[CameraModel, list[Rigid | None]]:
     """Return one side's lens, and the target's pose at each moment."""
-    seen = [number for number, moment in enumerate(moments) if moment[side] is not None]
+    moment_indices = [index for index, moment in enumerate(moments) if moment[side] is not None]
     views = [view for moment in moments if (view := moment[side]) is not None]
     known, label = lenses.known[side], f"{SIDES[side]} camera"
     if known is None:
@@ -145,65 +155,65 @@ def _side(
         check_tilts(adjusted, label)
     else:
         check_views(views, label, 1, known.size)
-        sights = [Sight(0, number, view) for number, view in enumerate(views)]
+        sights = [Sight(0, index, view) for index, view in enumerate(views)]
         adjusted = adjust(Bundle.single(known, likeliest_poses(views, known)), sights, 0.0)
     poses: list[Rigid | None] = [None] * len(moments)
-    for place, number in enumerate(seen):
-        poses[number] = adjusted.bundle.poses.subset(place)
+    for pose_index, index in enumerate(moment_indices):
+        poses[index] = adjusted.bundle.poses.subset(pose_index)
     return adjusted.bundle.cameras[0], poses
 
 
-def _rig(
+def _guess_rig(
     moments: list[Moment], poses: list[Poses], right: CameraModel, turns: Sequence[Rigid]
 ) -> tuple[Rigid, dict[int, float], list[int]]:
-    """Return the transform that fits most of the pairs best, and the pairs that do not fit.
+    """Return the transform that fits most of the pairs, and the distances of pairs that do not fit.
 
-    The last result are the pairs whose right view is numbered from the other end: after ``turns``
-    the target looks the same. All pairs together decide which numbering fits, since a camera may be
-    upside down. Raises ``POOR_FIT``.
+    The third result are the moments whose right view is numbered from the other end. ``turns``:
+    turns of the target after which it looks the same. All pairs together decide which numbering
+    fits, since a camera may be upside down. Raises ``POOR_FIT``.
     """
     pairs = [
         (number, in_left, in_right, moment[1])
         for number, ((in_left, in_right), moment) in enumerate(zip(poses, moments, strict=True))
         if in_left is not None and in_right is not None and moment[1] is not None
     ]
-    best, least, distances = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
+    best_guess, least_median, distances = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
     sampled = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
     for turn, (_, in_left, in_right, _) in itertools.product(turns, sampled):
-        # T_right_left = T_right_target T_target_left; the one with the least median error is taken,
-        # which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares Regression
-        # (1984).
+        # T_right_left = T_right_target T_target_left; the guess with the least median error is
+        # taken, which up to half of the pairs cannot spoil: Rousseeuw, Least Median of Squares
+        # Regression (1984).
         guess = in_right @ turn @ in_left.inverse()
-        tried = np.array(
+        candidate_distances = np.array(
             [_mean_distances(guess @ pose, view, right, turns) for _, pose, _, view in pairs]
         )
-        middle = float(np.median(tried.min(axis=1)))
-        if middle < least:
-            best, least, distances = guess, middle, tried
-    if not math.isfinite(least):
+        median = float(np.median(candidate_distances.min(axis=1)))
+        if median < least_median:
+            best_guess, least_median, distances = guess, median, candidate_distances
+    if not math.isfinite(least_median):
         raise Code.POOR_FIT.refusal(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
-    limit = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
+    limit = max(MIN_MISMATCH_RATIO * least_median, MIN_MISMATCH_SHARE * max(right.size))
     numbers, nearest = [number for number, *_ in pairs], distances.min(axis=1).tolist()
-    apart = {
+    mismatched = {
         number: distance
         for number, distance in zip(numbers, nearest, strict=True)
         if distance > limit
     }
-    turned = [
+    renumbered = [
         number
-        for number, by_turn in zip(numbers, distances, strict=True)
-        if by_turn[0] > by_turn[-1]
+        for number, distances_by_turn in zip(numbers, distances, strict=True)
+        if distances_by_turn[0] > distances_by_turn[-1]
     ]
-    return best, apart, turned
+    return best_guess, mismatched, renumbered
 
 
 def _mean_distances(
     pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]
 ) -> list[float]:
-    """Return the mean distance, pixels, of a view's points from a pose's, for each turn."""
-    seen = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
-    distances = [np.linalg.norm(points - view.points, axis=1) for points in seen]
+    """Return the mean distance, pixels, of a view's points from those of a pose after each turn."""
+    projected = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
+    distances = [np.linalg.norm(points - view.points, axis=1) for points in projected]
     return [float(np.nan_to_num(distance, nan=math.inf).mean()) for distance in distances]

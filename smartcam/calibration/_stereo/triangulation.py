@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 MAX_STEPS = 10
-"""At most this many steps lead from the linear solution to the least reprojection error; two or
-three are enough."""
+"""Limit of the steps from the linear solution to the least reprojection error; two or three are
+usually enough."""
 
-SETTLED_DEPTH_RATIO = 1e-9
+MAX_FINAL_STEP_RATIO = 1e-9
 """The iteration ends when a step moves a point by less than this part of its depth."""
 
 
@@ -30,7 +30,7 @@ class CameraPair(NamedTuple):
     transform: Transform  # ``T_right_left``
 
 
-class Triangulated(NamedTuple):
+class TriangulatedPoints(NamedTuple):
     """Triangulated points with their covariance."""
 
     # (N, 3), left camera's frame, metres; NaN where the rays do not meet in front of both cameras
@@ -40,36 +40,35 @@ class Triangulated(NamedTuple):
 
 def triangulate(
     pair: CameraPair, pixels: tuple[Array, Array], covariance: tuple[Array, Array]
-) -> Triangulated:
+) -> TriangulatedPoints:
     """Return the points whose projections are nearest to the given pixels.
 
-    Nearest is the least sum of squares in both images, weighted by the covariance of the pixels:
-    for normal noise no unbiased estimate has a smaller variance.
-
-    ``pixels`` (N, 2) and ``covariance`` (N, 2, 2) are given for the left and the right image.
+    The sum of squares in both images, weighted by the covariance of the pixels, is minimized. For
+    normal noise no unbiased estimate has a smaller variance. ``pixels`` (N, 2) and ``covariance``
+    (N, 2, 2) are those of the left and of the right image.
     """
-    points = _linear(pair, pixels)
+    points = _linear_solution(pair, pixels)
     points[~(points[:, 2] > 0)] = np.nan
-    white = [whitening(matrix, 0.0) for matrix in covariance]
+    whiteners = [whitening(matrix, 0.0) for matrix in covariance]
     normal = np.full((len(points), 3, 3), np.nan)
     for _ in range(MAX_STEPS):
-        normal, step = _step(pair, pixels, white, points)
+        normal, step = _step(pair, pixels, whiteners, points)
         points = points + step
         with np.errstate(invalid="ignore"):
-            moved = np.linalg.norm(step, axis=1) > SETTLED_DEPTH_RATIO * np.abs(points[:, 2])
-        if not moved.any():
+            is_moving = np.linalg.norm(step, axis=1) > MAX_FINAL_STEP_RATIO * np.abs(points[:, 2])
+        if not is_moving.any():
             break
-    hidden = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
-    points[hidden] = np.nan
+    is_behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))
+    points[is_behind] = np.nan
     points[~np.isfinite(points).all(axis=1)] = np.nan  # all weights are finite
     # The covariance of least squares with residuals of variance 1 is (J^T J)^-1.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2.
     inverse = np.full_like(normal, np.nan)
-    inverse[~hidden] = np.linalg.pinv(normal[~hidden], hermitian=True)
-    return Triangulated(points, inverse)
+    inverse[~is_behind] = np.linalg.pinv(normal[~is_behind], hermitian=True)
+    return TriangulatedPoints(points, inverse)
 
 
-def _linear(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
+def _linear_solution(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     """Return the points (N, 3) by the direct linear transform of the rays."""
     if not len(pixels[0]):
         return np.zeros((0, 3))
@@ -87,20 +86,25 @@ def _linear(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
 
 
 def _step(
-    pair: CameraPair, pixels: tuple[Array, Array], white: list[Array], points: Array
+    pair: CameraPair, pixels: tuple[Array, Array], whiteners: list[Array], points: Array
 ) -> tuple[Array, Array]:
     """Return the normal matrices (N, 3, 3) and Gauss and Newton's step (N, 3)."""
     # (J^T J) d = J^T r, where the right camera's rows of J have the chain rule's R of R X + t. All
-    # points are solved at once, which no solver of single problems does; a thousand take a few
-    # milliseconds.
+    # points are solved at once: a thousand points take a few milliseconds.
     in_left = linearize(points, pair.left)
     in_right = linearize(pair.transform.apply(points), pair.right)
-    rows = [white[0] @ in_left.by_point, white[1] @ in_right.by_point @ pair.transform.rotation]
-    misses = [
-        white[0] @ (pixels[0] - in_left.pixels)[..., None],
-        white[1] @ (pixels[1] - in_right.pixels)[..., None],
+    jacobian_parts = [
+        whiteners[0] @ in_left.by_point,
+        whiteners[1] @ in_right.by_point @ pair.transform.rotation,
     ]
-    jacobian, residuals = np.concatenate(rows, axis=1), np.concatenate(misses, axis=1)
+    residual_parts = [
+        whiteners[0] @ (pixels[0] - in_left.pixels)[..., None],
+        whiteners[1] @ (pixels[1] - in_right.pixels)[..., None],
+    ]
+    jacobian, residuals = (
+        np.concatenate(jacobian_parts, axis=1),
+        np.concatenate(residual_parts, axis=1),
+    )
     normal = jacobian.swapaxes(1, 2) @ jacobian
     right_side = jacobian.swapaxes(1, 2) @ residuals
     finite = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right_side).all(axis=(1, 2))
@@ -113,8 +117,8 @@ def _step(
 def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     """Return the distances of undistorted pixels from the epipolar lines of their partners.
 
-    ``pixels`` (N, 2) are given for the left and the right image; the result (N, 2) has the
-    distances in the left and in the right image, pixels.
+    ``pixels`` (N, 2): those of the left and of the right image. The result (N, 2) has the distances
+    in the left and in the right image, pixels.
     """
     # A point's two rays and the baseline lie in one plane: x2^T E x1 = 0 with E = [t]x R. In pixels
     # without distortion it is F = K2^-T E K1^-1; F x1 is the line of x1's partner in the right
@@ -123,12 +127,12 @@ def epipolar_distances(pair: CameraPair, pixels: tuple[Array, Array]) -> Array:
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, sections 9.2 and 9.6.
     left, right, transform = pair
     essential = cross_matrix(transform.translation) @ transform.rotation
-    seen = [
+    homogeneous = [
         np.column_stack([camera.undistort(pixels_of_camera), np.ones(len(pixels_of_camera))])
         for camera, pixels_of_camera in zip((left, right), pixels, strict=True)
     ]
     matrix = np.linalg.inv(right.matrix).T @ essential @ np.linalg.inv(left.matrix)
-    lines = [seen[1] @ matrix, seen[0] @ matrix.T]
-    products = np.abs((seen[1] * lines[1]).sum(axis=1))
+    lines = [homogeneous[1] @ matrix, homogeneous[0] @ matrix.T]
+    products = np.abs((homogeneous[1] * lines[1]).sum(axis=1))
     distances = [products / np.linalg.norm(line[:, :2], axis=1) for line in lines]
     return np.column_stack(distances)

@@ -1,6 +1,6 @@
 """Simulate cameras on robots: views with noise, poses with noise, and the Cramer-Rao bound.
 
-Nothing is drawn: the points of a target are projected. Tests compare the result of a calibration
+No images are drawn: the points of a target are projected. Tests compare the result of a calibration
 with the truth, and its error with the Cramer-Rao bound, which no unbiased estimate can beat.
 """
 
@@ -18,7 +18,7 @@ from smartcam.calibration._hand_eye.equations import (
     RobotPoses,
     RobotSigmas,
     Solution,
-    information,
+    fisher_information,
 )
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import Transform
@@ -38,7 +38,7 @@ GOLDEN_ANGLE_RADIANS = math.pi * (3.0 - math.sqrt(5.0))
 """Angle between neighbours of a spiral that covers a disc evenly, radians."""
 
 EXACT_SIGMA_PX = 1e-9
-"""Standard deviation, pixels, that views without noise state for their points."""
+"""Standard deviation, pixels, of the points in views without noise."""
 
 
 def view(
@@ -68,8 +68,8 @@ def view(
     """
     pixels = camera.project(transform.apply(target.points))
     pixels = pixels + sigma * random.normal(size=pixels.shape)
-    inside = ((pixels >= -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)
-    ids = np.flatnonzero(inside)
+    is_inside = ((pixels >= -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)
+    ids = np.flatnonzero(is_inside)
     if len(ids) < MIN_VISIBLE_POINTS:
         raise Code.OUT_OF_FIELD.refusal(
             f"view: expected at least {MIN_VISIBLE_POINTS} points of the target in the image, got "
@@ -106,23 +106,23 @@ def around(
     """
     centre = (target.points.min(axis=0) + target.points.max(axis=0)) / 2.0
     poses = []
-    for number in range(count):
-        polar = tilt * math.sqrt((number + 0.5) / count)
-        azimuth = number * GOLDEN_ANGLE_RADIANS
-        out = np.array(
+    for index in range(count):
+        polar = tilt * math.sqrt((index + 0.5) / count)
+        azimuth = index * GOLDEN_ANGLE_RADIANS
+        outwards = np.array(
             [
                 math.sin(polar) * math.cos(azimuth),
                 math.sin(polar) * math.sin(azimuth),
                 math.cos(polar),
             ]
         )
-        side = np.cross([0.0, 1.0, 0.0], -out)
+        side = np.cross([0.0, 1.0, 0.0], -outwards)
         side /= np.linalg.norm(side)
-        looking = np.column_stack([side, np.cross(-out, side), -out])
+        facing = np.column_stack([side, np.cross(-outwards, side), -outwards])
         roll = random.uniform(-math.pi / 2, math.pi / 2)
-        rotation = looking @ exp_rotation(np.array([0.0, 0.0, roll]))
-        reach = distance * random.uniform(0.8, 1.2)
-        poses.append(Transform("target", "camera", rotation, centre + reach * out))
+        rotation = facing @ exp_rotation(np.array([0.0, 0.0, roll]))
+        pose_distance = distance * random.uniform(0.8, 1.2)
+        poses.append(Transform("target", "camera", rotation, centre + pose_distance * outwards))
     return poses
 
 
@@ -160,8 +160,8 @@ class HandEyeScene:
 
     def seen(self, robot_pose: Transform) -> Transform:
         """Return ``T_camera_target`` at a pose of the robot."""
-        between = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
-        return self.camera_pose.inverse() @ between @ self.target_pose
+        carrier_motion = robot_pose.inverse() if self.setup == "eye-in-hand" else robot_pose
+        return self.camera_pose.inverse() @ carrier_motion @ self.target_pose
 
     def measured(
         self, *, pixel_sigma: float, robot_sigmas: RobotSigmas, random: np.random.Generator
@@ -187,7 +187,7 @@ class HandEyeScene:
             )
             for number, pose in enumerate(self.robot_poses)
         ]
-        poses = [self._disturbed(pose, robot_sigmas, random) for pose in self.robot_poses]
+        poses = [self._add_noise(pose, robot_sigmas, random) for pose in self.robot_poses]
         return poses, views
 
     def bound(self, *, pixel_sigma: float, robot_sigmas: RobotSigmas) -> Bound:
@@ -196,9 +196,9 @@ class HandEyeScene:
         The target's pose and the robot's true poses are unknown, too. A sigma of 0 means values
         without noise, known to be exact.
         """
-        # No unbiased estimate has a covariance below the inverse of Fisher's information, J^T C^-1
-        # J of the pixels; the robot's true poses are eliminated from it. Source: Kay, Fundamentals
-        # of Statistical Signal Processing: Estimation Theory (1993), chapter 3.
+        # No unbiased estimate has a covariance below the inverse of Fisher's information,
+        # J^T C^-1 J of the pixels; the robot's true poses are eliminated from it. Source: Kay,
+        # Fundamentals of Statistical Signal Processing: Estimation Theory (1993), chapter 3.
         points = [self.target.points] * len(self.robot_poses)
         count = len(self.target.points)
         whitening = np.broadcast_to(np.eye(2) / pixel_sigma, (len(points), count, 2, 2))
@@ -206,13 +206,17 @@ class HandEyeScene:
         pixels = [
             self.camera.project(transform.apply(self.target.points)) for transform in transforms
         ]
-        flat = np.zeros((len(points), count, 0))
-        seen = PixelObservations(whitening, self.camera, np.stack(points), np.stack(pixels), flat)
+        no_heights = np.zeros((len(points), count, 0))
+        observations = PixelObservations(
+            whitening, self.camera, np.stack(points), np.stack(pixels), no_heights
+        )
         poses = Rigid.stacked(pose.rigid for pose in self.robot_poses)
         noise = RobotNoise(robot_sigmas) if max(robot_sigmas) > 0 else None
         truth = Solution(self.camera_pose.rigid, self.target_pose.rigid, noise=noise)
-        fisher = information(RobotPoses(poses, self.setup == "eye-in-hand"), seen, truth)
-        variances = np.diag(np.linalg.inv(fisher))
+        information = fisher_information(
+            RobotPoses(poses, self.setup == "eye-in-hand"), observations, truth
+        )
+        variances = np.diag(np.linalg.inv(information))
         return Bound(math.sqrt(variances[:3].sum()), math.sqrt(variances[3:6].sum()))
 
     def errors(self, camera_pose: Transform) -> tuple[float, float]:
@@ -220,7 +224,7 @@ class HandEyeScene:
         turn = float(self.camera_pose.rigid.angle_to(camera_pose.rigid))
         return turn, float(np.linalg.norm(camera_pose.translation - self.camera_pose.translation))
 
-    def _disturbed(
+    def _add_noise(
         self, pose: Transform, sigmas: RobotSigmas, random: np.random.Generator
     ) -> Transform:
         step = np.repeat(sigmas, 3) * random.normal(size=6)
@@ -248,19 +252,21 @@ def hand_eye_scene(
         distance: distance of camera and target, metres; it varies by a fifth to both sides.
         random: source of the poses, and of the places of camera and target.
     """
-    looks = around(target, poses, tilt=tilt, distance=distance, random=random)
-    turn = exp_rotation(random.uniform(-1.5, 1.5, size=3))
-    hand, hand_source = random.uniform(-0.1, 0.1, size=3), "camera"
-    world = exp_rotation(random.uniform(-1.5, 1.5, size=3))
-    place = random.uniform(-0.6, 0.6, size=3)
+    view_poses = around(target, poses, tilt=tilt, distance=distance, random=random)
+    tool_rotation = exp_rotation(random.uniform(-1.5, 1.5, size=3))
+    tool_position, hand_source = random.uniform(-0.1, 0.1, size=3), "camera"
+    world_rotation = exp_rotation(random.uniform(-1.5, 1.5, size=3))
+    world_position = random.uniform(-0.6, 0.6, size=3)
     if setup == "eye-in-hand":
-        camera_pose = Transform("flange", hand_source, turn, hand)
-        target_pose = Transform("base", "target", world, place)
-        robot = [target_pose @ look @ camera_pose.inverse() for look in looks]
+        camera_pose = Transform("flange", hand_source, tool_rotation, tool_position)
+        target_pose = Transform("base", "target", world_rotation, world_position)
+        robot = [target_pose @ view_pose @ camera_pose.inverse() for view_pose in view_poses]
     else:
-        camera_pose = Transform("base", "camera", world, place)
-        target_pose = Transform("flange", "target", turn, hand)
-        robot = [camera_pose @ look.inverse() @ target_pose.inverse() for look in looks]
+        camera_pose = Transform("base", "camera", world_rotation, world_position)
+        target_pose = Transform("flange", "target", tool_rotation, tool_position)
+        robot = [
+            camera_pose @ view_pose.inverse() @ target_pose.inverse() for view_pose in view_poses
+        ]
     return HandEyeScene(
         setup=setup,
         camera=camera,

@@ -17,13 +17,13 @@ from smartcam.emulator._inside import EvaluatingCamera, applications_of, request
 from smartcam.exceptions import ConfigurationError
 from smartcam.makes._ifm.chunks import JPEG, MONO8, ImageChunk
 from smartcam.makes._ifm.dialect import (
-    ASYNCHRONOUS,
-    ERRORS,
+    ASYNCHRONOUS_TRIGGER,
+    ERROR_TICKET,
     MAX_INPUT_BYTES,
-    NOTIFICATIONS,
+    NOTIFICATION_TICKET,
     OVERRUN,
     PCIC,
-    RESULTS,
+    RESULT_TICKET,
 )
 from smartcam.makes._ifm.layouts import check_layout, encode
 
@@ -33,9 +33,12 @@ if TYPE_CHECKING:
     from smartcam.emulator import LineClient
     from smartcam.protocols import LineRow
 
-INPUT_CONTAINERS = 10
-_KINDS: Mapping[type, str] = {str: "string", bool: "uint8", int: "int32"}
-_NETWORK = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
+INPUT_CONTAINER_COUNT = 10
+_ELEMENT_TYPES: Mapping[type, str] = {str: "string", bool: "uint8", int: "int32"}
+"""ifm's names of the types of values; those of other types are ``float32``."""
+
+_NETWORK_SETTINGS = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
+"""Settings after the address in the answer to ``G?``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +47,11 @@ class IfmApplication:
 
     Attributes:
         id: number, 1 to 99.
-        parts: the values of each evaluation by the ids of elements; records are lists of mappings.
+        parts: values of each evaluation, by ids of elements; records are lists of mappings.
         processing_time: seconds of an evaluation.
         trigger: trigger of evaluations: ``"process"``, ``"continuous"`` or ``"hardware"``.
         images: number of pictures of an evaluation.
-        jpeg: path or bytes of a JPEG file for all pictures; without it, grey levels.
+        jpeg: path or bytes of a JPEG file for all pictures; without it, pictures are grey levels.
     """
 
     id: int
@@ -70,11 +73,11 @@ class IfmApplication:
                 raise ConfigurationError(f"jpeg: {exc}") from exc
 
     def picture(self, count: int, time: float) -> ImageChunk:
-        """Return a picture of an evaluation."""
+        """Return picture number ``count`` since the device began, taken at a time."""
         if isinstance(self.jpeg, bytes) and self.jpeg:
-            size = re.search(rb"\xff[\xc0\xc2].{3}(..)(..)", self.jpeg, re.DOTALL)
-            sides = size.groups() if size else (b"", b"")
-            height, width = (int.from_bytes(side, "big") for side in sides)
+            match = re.search(rb"\xff[\xc0\xc2].{3}(..)(..)", self.jpeg, re.DOTALL)
+            side_bytes = match.groups() if match else (b"", b"")
+            height, width = (int.from_bytes(side, "big") for side in side_bytes)
             return ImageChunk(JPEG, width, height, count, time, self.jpeg)
         levels = np.add.outer(np.arange(48), np.arange(64) + count).astype(np.uint8)
         return ImageChunk(MONO8, 64, 48, count, time, levels.tobytes())
@@ -104,7 +107,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     protocol = PCIC
     client_class: ClassVar[type[TicketedClient]] = IfmClient
-    also_hears: ClassVar[tuple[LineRow, ...]] = (ASYNCHRONOUS,)
+    also_hears: ClassVar[tuple[LineRow, ...]] = (ASYNCHRONOUS_TRIGGER,)
 
     def __init__(
         self,
@@ -115,14 +118,18 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         defaults: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        made = applications_of(IfmApplication, applications, defaults)
-        self.set_up({each.id: each.parts for each in made}, active, 0)
-        self.applications: Mapping[int, IfmApplication] = {each.id: each for each in made}
+        built_applications = applications_of(IfmApplication, applications, defaults)
+        self.set_up(
+            {application.id: application.parts for application in built_applications}, active, 0
+        )
+        self.applications: Mapping[int, IfmApplication] = {
+            application.id: application for application in built_applications
+        }
         self.version: int = check_integer(version, "version", 1, 4)
         self.error = 0
         self.results: int = 0
         self.good: int = 0
-        self.inputs: list[str] = [""] * INPUT_CONTAINERS
+        self.inputs: list[str] = [""] * INPUT_CONTAINER_COUNT
         self.values: Mapping[str, Any] = {}
         self._outputs: dict[str, str] = {}
         super().__init__(**options)
@@ -142,21 +149,24 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return client
 
     def own_layout(self) -> Mapping[str, Any]:
-        """Return the device's own layout: the values of a part as ASCII, between two words."""
+        """Return the device's own layout: a part's values as ASCII, from ``star`` to ``stop``."""
         semicolon = {"type": "string", "id": "delimiter", "value": ";"}
         elements: list[dict[str, Any]] = [{"type": "string", "id": "begin", "value": "star"}]
         for key, value in self.application.parts[0].items():
             if not isinstance(value, (list, tuple, bytes)):
-                elements += (semicolon, {"type": _KINDS.get(type(value), "float32"), "id": key})
+                elements += (
+                    semicolon,
+                    {"type": _ELEMENT_TYPES.get(type(value), "float32"), "id": key},
+                )
         elements += (semicolon, {"type": "string", "id": "end", "value": "stop"})
-        form = {"dataencoding": "ascii"}
-        return {"layouter": "flexible", "format": form, "elements": elements}
+        element_format = {"dataencoding": "ascii"}
+        return {"layouter": "flexible", "format": element_format, "elements": elements}
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Carry out a request; during a long one, further requests are read."""
+        """Answer a request; while the answer is awaited, further requests are read."""
         call = cast("IfmClient", client.answer_later())
-        untold = call.dialect.tickets and not call.ticket
-        call.answer("?") if untold else super().hear(call, line)
+        lacks_ticket = call.dialect.tickets and not call.ticket
+        call.answer("?") if lacks_ticket else super().hear(call, line)
 
     def unknown(self, line: str) -> str:
         """Return the answer to an unknown command."""
@@ -170,16 +180,20 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return self.application.processing_time
 
     def evaluated(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
-        """Answer with the result, and send it to all clients that have switched results on."""
+        """Answer with the result; send it to all clients that have switched results on."""
         self.values = part
         self.results += 1
         self.good += bool(part.get("passed", True))
-        asker = None if call is None else cast("IfmClient", call).session
+        asking_client = None if call is None else cast("IfmClient", call).session
         if call is not None:
-            call.answer(self._encoded(cast("IfmClient", call)))
-        self.tell(RESULTS, self._encoded, lambda client: client.outputs & 1 and client is not asker)
+            call.answer(self._encode_result(cast("IfmClient", call)))
+        self.tell(
+            RESULT_TICKET,
+            self._encode_result,
+            lambda client: client.outputs & 1 and client is not asking_client,
+        )
 
-    def _encoded(self, client: IfmClient) -> str:
+    def _encode_result(self, client: IfmClient) -> str:
         try:
             return encode(client.layout, self.values).decode("latin-1")
         except (TypeError, ValueError, AttributeError, struct.error):
@@ -191,13 +205,17 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     def overrun(self) -> None:
         """Report that a trigger came too early."""
-        self.tell(ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", lambda client: client.outputs & 2)
+        self.tell(
+            ERROR_TICKET, lambda _: f"{OVERRUN}:Trigger overrun", lambda client: client.outputs & 2
+        )
 
     def activate(self, application: int) -> None:
-        """Make another application the active one, and report that."""
+        """Make another application the active one; notify the clients."""
         super().activate(application)
         text = json.dumps({"Index": application})
-        self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda client: client.outputs & 4)
+        self.tell(
+            NOTIFICATION_TICKET, lambda _: f"000500000:{text}", lambda client: client.outputs & 4
+        )
 
     def activated(self) -> None:
         """Start evaluating, if the active application runs continuously."""
@@ -228,19 +246,19 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return None
 
     @request(r"p([0-7])")
-    def _p(self, call: IfmClient, outputs: str) -> str:
+    def _choose_messages(self, call: IfmClient, outputs: str) -> str:
         """Switch results (1), errors (2) and notifications (4) of this session on."""
         call.session.outputs = int(outputs)
         return "*"
 
     @request(r"A\?")
-    def _apps(self, call: IfmClient) -> str:
+    def _list_applications(self, call: IfmClient) -> str:
         """Return the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
         return "\t".join([*numbers, *(f"{application:02}" for application in self.applications)])
 
     @request(r"a(\d\d)")
-    def _a(self, call: IfmClient, number: str) -> str:
+    def _switch_application(self, call: IfmClient, number: str) -> str:
         """Make another application the active one."""
         if int(number) not in self.applications:
             return "!"
@@ -248,34 +266,34 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return "*"
 
     @request(r"E\?")
-    def _error(self, call: IfmClient) -> str:
+    def _read_error(self, call: IfmClient) -> str:
         """Return the present error as nine digits, all zeros for none."""
         return f"{self.error:09}"
 
     @request(r"S\?")
-    def _stats(self, call: IfmClient) -> str:
+    def _count_results(self, call: IfmClient) -> str:
         """Return the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
         return "\t".join(f"{count:010}" for count in counts) if self.active else "!"
 
     @request(r"G\?")
-    def _identity(self, call: IfmClient) -> str:
+    def _identify(self, call: IfmClient) -> str:
         """Return maker, article, name, place, description, address, ports and time settings."""
         return "\t".join(
-            ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK)
+            ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK_SETTINGS)
         )
 
     @request(r"H\?")
-    def _help(self, call: IfmClient) -> str:
+    def _list_requests(self, call: IfmClient) -> str:
         """Return this list."""
-        words = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
-        each = {
-            words.sub("", form.pattern): handler.__doc__ for form, handler in self.requests.items()
+        groups = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
+        texts = {
+            groups.sub("", form.pattern): handler.__doc__ for form, handler in self.requests.items()
         }
-        return "\n".join(f"{form:<4} {text}" for form, text in each.items())
+        return "\n".join(f"{form:<4} {text}" for form, text in texts.items())
 
     @request(r"I(\d\d)\?")
-    def _image(self, call: IfmClient, kind: str) -> str:
+    def _read_image(self, call: IfmClient, kind: str) -> str:
         """Return the last image: 01 as JPEG files, 02 as grey levels."""
         application, now = self.application, self.clock.now
         if kind != ("01" if application.jpeg else "02"):
@@ -284,10 +302,10 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         data = b"".join(application.picture(count, now).encoded for count in counts).decode(
             "latin-1"
         )
-        return _counted(data) if data else "!"
+        return _with_length(data) if data else "!"
 
     @request(r"c(\d{9})(.*)")
-    def _c(self, call: IfmClient, length: str, text: str) -> str:
+    def _set_layout(self, call: IfmClient, length: str, text: str) -> str:
         """Set the layout of this session's results, from JSON with its length."""
         if int(length) != len(text):
             return "!"
@@ -298,12 +316,12 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return "*"
 
     @request(r"C\?")
-    def _layout(self, call: IfmClient) -> str:
+    def _read_layout(self, call: IfmClient) -> str:
         """Return the layout of this session with its length."""
-        return _counted(json.dumps(call.layout))
+        return _with_length(json.dumps(call.layout))
 
     @request(r"j(0\d)(\d{9})(.*)")
-    def _j(self, call: IfmClient, number: str, length: str, text: str) -> str:
+    def _write_input(self, call: IfmClient, number: str, length: str, text: str) -> str:
         """Put a text with its length into an input container, 00 to 09."""
         if int(length) != len(text) or len(text) > MAX_INPUT_BYTES:
             return "!"
@@ -311,49 +329,49 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return "*"
 
     @request(r"J(0\d)\?")
-    def _text(self, call: IfmClient, number: str) -> str:
+    def _read_input(self, call: IfmClient, number: str) -> str:
         """Return the text in an input container, with its length."""
-        return _counted(self.inputs[int(number)])
+        return _with_length(self.inputs[int(number)])
 
     @request(r"g[01]|d[01]\d{3}")
-    def _star(self, call: IfmClient) -> str:
+    def _accept(self, call: IfmClient) -> str:
         """Open or close the gate of a trigger that lasts; switch the view indicators."""
         return "*"
 
     @request(r"o(0[1-4])([01])")
-    def _o(self, call: IfmClient, pin: str, state: str) -> str:
+    def _set_output(self, call: IfmClient, pin: str, state: str) -> str:
         """Set an output."""
         self._outputs[pin] = state
         return "*"
 
     @request(r"O(0[1-4])\?")
-    def _output(self, call: IfmClient, pin: str) -> str:
+    def _read_output(self, call: IfmClient, pin: str) -> str:
         """Return the state of an output."""
         return pin + self._outputs.get(pin, "0")
 
     @request(r"L\?")
-    def _session(self, call: IfmClient) -> str:
+    def _session_number(self, call: IfmClient) -> str:
         """Return the number of this session."""
         return f"{call.number:03}"
 
     @request(r"V\?")
-    def _versions(self, call: IfmClient) -> str:
+    def _list_versions(self, call: IfmClient) -> str:
         """Return the version of the protocol, and the versions that can be set."""
         version = int(call.dialect.name[1:])
         return f"{version:02} 01 02 03" if version < 4 else "04 01 04"
 
     @request(r"v0([1-4])")
-    def _v(self, call: IfmClient, version: str) -> str:
+    def _set_version(self, call: IfmClient, version: str) -> str:
         """Set the version of the protocol for this session."""
         call.session.speak(f"v{version}")
         return "*"
 
     @request(r"v\d\d|[jJoO]\d\d.*")
-    def _no_such(self, call: IfmClient) -> str:
+    def _refuse_missing(self, call: IfmClient) -> str:
         """Refuse a version, an input container or an output that the device does not have."""
         return "!"
 
 
-def _counted(text: str) -> str:
-    """Return a text after its length."""
+def _with_length(text: str) -> str:
+    """Return a text preceded by its length, in nine digits."""
     return f"{len(text):09}{text}"

@@ -1,4 +1,4 @@
-"""PCIC, the process interface of ifm's sensors: each answer carries the ticket of its question.
+"""PCIC, the process interface of ifm's sensors: each answer has the ticket of its question.
 
 The known facts about the devices, with their sources, are in ``docs/ifm.md``.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from smartcam._arguments import check_choice
 from smartcam.exceptions import ConfigurationError, FrameError, UnsupportedError
 from smartcam.makes._ifm.chunks import read_chunks
-from smartcam.makes._ifm.layouts import MARK, layout_json, with_bools
+from smartcam.makes._ifm.layouts import RESULT_MARK, convert_bools, layout_json
 from smartcam.models import Status
 from smartcam.protocols import (
     CodeMeaning,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 50010
 TICKETS = range(1000, 10000)
-RESULTS, ERRORS, NOTIFICATIONS, DEBUG = "0000", "0001", "0010", "0020"
+RESULT_TICKET, ERROR_TICKET, NOTIFICATION_TICKET, DEBUG_TICKET = "0000", "0001", "0010", "0020"
 """Tickets of messages that a device sends unasked."""
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
@@ -51,55 +51,55 @@ MAX_INPUT_BYTES = 256
 """Largest number of bytes of an input container."""
 
 CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
-"""Codes of this library for the answers of a single character."""
+"""Codes, of this library alone, for answers of a single character."""
 
-NOT_NOW = 4
-"""Code of this library for a trigger that was answered with ``!``."""
+TRIGGER_REFUSED = 4
+"""Code, of this library alone, for a trigger that was answered with ``!``."""
 
-_MEANINGS: Mapping[int, CodeMeaning] = {
+_CODE_MEANINGS: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
     1: CodeMeaning("!: not now, or a wrong value", Verdict.REFUSED),
     2: CodeMeaning("?: wrong syntax or length", Verdict.UNKNOWN),
     3: CodeMeaning("$: unknown error code", Verdict.REFUSED),
-    NOT_NOW: CodeMeaning(
+    TRIGGER_REFUSED: CodeMeaning(
         "!: busy, another trigger source, no application, or configuration mode", Verdict.BUSY
     ),
 }
 
-FATAL = frozenset({110001001, 110001002, 110001003})
-"""Errors that are System Error: boot timeout, fatal software error, unknown hardware."""
+FATAL_ERRORS = frozenset({110001001, 110001002, 110001003})
+"""Errors that set the bit System Error: boot timeout, fatal software error, unknown hardware."""
 
 OVERTEMPERATURE, OVERRUN = 110004000, 110001006
 
 
 def _trigger_code(answer: str) -> int | None:
     code = CODES.get(answer)
-    return NOT_NOW if code == 1 else code
+    return TRIGGER_REFUSED if code == 1 else code
 
 
-def _triggered(answer: str) -> tuple[m.Message, ...]:
+def _read_trigger_answer(answer: str) -> tuple[m.Message, ...]:
     code = _trigger_code(answer)
     if code:
         return (m.TriggerAnswer(code=code),)
-    return m.TriggerAnswer(), _result(answer)
+    return m.TriggerAnswer(), _read_result(answer)
 
 
-def _result(content: str) -> m.ResultContainer:
+def _read_result(content: str) -> m.ResultContainer:
     return m.ResultContainer(data=content.encode("latin-1"))
 
 
-def _status(answer: str) -> m.StatusReport:
+def _read_status(answer: str) -> m.StatusReport:
     """Return the status: an error state of nine digits, or ``!`` in configuration mode."""
     if answer in CODES:
         return m.StatusReport(status=Status(0))
     error = int(answer)
-    trouble = Status.SYSTEM_ERROR if error in FATAL else Status(0)
-    hot = Status.OVERHEAT if error == OVERTEMPERATURE else Status(0)
-    return m.StatusReport(status=READY | trouble | hot)
+    error_bit = Status.SYSTEM_ERROR if error in FATAL_ERRORS else Status(0)
+    heat_bit = Status.OVERHEAT if error == OVERTEMPERATURE else Status(0)
+    return m.StatusReport(status=READY | error_bit | heat_bit)
 
 
-def _active(answer: str) -> int:
-    """Return the active application of ``count TAB active TAB ...``; -1 if there is none."""
+def _read_active(answer: str) -> int:
+    """Return the active application from ``count TAB active TAB ...``; -1 if there is none."""
     if answer == "!":
         return m.UNNAMED_APPLICATION
     count, active, *_ = answer.split("\t")
@@ -108,57 +108,57 @@ def _active(answer: str) -> int:
     return int(active) if int(count) and int(active) else m.UNNAMED_APPLICATION
 
 
-def _error(content: str) -> m.Notice:
-    return _notice("error", content)
+def _read_error(content: str) -> m.Notice:
+    return _read_notice("error", content)
 
 
-def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
-    """Return an error; an overrun also as the status of a dropped trigger, maybe this client's."""
-    notice = _error(content)
+def _read_error_or_overrun(content: str) -> tuple[m.Message, ...]:
+    """Return an error; for an overrun also statuses of a dropped trigger, perhaps this client's."""
+    notice = _read_error(content)
     if notice.code != OVERRUN:
         return (notice,)
     overrun = m.StatusReport(status=READY | Status.OVERTRIGGERED)
     return notice, overrun, m.StatusReport(status=READY)
 
 
-def _notice(kind: Literal["error", "notification"], content: str) -> m.Notice:
-    """Return the notice of a device about itself: nine digits, a colon and a text."""
+def _read_notice(kind: Literal["error", "notification"], content: str) -> m.Notice:
+    """Return a device's notice about itself from nine digits, a colon and a text."""
     digits, colon, text = content.partition(":")
     if colon and digits.isascii() and digits.isdecimal() and len(digits) <= 9:
         return m.Notice(kind, int(digits), text)
     return m.Notice(kind, 0, content)
 
 
-def _reply(answer: str) -> LineReply:
+def _read_reply(answer: str) -> LineReply:
     return LineReply(code=CODES.get(answer, 0), data=answer.encode("latin-1"))
 
 
-def _connect(dialect: PcicDialect, message: m.Connect) -> Script:
-    """Ask for the device's maker, switch its messages on, and upload the layout."""
+def _connect_script(dialect: PcicDialect, message: m.Connect) -> Script:
+    """Ask for the maker, switch unasked messages on, and upload the layout."""
     maker = yield "G?"
     if not maker.upper().startswith("IFM"):
         raise FrameError(f"{maker[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
     code = CODES[(yield "p7" if dialect.tickets else "p0")]
-    code = code or (yield from _upload(dialect))
+    code = code or (yield from _upload_layout(dialect))
     return m.ConnectAnswer(code=code, version=1)
 
 
-def _upload(dialect: PcicDialect) -> Generator[str, str, int]:
+def _upload_layout(dialect: PcicDialect) -> Generator[str, str, int]:
     if dialect.layout is None:
         return 0
-    described = layout_json(dialect.layout)
-    return CODES[(yield f"c{len(described):09}{described}")]
+    description = layout_json(dialect.layout)
+    return CODES[(yield f"c{len(description):09}{description}")]
 
 
-def _switch(dialect: PcicDialect, message: m.SwitchApplication) -> Script:
+def _switch_script(dialect: PcicDialect, message: m.SwitchApplication) -> Script:
     code = CODES[(yield f"a{message.application:02}")]
-    active = _active((yield "A?"))
+    active = _read_active((yield "A?"))
     if code == 0:
-        code = yield from _upload(dialect)  # the layout may be lost with the old application
+        code = yield from _upload_layout(dialect)  # the layout may be lost with the old application
     return m.SwitchAnswer(code=code, application=active)
 
 
-def _image(dialect: PcicDialect, message: m.ReadImage) -> Script:
+def _image_script(dialect: PcicDialect, message: m.ReadImage) -> Script:
     answer = yield "I01?"
     if answer in CODES:
         answer = yield "I02?"
@@ -168,7 +168,7 @@ def _image(dialect: PcicDialect, message: m.ReadImage) -> Script:
     return m.Image(data=chunks[0].file if chunks else b"")
 
 
-def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
+def _input_script(dialect: PcicDialect, message: m.SetInput) -> Script:
     data = message.data
     if len(data) > MAX_INPUT_BYTES:
         raise ConfigurationError(
@@ -178,38 +178,63 @@ def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
     return m.SetInputAnswer(code=CODES[answer])
 
 
-def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
-    """Return the rows; without lengths, none for pictures; without tickets, none for messages."""
-    error = _error if trigger.answer is m.ResultContainer else _error_or_overrun
-    unasked = (
-        LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
-        LineRow(None, "errors", m.Notice, error, word=ERRORS, also=(m.StatusReport,)),
+def _make_rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
+    """Return the rows of a dialect.
+
+    There are rows for pictures only with ``lengths``, for unasked messages only with ``tickets``.
+    """
+    read_error = _read_error if trigger.answer is m.ResultContainer else _read_error_or_overrun
+    unasked_rows = (
+        LineRow(None, "results", m.ResultContainer, _read_result, word=RESULT_TICKET),
+        LineRow(None, "errors", m.Notice, read_error, word=ERROR_TICKET, also=(m.StatusReport,)),
         LineRow(
-            None, "notifications", m.Notice, partial(_notice, "notification"), word=NOTIFICATIONS
+            None,
+            "notifications",
+            m.Notice,
+            partial(_read_notice, "notification"),
+            word=NOTIFICATION_TICKET,
         ),
-        LineRow(None, "debug", m.Notice, lambda text: m.Notice("debug", 0, text[:200]), word=DEBUG),
+        LineRow(
+            None,
+            "debug",
+            m.Notice,
+            lambda text: m.Notice("debug", 0, text[:200]),
+            word=DEBUG_TICKET,
+        ),
     )
     return (
-        LineRow(m.Connect, "G?", m.ConnectAnswer, refuse_line, script=_connect),
-        LineRow(m.GetStatus, "E?", m.StatusReport, _status),
+        LineRow(m.Connect, "G?", m.ConnectAnswer, refuse_line, script=_connect_script),
+        LineRow(m.GetStatus, "E?", m.StatusReport, _read_status),
         LineRow(
-            m.Query, "A?", m.QueryAnswer, lambda text: m.QueryAnswer(application=_active(text))
+            m.Query, "A?", m.QueryAnswer, lambda text: m.QueryAnswer(application=_read_active(text))
         ),
-        LineRow(m.SwitchApplication, "a{application}", m.SwitchAnswer, refuse_line, script=_switch),
+        LineRow(
+            m.SwitchApplication,
+            "a{application}",
+            m.SwitchAnswer,
+            refuse_line,
+            script=_switch_script,
+        ),
         trigger,
-        *((LineRow(m.ReadImage, "I01?", m.Image, refuse_line, script=_image),) if lengths else ()),
-        LineRow(m.SetInput, "j{data}", m.SetInputAnswer, refuse_line, script=_input),
-        *(unasked if tickets else ()),
-        LineRow(LineCommand, "{line}", LineReply, _reply),
+        *(
+            (LineRow(m.ReadImage, "I01?", m.Image, refuse_line, script=_image_script),)
+            if lengths
+            else ()
+        ),
+        LineRow(m.SetInput, "j{data}", m.SetInputAnswer, refuse_line, script=_input_script),
+        *(unasked_rows if tickets else ()),
+        LineRow(LineCommand, "{line}", LineReply, _read_reply),
     )
 
 
-SYNCHRONOUS = LineRow(m.Trigger, "T?", m.ResultContainer, _triggered, also=(m.TriggerAnswer,))
-ASYNCHRONOUS = LineRow(
+SYNCHRONOUS_TRIGGER = LineRow(
+    m.Trigger, "T?", m.ResultContainer, _read_trigger_answer, also=(m.TriggerAnswer,)
+)
+ASYNCHRONOUS_TRIGGER = LineRow(
     m.Trigger, "t", m.TriggerAnswer, lambda text: m.TriggerAnswer(code=_trigger_code(text) or 0)
 )
 
-_COMMAND = re.compile(r"[A-Zabcdgjlop][^\r\n]*")
+_COMMAND_FORM = re.compile(r"[A-Zabcdgjlop][^\r\n]*")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -218,7 +243,7 @@ class PcicDialect(TicketedDialect):
 
     Args:
         layout: layout of the session's results; None for the device's own.
-        container: number of the input container for input data.
+        container: number of the input container that input data goes to.
     """
 
     layout: Layout | None = None
@@ -232,23 +257,23 @@ class PcicDialect(TicketedDialect):
         Raises:
             ConfigurationError: there is no such trigger or container.
         """
-        kind = check_choice(parameters.get("trigger", "sync"), "trigger", ("sync", "async"))
+        trigger_kind = check_choice(parameters.get("trigger", "sync"), "trigger", ("sync", "async"))
         container = parameters.get("input", str(self.container))
         if not (container.isdecimal() and len(container) <= 2):
             raise ConfigurationError(f"input: 0 to 99 was expected, got {container!r}")
-        trigger = SYNCHRONOUS if kind == "sync" else ASYNCHRONOUS
-        rows = _rows(trigger, tickets=bool(self.tickets), lengths=bool(self.digits))
+        trigger = SYNCHRONOUS_TRIGGER if trigger_kind == "sync" else ASYNCHRONOUS_TRIGGER
+        rows = _make_rows(trigger, tickets=bool(self.tickets), lengths=bool(self.digits))
         return replace(self, container=int(container), rows=rows, split=None)
 
     def for_layout(self, layout: Layout | None) -> PcicDialect:
         """Return the dialect for a session that uploads a layout.
 
         Raises:
-            ConfigurationError: a device cannot give such results, or this version has no binary
-                results, or none without a trigger.
+            ConfigurationError: a device cannot send such results, or this version has no binary
+                results or no unasked ones.
         """
         row = self.row(m.Trigger)
-        if not self.tickets and row is ASYNCHRONOUS:
+        if not self.tickets and row is ASYNCHRONOUS_TRIGGER:
             raise ConfigurationError(
                 f"ifm: dialect {self.name} has no results without a question, so no trigger=async"
             )
@@ -261,13 +286,13 @@ class PcicDialect(TicketedDialect):
             )
         layout_json(layout)
         readers = {
-            row: _read_with(layout, row) for row in self.rows if row.answer is m.ResultContainer
+            row: _make_reader(layout, row) for row in self.rows if row.answer is m.ResultContainer
         }
         rows = tuple(row._replace(read=readers.get(row, row.read)) for row in self.rows)
         return replace(self, layout=layout, rows=rows, split=None)
 
     def command(self, line: str) -> str:
-        """Return a command of the user, checked.
+        """Return a user's command after checking it.
 
         Raises:
             ConfigurationError: the line is no command, or would end the session, such as one that
@@ -283,7 +308,7 @@ class PcicDialect(TicketedDialect):
             raise ConfigurationError(
                 f"ifm: the session's layout is that of interpret_as: {self.layout.text}"
             )
-        if not _COMMAND.fullmatch(line):
+        if not _COMMAND_FORM.fullmatch(line):
             raise ConfigurationError(
                 f"ifm: {line[:32]!r} is no command; smartcam.makes has them in docs/ifm.md; "
                 "the version is the dialect's"
@@ -291,31 +316,34 @@ class PcicDialect(TicketedDialect):
         return line
 
 
-def _read_with(layout: Layout, row: LineRow) -> Callable[[str], Reported]:
-    """Return a reader of results of an uploaded layout, which begin with a mark."""
+def _make_reader(layout: Layout, row: LineRow) -> Callable[[str], Reported]:
+    """Return a function that reads results in an uploaded layout, which begin with a mark."""
 
     def read(content: str) -> Reported:
         if row.request is m.Trigger and content in CODES:
             return row.read(content)
         data = content.encode("latin-1")
-        if content.startswith(MARK):
-            container = m.ResultContainer(data=with_bools(layout, data[len(MARK) :]))
+        if content.startswith(RESULT_MARK):
+            container = m.ResultContainer(data=convert_bools(layout, data[len(RESULT_MARK) :]))
         else:
-            fault = f"{content[:32]!r} came, a result in the session's layout begins with {MARK!r}"
+            fault = (
+                f"{content[:32]!r} came, a result in the session's layout begins with "
+                f"{RESULT_MARK!r}"
+            )
             container = m.ResultContainer(data=data, cells=(), fault=fault)
         return (m.TriggerAnswer(), container) if row.request is m.Trigger else container
 
     return read
 
 
-def _version(name: str, about: str, tickets: range, digits: int) -> PcicDialect:
+def _make_version(name: str, about: str, tickets: range, digits: int) -> PcicDialect:
     return PcicDialect(
         name=name,
         about=about,
         source="docs/ifm.md, published",
         ids=range(1, MAX_APPLICATION + 1),
-        rows=_rows(SYNCHRONOUS, tickets=bool(tickets), lengths=bool(digits)),
-        codes=_MEANINGS,
+        rows=_make_rows(SYNCHRONOUS_TRIGGER, tickets=bool(tickets), lengths=bool(digits)),
+        codes=_CODE_MEANINGS,
         tickets=tickets,
         at_once=bool(tickets),
         digits=digits,
@@ -324,10 +352,10 @@ def _version(name: str, about: str, tickets: range, digits: int) -> PcicDialect:
 
 
 _VERSIONS = (
-    _version("v3", "ticket and length in both directions", TICKETS, 9),
-    _version("v4", "answers with their length, no tickets", range(0), 9),
-    _version("v2", "tickets, no length: texts only", TICKETS, 0),
-    _version("v1", "neither: texts only, no results but a trigger's", range(0), 0),
+    _make_version("v3", "ticket and length in both directions", TICKETS, 9),
+    _make_version("v4", "answers with their length, no tickets", range(0), 9),
+    _make_version("v2", "tickets, no length: texts only", TICKETS, 0),
+    _make_version("v1", "neither: texts only, no results but a trigger's", range(0), 0),
 )
 
 PCIC = Protocol(

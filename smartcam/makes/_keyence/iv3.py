@@ -1,4 +1,4 @@
-"""Keyence IV2 and IV3: sensors that answer each trigger with their judgement.
+"""Speak to Keyence IV2 and IV3: sensors that answer each trigger with a judgement.
 
 The known facts about them, with their sources, are in ``docs/keyence.md``.
 """
@@ -12,7 +12,7 @@ from smartcam.makes._keyence.words import (
     LINE_END,
     MAX_LINE_BYTES,
     READY,
-    asked_word,
+    answer_key,
     check_done,
     error_code,
 )
@@ -44,20 +44,20 @@ CODES = {
     3: CodeMeaning("not now", Verdict.BUSY),
     22: CodeMeaning("wrong parameter", Verdict.REFUSED),
 }
-"""Codes after ``ER,<command>``; from other devices of the family (inferred)."""
+"""Codes after ``ER,<command>``; taken from other devices of the family (inferred)."""
 
 
 def read_result(line: str) -> m.ResultContainer:
-    """Return the result in ``RT,count,OK|NG[,tool,OK|NG,rate]...``; ValueError for others."""
-    word, count, judged, *tools = line.split(",")
+    """Return the result in ``RT,count,OK|NG[,tool,OK|NG,rate]...``; raise ValueError for others."""
+    word, count, judgement, *tools = line.split(",")
     if word != "RT":
         raise ValueError(line)
-    cells = [m.CellValue("count", count), m.CellValue("judgement", _passed(judged))]
-    for place in range(0, len(tools) - len(tools) % 3, 3):
-        tool, passed, rate = tools[place : place + 3]
+    cells = [m.CellValue("count", count), m.CellValue("judgement", _bool_text(judgement))]
+    for index in range(0, len(tools) - len(tools) % 3, 3):
+        tool, passed, rate = tools[index : index + 3]
         cells += (
             m.CellValue(f"tool {tool}", tool),
-            m.CellValue(f"tool {tool} judgement", _passed(passed)),
+            m.CellValue(f"tool {tool} judgement", _bool_text(passed)),
             m.CellValue(f"tool {tool} rate", rate),
         )
     if len(tools) % 3:
@@ -65,29 +65,29 @@ def read_result(line: str) -> m.ResultContainer:
     return m.ResultContainer(data=line.encode(ENCODING), cells=tuple(cells))
 
 
-def _passed(word: str) -> str:
+def _bool_text(word: str) -> str:
     return {"OK": "1", "NG": "0"}[word]
 
 
-def _triggered(line: str) -> tuple[m.Message, ...]:
+def _read_trigger_answer(line: str) -> tuple[m.Message, ...]:
     code = error_code(line)
     if code is not None:
         return (m.TriggerAnswer(code=code),)
     return m.TriggerAnswer(), read_result(line)
 
 
-def _unasked(line: str) -> m.Notice:
-    """Return an unasked result as a notice: no sensor is known to send any."""
+def _read_unasked(line: str) -> m.Notice:
+    """Return an unasked result as a notice; no known sensor sends one."""
     return m.Notice("notification", 0, line)
 
 
-def _connected(line: str) -> tuple[m.Message, ...]:
+def _read_connect_answer(line: str) -> tuple[m.Message, ...]:
     if error_code(line) is None:
         read_result(line)
     return m.ConnectAnswer(version=1), m.StatusReport(status=READY)
 
 
-def _program(line: str) -> m.QueryAnswer:
+def _read_program(line: str) -> m.QueryAnswer:
     word, program = line.split(",")
     if word != "PR" or not program.isdecimal() or len(program) > 9:
         raise ValueError(line)
@@ -96,13 +96,13 @@ def _program(line: str) -> m.QueryAnswer:
     return m.QueryAnswer(application=int(program))
 
 
-def _switch(dialect: LineDialect, message: m.SwitchApplication) -> Script:
+def _switch_script(dialect: LineDialect, message: m.SwitchApplication) -> Script:
     code = check_done((yield f"PW,{message.application}"))
-    program = _program((yield "PR")).application
+    program = _read_program((yield "PR")).application
     return m.SwitchAnswer(code=code, application=program)
 
 
-def _reply(line: str) -> LineReply:
+def _read_reply(line: str) -> LineReply:
     return LineReply(code=check_done(line), data=line.encode(ENCODING))
 
 
@@ -111,20 +111,31 @@ LINES = LineDialect(
     about="lines that end with CR",
     source="docs/keyence.md, derived",
     rows=(
-        LineRow(m.Connect, "RT", m.ConnectAnswer, _connected, also=(m.StatusReport,)),
-        LineRow(m.Query, "PR", m.QueryAnswer, _program),
+        LineRow(m.Connect, "RT", m.ConnectAnswer, _read_connect_answer, also=(m.StatusReport,)),
+        LineRow(m.Query, "PR", m.QueryAnswer, _read_program),
         LineRow(
-            m.SwitchApplication, "PW,{application}", m.SwitchAnswer, refuse_line, script=_switch
+            m.SwitchApplication,
+            "PW,{application}",
+            m.SwitchAnswer,
+            refuse_line,
+            script=_switch_script,
         ),
-        LineRow(m.Trigger, "T2", m.ResultContainer, _triggered, word="RT", also=(m.TriggerAnswer,)),
-        LineRow(None, "result", m.Notice, _unasked, word="RT"),
-        LineRow(LineCommand, "{line}", LineReply, _reply),
+        LineRow(
+            m.Trigger,
+            "T2",
+            m.ResultContainer,
+            _read_trigger_answer,
+            word="RT",
+            also=(m.TriggerAnswer,),
+        ),
+        LineRow(None, "result", m.Notice, _read_unasked, word="RT"),
+        LineRow(LineCommand, "{line}", LineReply, _read_reply),
     ),
     ids=range(LAST_PROGRAM + 1),
     line_end=LINE_END,
     max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
-    split=lambda line: (asked_word(line, {"T2": "RT"}), line),
+    split=lambda line: (answer_key(line, {"T2": "RT"}), line),
     codes=CODES,
     names_application=False,
     make="Keyence IV3",

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
     from smartcam.emulator import LineClient
 
-LAST_COUNT = 32_767
-"""The largest count of triggers; the next one is 1."""
+MAX_COUNT = 32_767
+"""Largest count of triggers; the count after it is 1."""
 
-LEAST_RATE = 70
-"""The least rate that a tool accepts as OK."""
+MIN_OK_RATE = 70
+"""Smallest rate that a tool judges as OK."""
 
 
 class EmulatedIv3(EvaluatingCamera):
@@ -26,7 +26,7 @@ class EmulatedIv3(EvaluatingCamera):
     Args:
         programs: numbers of its programs, 0 to 127.
         active: number of the active program; None for the first one.
-        parts: the rates of the tools of each part; 70 and more is OK.
+        parts: rates of the tools for each part; a rate of 70 or more is OK.
         processing_time: seconds of an inspection.
         options: the options of :class:`~smartcam.emulator.LineCamera`.
 
@@ -60,14 +60,14 @@ class EmulatedIv3(EvaluatingCamera):
 
     def evaluated(self, call: LineClient | None, part: Sequence[int]) -> None:
         """Judge a part; send the result to the client that asked for it."""
-        self.count = self.count % LAST_COUNT + 1
+        self.count = self.count % MAX_COUNT + 1
         rates = [check_integer(rate, "a rate", 0, 9_999_999) for rate in part]
         tools = [
-            f"{tool:02},{'OK' if rate >= LEAST_RATE else 'NG'},{rate:07}"
+            f"{tool:02},{'OK' if rate >= MIN_OK_RATE else 'NG'},{rate:07}"
             for tool, rate in enumerate(rates, 1)
         ]
-        judged = "OK" if all(rate >= LEAST_RATE for rate in rates) else "NG"
-        self.last = ",".join([f"RT,{self.count:05},{judged}", *tools])
+        judgement = "OK" if all(rate >= MIN_OK_RATE for rate in rates) else "NG"
+        self.last = ",".join([f"RT,{self.count:05},{judgement}", *tools])
         if call is not None:
             call.answer(self.last)
 
@@ -88,7 +88,7 @@ class EmulatedIv3(EvaluatingCamera):
         return None
 
     @request("T1")
-    def _blind(self, client: LineClient) -> str:
+    def _trigger_without_answer(self, client: LineClient) -> str:
         """Inspect; the client asks for the result later."""
         if self.busy:
             return "ER,T1,03"

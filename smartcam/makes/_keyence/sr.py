@@ -14,7 +14,7 @@ from smartcam.makes._keyence.words import (
     LINE_END,
     MAX_LINE_BYTES,
     READY,
-    asked_word,
+    answer_key,
     check_done,
     error_code,
 )
@@ -50,10 +50,10 @@ CODES = {
     22: CodeMeaning("a file is wrong", Verdict.REFUSED),
     99: CodeMeaning("the reader is broken", Verdict.REFUSED),
 }
-"""Codes after ``ER,<command>``; 00, an unknown command, is 100 here, since 0 means done."""
+"""Codes after ``ER,<command>``. Code 00, an unknown command, is 100 here, since 0 means done."""
 
 
-def _code(line: str) -> int:
+def _answer_code(line: str) -> int:
     code = error_code(line)
     return 0 if code is None else code or 100
 
@@ -61,67 +61,78 @@ def _code(line: str) -> int:
 def read_code(line: str) -> m.ResultContainer:
     """Return the result of a reading: whether a code was read, and its text."""
     data = line.encode(ENCODING)
-    read = line != NOTHING_READ
-    text = data.decode("utf-8", "replace") if read else ""
-    cells = (m.CellValue("read", str(int(read))), m.CellValue("code", text))
+    is_read = line != NOTHING_READ
+    text = data.decode("utf-8", "replace") if is_read else ""
+    cells = (m.CellValue("read", str(int(is_read))), m.CellValue("code", text))
     return m.ResultContainer(data=data, cells=cells)
 
 
-def _scanned(line: str) -> tuple[m.Message, ...]:
+def _read_trigger_answer(line: str) -> tuple[m.Message, ...]:
     if line.startswith("ER,LON,"):
-        return (m.TriggerAnswer(code=_code(line)),)
-    return m.TriggerAnswer(), _unasked(line)
+        return (m.TriggerAnswer(code=_answer_code(line)),)
+    return m.TriggerAnswer(), _read_unasked(line)
 
 
-def _unasked(line: str) -> m.ResultContainer:
+def _read_unasked(line: str) -> m.ResultContainer:
     if line.startswith(("ER,", "OK,LON")):  # an answer and no code: LON has none
         raise ValueError(line)
     return read_code(line)
 
 
-def _busy(line: str) -> m.StatusReport:
-    """Return the status of ``OK,BUSYSTAT,NONE``, or of another word in place of NONE."""
-    if _code(line):
+def _read_status(line: str) -> m.StatusReport:
+    """Return the status in ``OK,BUSYSTAT,<word>``; NONE means that the reader waits."""
+    if _answer_code(line):
         raise ValueError(line)
-    idle = line.split(",")[2] == "NONE"
-    return m.StatusReport(status=READY if idle else Status.RUNNING | Status.BUSY)
+    is_idle = line.split(",")[2] == "NONE"
+    return m.StatusReport(status=READY if is_idle else Status.RUNNING | Status.BUSY)
 
 
-def _reply(line: str) -> LineReply:
-    return LineReply(code=_code(line), data=line.encode(ENCODING))
+def _read_reply(line: str) -> LineReply:
+    return LineReply(code=_answer_code(line), data=line.encode(ENCODING))
 
 
 def _split(line: str) -> tuple[str, str]:
-    """Return the command that a line answers; "" if the line is a code."""
+    """Return the command that a line answers, "" for a code, and the line."""
     first, _, argument = line.partition(",")
-    return (asked_word(line, {}) if first in {"OK", "ER"} and argument else ""), line
+    return (answer_key(line, {}) if first in {"OK", "ER"} and argument else ""), line
 
 
-def _rows(bank: int | None) -> tuple[LineRow, ...]:
+def _make_rows(bank: int | None) -> tuple[LineRow, ...]:
     active = m.UNNAMED_APPLICATION if bank is None else bank
-    lon = "LON" if bank is None else f"LON,{bank:02}"
+    trigger_line = "LON" if bank is None else f"LON,{bank:02}"
 
-    def counted(line: str) -> m.QueryAnswer:
+    def read_query_answer(line: str) -> m.QueryAnswer:
         if check_done(line) or not line.startswith("OK,NUM"):
             raise ValueError(line)
         return m.QueryAnswer(application=active)
 
-    def connected(line: str) -> m.ConnectAnswer:
+    def read_connect_answer(line: str) -> m.ConnectAnswer:
         if not line.startswith("OK,ERRSTAT"):
             raise ValueError(line)
         return m.ConnectAnswer(version=1)
 
     return (
-        LineRow(m.Connect, "ERRSTAT", m.ConnectAnswer, connected),
-        LineRow(m.GetStatus, "BUSYSTAT", m.StatusReport, _busy),
-        LineRow(m.Query, "NUM", m.QueryAnswer, counted),
-        LineRow(m.Trigger, lon, m.ResultContainer, _scanned, word="", also=(m.TriggerAnswer,)),
+        LineRow(m.Connect, "ERRSTAT", m.ConnectAnswer, read_connect_answer),
+        LineRow(m.GetStatus, "BUSYSTAT", m.StatusReport, _read_status),
+        LineRow(m.Query, "NUM", m.QueryAnswer, read_query_answer),
+        LineRow(
+            m.Trigger,
+            trigger_line,
+            m.ResultContainer,
+            _read_trigger_answer,
+            word="",
+            also=(m.TriggerAnswer,),
+        ),
         LineRow(m.EndTrigger, "LOFF", None, refuse_line),
         LineRow(
-            None, "LOFF", m.Notice, lambda line: m.Notice("error", _code(line), line), word="LOFF"
+            None,
+            "LOFF",
+            m.Notice,
+            lambda line: m.Notice("error", _answer_code(line), line),
+            word="LOFF",
         ),
-        LineRow(None, "code", m.ResultContainer, _unasked),
-        LineRow(LineCommand, "{line}", LineReply, _reply),
+        LineRow(None, "code", m.ResultContainer, _read_unasked),
+        LineRow(LineCommand, "{line}", LineReply, _read_reply),
     )
 
 
@@ -140,14 +151,14 @@ class SrDialect(LineDialect):
         text = parameters["bank"]
         if not (text.isascii() and text.isdecimal() and int(text[:4]) <= LAST_BANK):
             raise ConfigurationError(f"bank: 0 to {LAST_BANK} was expected, got {text!r}")
-        return replace(self, rows=_rows(int(text)))
+        return replace(self, rows=_make_rows(int(text)))
 
 
 LINES = SrDialect(
     name="lines",
     about="lines that end with CR",
     source="docs/keyence.md, derived",
-    rows=_rows(None),
+    rows=_make_rows(None),
     ids=range(LAST_BANK + 1),
     line_end=LINE_END,
     max_line=MAX_LINE_BYTES,

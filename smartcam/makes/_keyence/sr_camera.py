@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 class SrDevice:
-    """The operator of an emulated camera: actions at the device itself."""
+    """Actions at the emulated reader itself, as by an operator."""
 
     def __init__(self, camera: EmulatedSr) -> None:
         self._camera = camera
 
     def trigger(self) -> None:
-        """Trigger at the input; the reading is sent to all clients."""
+        """Trigger by the input; the reading is sent to all clients."""
         self._camera.tell_all()
 
 
@@ -33,7 +33,7 @@ class EmulatedSr(LineCamera):
         codes: the code of each reading; None for a code that cannot be read.
         reading_time: seconds from LON until a code is read.
         answer_time: seconds from the reading's end until its line is sent.
-        waits_for_end: send the reading at LOFF, not when the code is read.
+        waits_for_end: whether the reading is sent at LOFF instead of when the code is read.
         options: the options of :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
@@ -58,17 +58,17 @@ class EmulatedSr(LineCamera):
         self.read: int = 0
         self.unread: int = 0
         self._reading: LineClient | None = None
-        self._code: str | None = None  # code that was read, to be sent at the end
+        self._code: str | None = None  # code that was read in the current reading
         self._run = 0
         self.device: Any = SrDevice(self)
         super().__init__(**options)
 
     def hear(self, client: LineClient, line: str) -> None:
-        """Answer a line; a reading is sent later, and other lines are answered meanwhile."""
+        """Answer a line; a reading is sent later, and until then other lines are answered."""
         call = client.answer_later()
         word, _, argument = line.partition(",")
-        bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK
-        if line == "LON" or (word == "LON" and bank):
+        is_bank = argument.isdecimal() and len(argument) == 2 and int(argument) <= LAST_BANK
+        if line == "LON" or (word == "LON" and is_bank):
             self._begin(call)
         elif line == "LOFF":
             self._end()
@@ -101,7 +101,7 @@ class EmulatedSr(LineCamera):
         self.after(self.reading_time, lambda: self._read_code(run))
 
     def _read_code(self, run: int) -> None:
-        """Read the present code, in the current reading."""
+        """Read the next code if the reading with this number still runs."""
         if run != self._run or self._reading is None:
             return
         self._code = next(self.codes)
@@ -117,12 +117,14 @@ class EmulatedSr(LineCamera):
         self._reading = self._code = None
         self.read, self.unread = self.read + (code is not None), self.unread + (code is None)
         if call is not None:
-            reading = NOTHING_READ if code is None else code
-            self.after(self.answer_time, lambda: call.answer(reading))
+            text = NOTHING_READ if code is None else code
+            self.after(self.answer_time, lambda: call.answer(text))
 
     def tell_all(self) -> None:
         """Read a code and send it to all clients."""
         code = next(self.codes)
-        row = next(number for number, each in enumerate(LINES.rows, 1) if each.line == "code")
+        row_number = next(number for number, row in enumerate(LINES.rows, 1) if row.line == "code")
         for client in list(self._clients.values()):
-            client.say_bytes(self.lines.data(NOTHING_READ if code is None else code), row=row)
+            client.say_bytes(
+                self.lines.data(NOTHING_READ if code is None else code), row=row_number
+            )

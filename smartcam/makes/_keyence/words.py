@@ -1,4 +1,4 @@
-"""The common words of Keyence's lines: ``ER,<command>,nn`` and ``OK,<command>``."""
+"""Read the answers that Keyence's devices have in common: ``ER,<command>,nn``, ``OK,<command>``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 LINE_END = b"\r"
 ENCODING = "latin-1"
-"""One byte for each character, since the content of a code is not always text."""
+"""Encoding of lines: one byte for each character, since a code is not always text."""
 
 MAX_LINE_BYTES = 8192
 """Largest number of bytes of a line: the longest two-dimensional codes have some 7,000
@@ -21,7 +21,7 @@ READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 
 
 def error_code(line: str) -> int | None:
-    """Return the number of ``ER,<command>,nn``, None for another line.
+    """Return the number of ``ER,<command>,nn``; None for another line.
 
     Raises:
         ValueError: the line has no number.
@@ -35,13 +35,13 @@ def check_done(line: str) -> int:
     return error_code(line) or 0
 
 
-def asked_word(line: str, others: Mapping[str, str]) -> str:
-    """Return the command that ``ER,<command>`` or ``OK,<command>`` answers, else the first word.
+def answer_key(line: str, answer_words: Mapping[str, str]) -> str:
+    """Return the word that shows what a line answers: the command in it, else the first word.
 
     Args:
         line: the answer.
-        others: commands whose answers begin with another word, and that word.
+        answer_words: words of answers, by command, that differ from the command.
     """
     first, _, argument = line.partition(",")
     word = argument.partition(",")[0] if first in {"OK", "ER"} and argument else first
-    return others.get(word, word)
+    return answer_words.get(word, word)

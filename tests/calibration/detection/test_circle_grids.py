@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CircleGrid, find_target, make_sheet
-from smartcam.calibration._detection.blobs import dark_pieces
+from smartcam.calibration._detection.blobs import find_dark_pieces
 from smartcam.geometry._inside import Code
-from tests.calibration.inside import alike_areas, apply_homography, fit_homography, lattices
+from tests.calibration.inside import apply_homography, area_test, fit_homography, grow_grids
 from tests.calibration.scenes import STRAIGHT, drawn, refused
 
 ROUND = CircleGrid(columns=7, rows=6, spacing=0.015, diameter=0.0075, origin_diameter=0.011)
@@ -127,7 +127,7 @@ def test_spots_are_filled_and_round() -> None:
     cv2.line(image, (20, 150), (120, 170), 40, 3)
     cv2.putText(image, "KX", (200, 80), cv2.FONT_HERSHEY_SIMPLEX, 2, 40, 4)
     cv2.circle(image, (250, 150), 8, 40, -1)
-    spots = dark_pieces(image, 80).spots(most=100)
+    spots = find_dark_pieces(image, 80).find_spots(max_count=100)
     np.testing.assert_allclose(spots.points, [[60, 50], [250, 150]], atol=0.2)
     np.testing.assert_allclose(spots.areas, [np.pi * 180, np.pi * 64], rtol=0.4)
 
@@ -136,7 +136,7 @@ def test_spots_beyond_the_most_are_the_smallest() -> None:
     image = np.full((100, 300), 200, np.uint8)
     for u, radius in ((50, 5), (150, 9), (250, 7)):
         cv2.circle(image, (u, 50), radius, 40, -1)
-    found = dark_pieces(image, 60).spots(most=2).points
+    found = find_dark_pieces(image, 60).find_spots(max_count=2).points
     np.testing.assert_allclose(np.sort(found[:, 0]), [150, 250], atol=0.2)
 
 
@@ -144,7 +144,7 @@ def test_lattices_among_other_dots_have_each_of_the_grid() -> None:
     pixels = drawn(PLAIN, tilt=50, roll=30).pixels
     others = np.random.default_rng(4).uniform([0, 380], [100, 480], (30, 2))
     points = np.vstack([others, pixels])
-    (grid,) = lattices(points, alike_areas(np.ones(len(points))), least=20, most=60)
+    (grid,) = grow_grids(points, area_test(np.ones(len(points))), min_count=20, max_count=60)
     assert sorted(grid.values()) == list(range(30, 78))
     places = np.array(list(grid), dtype=np.float64)
     matrix = fit_homography(places, points[list(grid.values())])
@@ -155,12 +155,12 @@ def test_lattices_among_other_dots_have_each_of_the_grid() -> None:
 
 def test_lattices_of_larger_grids_end_with_dots_too_many() -> None:
     pixels = drawn(PLAIN).pixels
-    same = alike_areas(np.ones(48))
-    assert max(len(one) for one in lattices(pixels, same, least=9, most=20)) > 20
+    same = area_test(np.ones(48))
+    assert max(len(one) for one in grow_grids(pixels, same, min_count=9, max_count=20)) > 20
     uneven = np.where(np.arange(48) % 2, 1.0, 3.0)
-    assert list(lattices(pixels, alike_areas(uneven), least=25, most=48)) == []
+    assert list(grow_grids(pixels, area_test(uneven), min_count=25, max_count=48)) == []
 
 
 def test_lattices_of_few_points_are_none() -> None:
-    assert list(lattices(np.zeros((4, 2)), alike_areas(np.ones(4)), least=4, most=9)) == []
-    assert list(lattices(np.zeros((9, 2)), alike_areas(np.ones(9)), least=4, most=9)) == []
+    assert list(grow_grids(np.zeros((4, 2)), area_test(np.ones(4)), min_count=4, max_count=9)) == []
+    assert list(grow_grids(np.zeros((9, 2)), area_test(np.ones(9)), min_count=4, max_count=9)) == []

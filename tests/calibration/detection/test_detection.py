@@ -13,17 +13,17 @@ import pytest
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, find_target
 from smartcam.calibration._detection.ordering import (
     Arrangement,
-    arrangements,
-    marked,
-    most_rightward,
-    places_row_by_row,
+    choose_marked,
+    choose_rightward,
+    find_arrangements,
+    positions_row_by_row,
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._inside import Target
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
 from tests import ROOT
-from tests.calibration.inside import alike_areas, grey_image, lattices, scaled
+from tests.calibration.inside import area_test, grey_image, grow_grids, resize_image
 from tests.calibration.scenes import STRAIGHT, check_pair, drawn, refused
 
 if TYPE_CHECKING:
@@ -309,8 +309,8 @@ GRIDS = [
 
 def laid_out(points: Array) -> NDArray[np.intp]:
     """Return the places (N, 2) of points that are a grid."""
-    (grid,) = lattices(
-        points, alike_areas(np.ones(len(points))), least=len(points), most=len(points)
+    (grid,) = grow_grids(
+        points, area_test(np.ones(len(points))), min_count=len(points), max_count=len(points)
     )
     places = np.zeros((len(points), 2), dtype=np.intp)
     places[list(grid.values())] = list(grid)
@@ -325,47 +325,47 @@ def test_arrangements_of_shuffled_points_are_those_that_look_alike(
     pixels = drawn(grid, tilt=40, roll=25).pixels
     shuffled = np.random.default_rng(1).permutation(len(pixels))
     found = pixels[shuffled]
-    ways = arrangements(found, laid_out(found), grid)
-    assert (len(ways), sum(way.proper for way in ways)) == (count, proper)
-    numbered = [way.order.ravel().tolist() for way in ways if way.proper]
+    ways = find_arrangements(found, laid_out(found), grid)
+    assert (len(ways), sum(way.is_front for way in ways)) == (count, proper)
+    numbered = [way.order.ravel().tolist() for way in ways if way.is_front]
     assert np.argsort(shuffled).tolist() in numbered
 
 
 def test_arrangements_of_other_counts_are_none() -> None:
     grid, other = GRIDS[0][0], CircleGrid(columns=8, rows=3, spacing=0.02, diameter=0.01)
     pixels = drawn(grid).pixels
-    assert arrangements(pixels, laid_out(pixels), other) == []
+    assert find_arrangements(pixels, laid_out(pixels), other) == []
 
 
 def test_arrangements_of_a_grid_with_a_point_too_many_are_none() -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
-    pixels, places = drawn(board).pixels, places_row_by_row(5, 4)
+    pixels, places = drawn(board).pixels, positions_row_by_row(5, 4)
     more = np.vstack([pixels, pixels[:1] - 30]), np.vstack([places, [[-1, 0]]])
-    assert arrangements(pixels, places, board) != []
-    assert arrangements(*more, board) == []
+    assert find_arrangements(pixels, places, board) != []
+    assert find_arrangements(*more, board) == []
 
 
 def test_rows_of_counts_columns_first() -> None:
-    assert places_row_by_row(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
+    assert positions_row_by_row(3, 2).tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
 
 
 def test_leftmost_is_proper_and_points_right() -> None:
     order = np.zeros((1, 1), dtype=np.intp)
     ways = [
-        Arrangement(order, proper=False, rightward=1.0),
-        Arrangement(order, proper=True, rightward=-0.9),
-        Arrangement(order, proper=True, rightward=0.9),
+        Arrangement(order, is_front=False, rightward=1.0),
+        Arrangement(order, is_front=True, rightward=-0.9),
+        Arrangement(order, is_front=True, rightward=0.9),
     ]
-    assert most_rightward(ways, "board") is ways[2]
+    assert choose_rightward(ways, "board") is ways[2]
     with refused(Code.MIRRORED, "board: expected an image of the sheet as one reads it"):
-        most_rightward(ways[:1], "board")
+        choose_rightward(ways[:1], "board")
 
 
 @pytest.mark.parametrize(("levels", "origin"), [([40, 200, 190, 180], 0), ([9, 9, 0, 200], None)])
 def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int | None) -> None:
     board = Checkerboard(columns=5, rows=4, square=0.02)
     pixels = drawn(board).pixels
-    ways = arrangements(pixels, places_row_by_row(5, 4), board)
+    ways = find_arrangements(pixels, positions_row_by_row(5, 4), board)
     corners = [0, 4, 19, 15]
 
     def level(order: np.ndarray) -> float:
@@ -373,9 +373,9 @@ def test_marked_takes_the_darkest_by_a_margin(levels: list[float], origin: int |
 
     if origin is None:
         with refused(Code.AMBIGUOUS_ORIGIN, "by 30 grey levels of 255, got 9"):
-            marked(ways, level, "board")
+            choose_marked(ways, level, "board")
     else:
-        way, margin = marked(ways, level, "board")
+        way, margin = choose_marked(ways, level, "board")
         assert (way.order[0, 0], margin) == (0, 140)
 
 
@@ -419,7 +419,7 @@ def test_grey_image_of_a_cut_of_an_image_is_contiguous() -> None:
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_scaled_image_has_its_stated_places(scale: float) -> None:
     image = np.repeat(np.arange(0, 240, 4, dtype=np.uint8)[None], 40, axis=0)
-    bytes_ = scaled(image, scale)
+    bytes_ = resize_image(image, scale)
     assert bytes_.shape == (40 * scale, 60 * scale)
     at = np.arange(4, 60 * scale - 4)
     places = (at + 0.5) / scale - 0.5

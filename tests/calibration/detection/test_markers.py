@@ -11,7 +11,7 @@ import pytest
 from smartcam.calibration import Charuco, TargetView, find_target
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
-from tests.calibration.inside import Markers, agreeing
+from tests.calibration.inside import Markers, compare_with_board
 from tests.calibration.scenes import BENT, STRAIGHT, Drawn, drawn, refused
 
 NEW = Charuco(columns=9, rows=6, square=0.03, marker=0.02, dictionary="DICT_4X4_50")
@@ -32,7 +32,7 @@ def seen(ids: list[int], *, turn: float = 0.3, scale: float = 40.0) -> Markers:
 
 
 def test_agreeing_of_a_right_board_has_all_markers() -> None:
-    good, contrary = agreeing(seen(list(range(20))), BOARD)
+    good, contrary = compare_with_board(seen(list(range(20))), BOARD)
     assert good.all()
     assert contrary == 0
 
@@ -42,7 +42,7 @@ def test_agreeing_of_a_right_board_has_all_markers() -> None:
 def test_agreeing_leaves_out_a_marker_with_another_number(wrong: int, read: int) -> None:
     markers = seen(list(range(20)))
     markers.ids[wrong] = read
-    good, contrary = agreeing(markers, BOARD)
+    good, contrary = compare_with_board(markers, BOARD)
     there = markers.ids == np.arange(20)
     assert good.tolist() == there.tolist()
     assert contrary <= 1
@@ -51,20 +51,20 @@ def test_agreeing_leaves_out_a_marker_with_another_number(wrong: int, read: int)
 def test_agreeing_leaves_out_a_marker_that_is_turned() -> None:
     markers = seen(list(range(20)))
     markers.quads[8] = np.roll(markers.quads[8], 1, axis=0)
-    assert np.flatnonzero(~agreeing(markers, BOARD).good).tolist() == [8]
+    assert np.flatnonzero(~compare_with_board(markers, BOARD).mask).tolist() == [8]
 
 
 @pytest.mark.parametrize("ids", [[], [3], [3, 44], [44, 45]])
 def test_agreeing_of_fewer_than_two_of_the_board_is_none(ids: list[int]) -> None:
     markers = Markers(np.zeros((len(ids), 4, 2)) + np.eye(4, 2), np.array(ids, dtype=np.intp))
-    good, contrary = agreeing(markers, BOARD)
+    good, contrary = compare_with_board(markers, BOARD)
     assert not good.any()
     assert contrary == 0
 
 
 def test_agreeing_joins_the_parts_beside_a_hand() -> None:
     board = np.concatenate([BOARD, BOARD + np.array([9, 0])])
-    good, contrary = agreeing(Markers(50 + 40 * board, np.arange(40)), board)
+    good, contrary = compare_with_board(Markers(50 + 40 * board, np.arange(40)), board)
     assert good.all()
     assert contrary == 0
 
@@ -72,7 +72,7 @@ def test_agreeing_joins_the_parts_beside_a_hand() -> None:
 def test_agreeing_of_rows_of_another_length_speaks_against_the_map() -> None:
     markers = seen(list(range(20)))
     narrow = BOARD.reshape(4, 5, 4, 2)[:, :4].reshape(-1, 4, 2)
-    good, contrary = agreeing(markers, narrow)
+    good, contrary = compare_with_board(markers, narrow)
     assert good.sum() == 4
     assert contrary >= 3
 

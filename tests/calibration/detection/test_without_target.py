@@ -23,7 +23,7 @@ from tests.calibration.inside import (
     MAX_OUTLINES_OF_ALL_WINDOWS,
     MAX_SEEDS_TRIED,
     WINDOWS_PX,
-    _Grown,
+    _GridGrower,
     _outlines,
     charucos,
     corners,
@@ -103,11 +103,11 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         monkeypatch.setattr(place, name, counting)
 
-    count(_Grown, "grow")
+    count(_GridGrower, "grow")
     count(boards, "find_saddles")
     count(boards, "refine_corners")
-    count(charucos, "_look")
-    count(circle_grids, "dark_pieces")
+    count(charucos, "_search_image")
+    count(circle_grids, "find_dark_pieces")
     return counted
 
 
@@ -131,7 +131,7 @@ def test_search_for_a_charuco_board_looks_once(
     scene: Callable[[np.random.Generator], Picture], calls: Counter[str]
 ) -> None:
     given_up(scene, CHARUCO)
-    assert calls["_look"] == 1
+    assert calls["_search_image"] == 1
     assert calls["grow"] <= MAX_SEEDS_TRIED
 
 
@@ -140,7 +140,7 @@ def test_search_for_dots_looks_for_dark_and_light_ones_twice(
     scene: Callable[[np.random.Generator], Picture], calls: Counter[str]
 ) -> None:
     given_up(scene, DOTS)
-    assert calls["dark_pieces"] == 4
+    assert calls["find_dark_pieces"] == 4
     assert calls["grow"] <= 6 * MAX_SEEDS_TRIED
 
 
@@ -163,8 +163,8 @@ def test_search_in_an_image_of_another_target_tries_few_sizes(
 ) -> None:
     with refused(Code.TARGET_NOT_FOUND):
         find_target(drawn(shown, tilt=25, roll=70).image, wanted)
-    assert calls["_look"] <= 2
-    assert calls["dark_pieces"] <= 6
+    assert calls["_search_image"] <= 2
+    assert calls["find_dark_pieces"] <= 6
 
 
 # ---------------------------------------------------------------------- parts of a board

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.calibration import CameraModel, RobotSigmas
-from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
+from smartcam.calibration._hand_eye.robot_noise import adjust_with_noise
 from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration.inside import (
     LINEAR,
@@ -24,12 +24,12 @@ from tests.calibration.inside import (
     RobotPoses,
     Solution,
     adjust,
-    bends,
+    bend_heights,
     check_motion,
+    leave_each_out,
     predicted_views,
     solve_linear,
-    sums,
-    without_each,
+    view_products,
 )
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
@@ -52,12 +52,14 @@ def pixels(
     shown = model.project(before.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     white = np.broadcast_to(np.eye(2) / 0.1, (*points.shape[:2], 2, 2))
     given = np.ones(points.shape[:2], dtype=np.bool_)
-    return PixelObservations(white, model, points, shown, bends(points, given), free=free)
+    return PixelObservations(
+        white, model, points, shown, bend_heights(points, given), free_parameters=free
+    )
 
 
 def poses(seen: Rigid, free: tuple[int, ...] = ()) -> PoseObservations:
     white = np.broadcast_to(np.diag([1e3] * 6), (len(seen.translation), 6, 6))
-    return PoseObservations(white, seen, free=free)
+    return PoseObservations(white, seen, free_parameters=free)
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
@@ -79,7 +81,7 @@ def test_derivatives_are_those_of_small_steps(
         corrections=random.normal(scale=1e-2, size=start.corrections.shape),
         camera=camera.turned_before(random.normal(scale=2e-3, size=6)),
     )
-    total = sums(robot, observed, at)[0]
+    total = view_products(robot, observed, at)[0]
     unknown = 12 + observed.extra_count
 
     def cost(steps: Any, own: Any) -> float:
@@ -142,7 +144,7 @@ def test_bends_that_points_do_not_show_are_left_out(columns: int, rows: int, cou
     points = np.tile(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * 0.02, (4, 1, 1))
     turned = points @ exp_rotation(np.array([0.0, 0.0, 0.3])).T
     for one, least in ((points, count), (turned, min(count, 3))):
-        heights = bends(one, np.ones(one.shape[:2], dtype=np.bool_))
+        heights = bend_heights(one, np.ones(one.shape[:2], dtype=np.bool_))
         flat = np.column_stack([np.ones(one[0].shape[0]), one[0][:, :2], heights[0]])
         assert heights.shape[2] == least
         assert np.linalg.matrix_rank(flat) == 3 + least
@@ -189,7 +191,7 @@ def test_noise_of_the_robot_is_told() -> None:
     observed = pixels(seen)
     noise = 0.1 * random.normal(size=observed.pixels.shape)
     blurred = dataclasses.replace(observed, pixels=observed.pixels + noise)
-    found = adjust_noisy(said, blurred, Solution(camera, target))
+    found = adjust_with_noise(said, blurred, Solution(camera, target))
     assert found.noise is not None
     np.testing.assert_allclose(found.noise.robot, sigmas, rtol=0.3)
     assert found.noise.shared == pytest.approx(1.0, abs=0.8)
@@ -206,7 +208,7 @@ def test_without_each_view_is_what_the_others_give(
     said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
     observed = pixels(seen, free=free)
     whole = adjust(said, observed, Solution(camera, target), noise)
-    found = without_each(said, observed, whole)
+    found = leave_each_out(said, observed, whole)
     for number in (0, 4, 8):
         some = np.delete(np.arange(9), number)
         again = adjust(said.subset(some), observed.subset(some), whole, noise)
@@ -222,7 +224,7 @@ def test_closed_forms_of_many_poses_begin_with_some_of_them() -> None:
     off = np.random.default_rng(7).normal(scale=1e-4, size=(60, 6))
     said = RobotPoses(robot.poses.turned_before(off), in_hand=True)
     for name in ("park", "shah"):
-        some, whole = (solve_linear(name, said, seen, exactly=one) for one in (False, True))
+        some, whole = (solve_linear(name, said, seen, use_all_views=one) for one in (False, True))
         assert some is not None
         assert whole is not None
         same = np.array_equal(some[0].translation, whole[0].translation)
@@ -244,7 +246,7 @@ def test_noise_that_a_views_points_share_is_told() -> None:
     )
     shown = pixels(moved).pixels + 0.1 * random.normal(size=observed.pixels.shape)
     blurred = dataclasses.replace(observed, pixels=shown)
-    found = adjust_noisy(robot, blurred, Solution(camera, target))
+    found = adjust_with_noise(robot, blurred, Solution(camera, target))
     assert found.noise is not None
     assert found.noise.shared > 3.0
     assert found.noise.robot.translation < 2e-4

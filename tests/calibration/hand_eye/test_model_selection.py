@@ -17,7 +17,7 @@ from smartcam.calibration import (
 )
 from smartcam.calibration.simulation import hand_eye_scene
 from smartcam.geometry._inside import Code, Rigid, exp_rotation
-from tests.calibration.inside import RobotPoses, second_turn, second_turns
+from tests.calibration.inside import RobotPoses, left_out_second_axis_turns, second_axis_turn
 from tests.calibration.scenes import CAMERA, SHEET, scene
 
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
@@ -75,12 +75,12 @@ def test_hand_eye_that_takes_noise_for_another_error_expects_the_difference() ->
 
 def test_second_turns_are_those_without_each_pose() -> None:
     robot = RobotPoses(Rigid.stacked(one.rigid for one in scene("eye-in-hand").robot_poses), True)
-    found = second_turns(robot)
+    found = left_out_second_axis_turns(robot)
     for number in range(len(found)):
         some = np.delete(np.arange(len(found)), number)
-        assert found[number] == pytest.approx(second_turn(robot.subset(some)), rel=1e-9)
+        assert found[number] == pytest.approx(second_axis_turn(robot.subset(some)), rel=1e-9)
     few = robot.subset(np.arange(3))
-    np.testing.assert_allclose(second_turns(few), second_turn(few))
+    np.testing.assert_allclose(left_out_second_axis_turns(few), second_axis_turn(few))
 
 
 def _nodding(rms: float) -> list[Transform]:

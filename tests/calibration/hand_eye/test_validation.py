@@ -19,9 +19,9 @@ from smartcam.calibration import (
 )
 from smartcam.calibration._hand_eye.model_selection import Problem
 from smartcam.calibration._hand_eye.validation import (
-    agreement,
     check_poses,
     expected_error,
+    find_agreement,
     max_plausible_error,
 )
 from smartcam.calibration.simulation import hand_eye_scene
@@ -207,10 +207,10 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
     poses = list(scene(setup, poses=10).robot_poses)
     poses[2], poses[5], poses[8] = poses[5], poses[8], poses[2]
     asked = problem(poses, setup)
-    found = agreement(asked)
+    found = find_agreement(asked)
     assert found is not None
     assert found.median < 1e-9
-    assert found.gross(max_plausible_error(asked)).tolist() == [2, 5, 8]
+    assert found.gross_error_indices(max_plausible_error(asked)).tolist() == [2, 5, 8]
     camera = Transform("x", "camera", *found.camera)
     np.testing.assert_allclose(
         camera.translation, scene(setup, poses=10).camera_pose.translation, atol=1e-9
@@ -220,12 +220,12 @@ def test_agreement_is_that_of_most_poses(setup: Setup) -> None:
 @pytest.mark.judged
 def test_check_poses_that_belong_together_tells_no_gross_ones() -> None:
     asked = problem(list(scene("eye-in-hand", poses=8).robot_poses), "eye-in-hand")
-    assert check_poses(asked).gross(max_plausible_error(asked)).tolist() == []
+    assert check_poses(asked).gross_error_indices(max_plausible_error(asked)).tolist() == []
 
 
 def test_expected_error_grows_with_the_distance() -> None:
     asked = problem(list(scene("eye-in-hand", poses=8).robot_poses), "eye-in-hand")
-    far = dataclasses.replace(asked, poses=asked.poses.scaled(2.0))
+    far = dataclasses.replace(asked, target_poses=asked.target_poses.scaled(2.0))
     assert expected_error(asked, RobotSigmas(0.0, 1e-3)) == pytest.approx(math.sqrt(2) * 1e-3)
     turn = RobotSigmas(1e-3, 0.0)
     assert expected_error(far, turn) == pytest.approx(2 * expected_error(asked, turn))

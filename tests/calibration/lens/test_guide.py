@@ -9,7 +9,7 @@ import pytest
 
 from smartcam.calibration import CameraModel, Charuco, Transform, suggest_views
 from smartcam.calibration._inside import Target
-from smartcam.calibration._lens.guide import NextView, candidates
+from smartcam.calibration._lens.guide import NextView, candidate_views
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code, exp_rotation
 from tests.calibration import lenskit
@@ -50,7 +50,7 @@ def test_view_at_a_new_place_of_the_target_helps_more() -> None:
 @pytest.mark.parametrize("camera", [lenskit.LEFT, lenskit.WIDE, lenskit.FISHEYE])
 @pytest.mark.parametrize("target", [lenskit.BOARD, CHARUCO])
 def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target: Target) -> None:
-    found = candidates(camera, target, roll=math.pi / 2)
+    found = candidate_views(camera, target, roll=math.pi / 2)
     assert len(found.texts) >= 50
     for pose in map(found.poses.subset, range(found.poses.size)):
         seen = camera.project(pose.apply(target.points))
@@ -59,7 +59,7 @@ def test_all_points_of_a_candidate_are_in_the_image(camera: CameraModel, target:
 
 def test_text_names_the_target_s_place_and_its_far_side() -> None:
     straight = CameraModel(size=(640, 480), matrix=LENS.matrix)
-    found = candidates(straight, lenskit.BOARD)
+    found = candidate_views(straight, lenskit.BOARD)
     poses = dict(zip(found.texts, map(found.poses.subset, range(found.poses.size)), strict=True))
     where = {
         "in the upper left corner of the image": (0, 0),

@@ -312,10 +312,10 @@ def test_fit_lens_of_views_of_different_noise_trusts_the_sharp_ones() -> None:
     around = poses(12)
     views = [*seen(LEFT, around[:6], sigma=0.02), *seen(LEFT, around[6:], sigma=1.0, seed=3)]
     sharp, all_of_them = fit_lens(views[:6], "plumb_bob"), fit_lens(views, "plumb_bob")
-    deviations = np.sqrt(np.diag(sharp.by_noise))
+    deviations = np.sqrt(np.diag(sharp.noise_covariance))
     off = lens_values(all_of_them.bundle.cameras[0]) - lens_values(sharp.bundle.cameras[0])
     assert np.abs(off / deviations).max() < 0.5
-    assert (np.diag(all_of_them.by_noise) < np.diag(sharp.by_noise)).all()
+    assert (np.diag(all_of_them.noise_covariance) < np.diag(sharp.noise_covariance)).all()
 
 
 def test_fit_lens_with_fixed_coefficients_leaves_them_at_zero() -> None:
@@ -362,11 +362,11 @@ def test_adjust_shape_finds_the_places_of_the_points() -> None:
     views = seen(LEFT, poses(15), sigma=0.02, points=OFF)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     before = fit_lens(views, "plumb_bob")
-    found = adjust_shape(before.bundle, sights, before.more)
+    found = adjust_shape(before.bundle, sights, before.extra_variance)
     assert found.bundle.points is not None
     off = found.bundle.points - moved_to_nominal(OFF, BOARD.points)
     assert np.sqrt((off**2).mean()) < 4e-5
-    assert found.more < 0.1 * before.more
+    assert found.extra_variance < 0.1 * before.extra_variance
     assert found.freedom == before.freedom - 3 * 54 + 7
 
 
@@ -378,12 +378,12 @@ def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) 
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     whole = fit_lens(views, "plumb_bob")
     if free:
-        whole = adjust_shape(whole.bundle, sights, whole.more)
+        whole = adjust_shape(whole.bundle, sights, whole.extra_variance)
     for one in leave_out(whole, sights):
         others = [sight for sight in sights if sight.pose != one.pose]
-        again = adjust(whole.bundle, others, whole.more).bundle
-        only = dataclasses.replace(again, poses=again.poses.subset([one.pose])).known()
-        (expected,) = adjust(only, [Sight(0, 0, views[one.pose])], whole.more).residuals
+        again = adjust(whole.bundle, others, whole.extra_variance).bundle
+        only = dataclasses.replace(again, poses=again.poses.subset([one.pose])).with_known_cameras()
+        (expected,) = adjust(only, [Sight(0, 0, views[one.pose])], whole.extra_variance).residuals
         off, rms = (math.sqrt(float((r**2).mean())) for r in (one.residuals[0], expected))
         assert off == pytest.approx(rms, rel=0.01)
 
@@ -395,10 +395,10 @@ def test_held_out_error_of_a_view_does_not_use_it() -> None:
     (fitted, again) = ([Sight(0, n, view) for n, view in enumerate(s)] for s in (views, spoiled))
     whole = fit_lens(views, "plumb_bob")
     true = next(one for one in leave_out(whole, fitted) if one.pose == 3)
-    moved = adjust(whole.bundle, again, whole.more)
+    moved = adjust(whole.bundle, again, whole.extra_variance)
     other = next(one for one in leave_out(moved, again) if one.pose == 3)
     lenses = [lens_values(one.bundle.cameras[0]) for one in (true, other)]
-    deviations = np.sqrt(np.diag(whole.by_noise))
+    deviations = np.sqrt(np.diag(whole.noise_covariance))
     assert np.abs((lenses[0] - lenses[1]) / deviations).max() < 1.0
     assert np.abs((lens_values(moved.bundle.cameras[0]) - lenses[0]) / deviations).max() > 5.0
 
@@ -431,7 +431,7 @@ def test_exact_sheet_stays_exact_even_before_a_lens_that_is_not_of_its_model(
         views = seen(LEFT, poses(8, seed=seed), seed=seed)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
         found = choose_shape(fit_lens(views, "plumb_bob", fixed), sights, "auto")
-        assert found.off is None
+        assert found.offsets is None
         assert found.remarks == []
 
 
@@ -453,9 +453,9 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
         views = seen(LEFT, poses(8, seed=seed), seed=seed, points=OFF)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
         fitted = fit_lens(views, "plumb_bob")
-        found = adjust_shape(fitted.bundle, sights, fitted.more)
+        found = adjust_shape(fitted.bundle, sights, fitted.extra_variance)
         off = lens_values(found.bundle.cameras[0]) - lens_values(LEFT)
-        squares.append(off @ np.linalg.solve(found.by_noise, off))
+        squares.append(off @ np.linalg.solve(found.noise_covariance, off))
     assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
 
 
@@ -463,7 +463,7 @@ def test_adjust_shape_keeps_the_nominal_place_direction_and_size() -> None:
     views = seen(LEFT, poses(8), points=OFF)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     fitted = fit_lens(views, "plumb_bob")
-    found = adjust_shape(fitted.bundle, sights, fitted.more).bundle
+    found = adjust_shape(fitted.bundle, sights, fitted.extra_variance).bundle
     assert found.points is not None
     np.testing.assert_allclose(
         moved_to_nominal(found.points, BOARD.points), found.points, atol=1e-9
@@ -525,7 +525,7 @@ def _bundle(count: int, *, free: bool = True) -> Bundle:
         Rigid.stacked([RIG.rigid]),
         Rigid.stacked(one.rigid for one in poses(count, name="left")),
         (columns, columns),
-        rigid=not free,
+        is_rig_known=not free,
     )
 
 
@@ -541,7 +541,7 @@ def test_with_lens_of_the_values_is_the_same_lens() -> None:
 
 
 def test_bundle_shared_counts_lenses_and_rig() -> None:
-    assert (_bundle(3).shared, _bundle(3, free=False).shared) == (24, 0)
+    assert (_bundle(3).shared_count, _bundle(3, free=False).shared_count) == (24, 0)
     assert _bundle(3).lens_columns == [slice(0, 9), slice(9, 18)]
 
 
@@ -549,9 +549,9 @@ def test_adjust_from_near_goes_back_to_the_truth() -> None:
     truth = _bundle(6)
     random = np.random.default_rng(1)
     scale = np.array([5, 5, 5, 5, 0.02, 0.02, 1e-3, 1e-3, 0.02] * 2 + [0.02] * 6)
-    away = truth.moved(scale * random.normal(size=24), 0.01 * random.normal(size=(6, 6)))
+    away = truth.with_steps(scale * random.normal(size=24), 0.01 * random.normal(size=(6, 6)))
     found = adjust(away, _sights(6, 0.0), 0.0)
-    assert found.weighted < 1e-3
+    assert found.weighted_squares < 1e-3
     for one, other in zip(found.bundle.cameras, truth.cameras, strict=True):
         np.testing.assert_allclose(one.matrix, other.matrix, atol=1e-3)
     np.testing.assert_allclose(found.bundle.rig.translation[0], RIG.translation, atol=1e-6)
@@ -561,7 +561,7 @@ def test_adjust_sum_of_squares_is_its_freedom() -> None:
     found = adjust(_bundle(8), _sights(8, 0.1), 0.0)
     count = sum(len(one) for one in found.residuals)
     assert found.freedom == 2 * count - 24 - 6 * 8
-    assert found.weighted == pytest.approx(found.freedom, rel=0.15)
+    assert found.weighted_squares == pytest.approx(found.freedom, rel=0.15)
 
 
 def test_adjust_covariance_of_poses_is_that_of_their_errors() -> None:
@@ -592,8 +592,8 @@ def test_adjust_of_points_behind_the_camera_gives_up() -> None:
     behind = bundle.poses.turned_after(np.tile([0, 0, 0, 0, 0, -9.0], (3, 1)))
     away = Bundle(bundle.cameras, bundle.rig, behind, bundle.basis)
     found = adjust(away, _sights(3, 0.0), 0.0)
-    assert math.isinf(found.weighted)
-    assert np.isnan(found.by_noise).all()
+    assert math.isinf(found.weighted_squares)
+    assert np.isnan(found.noise_covariance).all()
 
 
 def test_adjust_weighted_finds_the_variance_beyond_the_covariance() -> None:
@@ -602,5 +602,5 @@ def test_adjust_weighted_finds_the_variance_beyond_the_covariance() -> None:
         for one in _sights(8, 0.2)
     ]
     found = adjust_weighted(_bundle(8), sights)
-    assert math.sqrt(found.more) == pytest.approx(0.2, rel=0.1)
-    assert found.weighted == pytest.approx(found.freedom, rel=0.02)
+    assert math.sqrt(found.extra_variance) == pytest.approx(0.2, rel=0.1)
+    assert found.weighted_squares == pytest.approx(found.freedom, rel=0.02)

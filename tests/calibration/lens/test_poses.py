@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from smartcam import CalibrationError
 from smartcam.calibration import Transform, locate
 from smartcam.geometry._inside import Code, exp_rotation
-from tests.calibration.inside import excess, linearize, pose_changes, whitening
+from tests.calibration.inside import excess_variance, linearize, pose_changes, whitening
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, TURNED, WIDE, poses, seen
 
 if TYPE_CHECKING:
@@ -184,11 +184,11 @@ def test_excess_is_the_variance_that_the_covariance_does_not_explain() -> None:
     random = np.random.default_rng(3)
     sigma = random.uniform(0.01, 0.1, 2000)
     residuals = random.normal(size=(2000, 2)) * np.sqrt(sigma**2 + 0.2**2)[:, None]
-    found = excess(residuals, sigma[:, None, None] ** 2 * np.eye(2), 4000)
+    found = excess_variance(residuals, sigma[:, None, None] ** 2 * np.eye(2), 4000)
     assert found == pytest.approx(0.04, rel=0.05)
 
 
 @pytest.mark.parametrize("freedom", [0, 100])
 def test_excess_is_zero_if_noise_explains_all(freedom: int) -> None:
     residuals = 0.1 * np.random.default_rng(4).normal(size=(50, 2))
-    assert excess(residuals, np.tile(0.01 * np.eye(2), (50, 1, 1)), freedom) == 0.0
+    assert excess_variance(residuals, np.tile(0.01 * np.eye(2), (50, 1, 1)), freedom) == 0.0

@@ -21,7 +21,7 @@ from smartcam.calibration import (
     target_from_data,
 )
 from smartcam.calibration._lens.misfit import Equations
-from smartcam.calibration._lens.suspicions import squares_off
+from smartcam.calibration._lens.suspicions import stray_squares
 from smartcam.geometry._inside import Code
 from tests.calibration.lenskit import BOARD, LEFT, poses, seen
 from tests.calibration.scenes import refused
@@ -244,11 +244,11 @@ def test_strays_differ_from_their_neighbours() -> None:
     residuals, by_pose = random.normal(size=(40, 2)), random.normal(size=(40, 2, 6))
     residuals[[3, 30]] += [[15, 0], [0, -20]]
     some = Equations(by_pose, np.zeros((40, 2, 0)), residuals, np.full(40, 0.1))
-    assert np.flatnonzero(squares_off(some, 1.0)).tolist() == [3, 30]
-    assert not squares_off(some, 3.0**2).any()  # seven of these
-    assert not squares_off(some._replace(deviations=np.full(40, 0.01)), 1.0).any()  # 0.2 pixels
+    assert np.flatnonzero(stray_squares(some, 1.0)).tolist() == [3, 30]
+    assert not stray_squares(some, 3.0**2).any()  # seven of these
+    assert not stray_squares(some._replace(deviations=np.full(40, 0.01)), 1.0).any()  # 0.2 pixels
     many = residuals + 30 * (np.arange(40) % 3 == 0)[:, None]
-    assert not squares_off(some._replace(residuals=many), 1.0).any()
+    assert not stray_squares(some._replace(residuals=many), 1.0).any()
 
 
 @pytest.mark.parametrize(

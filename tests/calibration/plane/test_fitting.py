@@ -116,7 +116,7 @@ def test_held_out_equals_a_new_fit(name: ModelName, weights: Array | None) -> No
     pairs = noisy(weights)
     found = held_out(fit(name, pairs), pairs)
     for index in range(9):
-        others = fit(name, pairs.without(index)).matrix
+        others = fit(name, pairs.leave_out(index)).matrix
         expected = pairs.robot[index] - apply_homography(others, pairs.camera[index : index + 1])[0]
         assert found[index] == pytest.approx(expected, abs=1e-8)  # the limit of rounding
 
@@ -124,14 +124,14 @@ def test_held_out_equals_a_new_fit(name: ModelName, weights: Array | None) -> No
 def test_held_out_of_many_points_nearly_equals_a_new_fit() -> None:
     pairs = noisy(marks=grid(15, 15))
     found = held_out(fit("homography", pairs), pairs)
-    others = fit("homography", pairs.without(0)).matrix
+    others = fit("homography", pairs.leave_out(0)).matrix
     expected = pairs.robot[0] - apply_homography(others, pairs.camera[:1])[0]
     assert found[0] == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_held_out_of_the_fewest_points_is_none(name: ModelName) -> None:
-    few = MODELS[name].least
+    few = MODELS[name].min_points
     pairs = noisy(marks=grid(2, 2)[:few])
     assert np.isnan(held_out(fit(name, pairs), pairs)).all()
 
@@ -171,7 +171,7 @@ def test_sensitivity_equals_numerical_derivatives() -> None:
 def test_frame_outward_and_inward_undo_each_other() -> None:
     frame = Normalization(np.array([320.0, 240.0]), 150.0, np.array([1.0, -2.0, 0.5]), 0.2)
     matrix = fit("homography", tilted()).matrix
-    outward = frame.outward(matrix)
+    outward = frame.to_original(matrix)
     mapped = apply_homography(outward, frame.camera + frame.camera_size * GRID)
     assert mapped == pytest.approx(frame.robot + frame.robot_size * apply_homography(matrix, GRID))
-    assert frame.inward(outward) == pytest.approx(matrix, abs=1e-12)
+    assert frame.to_normalized(outward) == pytest.approx(matrix, abs=1e-12)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from smartcam.calibration import Chain, MovingCamera, PoseHistory, Transform, chain_of, fit_plane
-from smartcam.calibration._plane.moving_camera import Moved
+from smartcam.calibration._plane.moving_camera import RigidMotion
 from tests.calibration.inside import Poses, RealWorldPosition
 from tests.geometry.rigid import (
     NOON,
@@ -161,7 +161,7 @@ def test_moving_camera_knows_the_y_down_of_its_chain() -> None:
     field = TABLE_POSE.apply(TABLE)
     static = Chain([], y_down=True)
     assert MovingCamera(static, FLANGE, field=field).now(FLANGE).y_down is True
-    alone = MovingCamera(Moved(FLANGE), FLANGE, field=field)
+    alone = MovingCamera(RigidMotion(FLANGE), FLANGE, field=field)
     assert (alone.now(FLANGE).y_down, alone.now(FLANGE).camera_frame) == (None, None)
 
 
@@ -177,7 +177,7 @@ def test_moved_before_the_chain_is_wrong() -> None:
     """The thesis' form: the same motion applied before all other solvers."""
     motion = in_plane(0.5, 0.1, 0.0)
     pose = carried(TABLE_POSE, motion, FLANGE)
-    moved = Moved(pose.undated() @ FLANGE.undated().inverse())
+    moved = RigidMotion(pose.undated() @ FLANGE.undated().inverse())
     static = RealWorldPosition(TABLE_POSE.translation, TABLE_POSE.rotation)
     right = Chain([static, moved]).transform(SEEN)
     np.testing.assert_allclose(right, (TABLE_POSE @ motion).apply(TABLE), atol=1e-12)

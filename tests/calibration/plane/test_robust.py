@@ -15,10 +15,10 @@ from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
 from smartcam.calibration._plane.robust import (
+    MAP_SOLVERS,
     MAX_FITTED_PROPOSALS,
     MAX_SUBSETS_TRIED,
-    PROPOSALS,
-    agreeing,
+    find_agreeing,
 )
 from smartcam.geometry._inside import Array, Code
 from tests.calibration.inside import Fit, fit
@@ -108,7 +108,7 @@ def test_fit_plane_robust_of_points_that_all_agree_is_the_ordinary_fit() -> None
 def test_fit_plane_robust_leaves_out_a_good_point_seldom(sigma: float | None, most: int) -> None:
     ones = np.ones(9)
     left_out = sum(
-        not agreeing(GRID, SCENE.touched(GRID, seed), ones, sigma).all()
+        not find_agreeing(GRID, SCENE.touched(GRID, seed), ones, sigma).all()
         for seed in range(1000, 1150)
     )
     assert left_out <= most
@@ -139,7 +139,7 @@ def test_agreeing_with_two_wrong_of_six_never_takes_one_for_right(count: int) ->
     for seed in range(count):
         touches = with_wrong(SIX, [seed % 6, (seed + 1 + seed % 5) % 6], seed)
         with suppress(CalibrationError):  # a good point is an outlier, too
-            found.append((seed, np.flatnonzero(~agreeing(SIX, touches, np.ones(6), SIGMA))))
+            found.append((seed, np.flatnonzero(~find_agreeing(SIX, touches, np.ones(6), SIGMA))))
     assert len(found) >= 0.95 * count
     for seed, left_out in found:
         assert {seed % 6, (seed + 1 + seed % 5) % 6} == set(left_out.tolist()), seed
@@ -293,21 +293,21 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
     touches = with_wrong(marks, [*range(0, 180, 2)])
     proposed: list[int] = []
     fitted: list[Fit] = []
-    for name, propose in PROPOSALS.items():
+    for name, propose in MAP_SOLVERS.items():
 
         def counted(camera: Array, touched: Array, propose: Any = propose) -> Array:
             proposed.append(len(camera))
             maps: Array = propose(camera, touched)
             return maps
 
-        monkeypatch.setitem(PROPOSALS, name, counted)
+        monkeypatch.setitem(MAP_SOLVERS, name, counted)
 
     def kept(*given: Any) -> Fit:
         fitted.append(fit(*given))
         return fitted[-1]
 
     monkeypatch.setattr(robust_module, "fit", kept)
-    mask = agreeing(marks, touches, np.ones(200), SIGMA)
+    mask = find_agreeing(marks, touches, np.ones(200), SIGMA)
     assert np.flatnonzero(~mask).tolist() == [*range(0, 180, 2)]
     assert len(proposed) == 2
     assert max(proposed) <= MAX_SUBSETS_TRIED

@@ -14,7 +14,7 @@ import pytest
 
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid
 from smartcam.calibration._inside import Target
-from smartcam.calibration._printing.shapes import Box, ink, outlines, quartered
+from smartcam.calibration._printing.shapes import Box, origin_mark_shapes, outlines, pattern_shapes
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry._inside import Code
 from tests.calibration.inside import Disc, Label, Polygon, PrintedPage, pdf, rectangle, svg
@@ -35,7 +35,7 @@ def winding(polygons: list[Polygon], x: float, y: float) -> int:
 
 
 def polygons(target: Target) -> list[Polygon]:
-    return [one for one in ink(target)[0] if isinstance(one, Polygon)]
+    return [one for one in pattern_shapes(target)[0] if isinstance(one, Polygon)]
 
 
 def area(loop: list[tuple[int, int]]) -> float:
@@ -52,13 +52,13 @@ def test_checkerboard_is_black_at_the_origin_and_in_turns() -> None:
 def test_checkerboard_box_is_that_of_its_squares() -> None:
     target = Checkerboard(columns=4, rows=3, square=0.01, origin_mark=True)
     corners = np.concatenate([one.points for one in polygons(target)])
-    assert ink(target)[1] == Box(-10, -10, 40, 30)
+    assert pattern_shapes(target)[1] == Box(-10, -10, 40, 30)
     assert (*corners.min(axis=0), *corners.max(axis=0)) == (-10, -10, 40, 30)
 
 
 def test_checkerboard_origin_mark_is_a_dot_in_the_area_of_the_origin() -> None:
     target = Checkerboard(columns=4, rows=3, square=0.01, origin_mark=True)
-    mark = ink(target)[0][-1]
+    mark = pattern_shapes(target)[0][-1]
     assert isinstance(mark, Disc)
     assert mark.centre == pytest.approx((-13, -13))
     assert mark.radius == pytest.approx(1.5)
@@ -93,19 +93,19 @@ def test_charuco_is_the_board_of_opencv(rows: int, legacy: bool) -> None:
 def test_charuco_with_more_squares_than_markers_is_refused() -> None:
     target = Charuco(columns=20, rows=20, square=0.01, marker=0.006, dictionary="DICT_4X4_50")
     with pytest.raises(CalibrationError, match="at least 200 markers in DICT_4X4_50, got 50"):
-        ink(target)
+        pattern_shapes(target)
 
 
 def test_charuco_of_an_unknown_dictionary_is_refused() -> None:
     target = Charuco(columns=4, rows=4, square=0.01, marker=0.006, dictionary="DICT_MINE")
     with pytest.raises(CalibrationError, match="got 'DICT_MINE'") as caught:
-        ink(target)
+        pattern_shapes(target)
     assert caught.value.code == Code.SHAPE
 
 
 def test_circles_are_dots_at_the_points_the_origin_one_larger() -> None:
     target = CircleGrid(columns=4, rows=3, spacing=0.02, diameter=0.01, origin_diameter=0.014)
-    dots, box = ink(target)
+    dots, box = pattern_shapes(target)
     assert [one.radius for one in dots if isinstance(one, Disc)] == pytest.approx([7] + 11 * [5])
     centres = [one.centre for one in dots if isinstance(one, Disc)]
     np.testing.assert_allclose(centres, 1e3 * target.points[:, :2], atol=1e-12)
@@ -114,7 +114,7 @@ def test_circles_are_dots_at_the_points_the_origin_one_larger() -> None:
 
 def test_circles_asymmetric_box_has_the_shifted_rows() -> None:
     target = CircleGrid(columns=4, rows=11, spacing=0.04, diameter=0.015, asymmetric=True)
-    assert ink(target)[1] == pytest.approx((-7.5, -7.5, 147.5, 207.5))
+    assert pattern_shapes(target)[1] == pytest.approx((-7.5, -7.5, 147.5, 207.5))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -138,7 +138,7 @@ def test_outlines_have_points_only_at_their_turns() -> None:
 
 
 def test_origin_mark_of_rays_has_two_black_quarters_and_a_white_dot() -> None:
-    shapes, box = quartered(10)
+    shapes, box = origin_mark_shapes(10)
     solid = [one for one in shapes if isinstance(one, Polygon)]
     at = [(2, 2), (-4, -4), (4, -4), (-4, 4), (4.2, 4.2), (-7.5, -7.5)]
     assert [winding(solid, x, y) for x, y in at] == [1, 1, 0, 0, 0, 0]
@@ -153,7 +153,7 @@ SHAPES = (
     rectangle(10, 20, 30, 5),
     Disc((50.0, 60.0), 2.5),
     Label((10, 90), "a <b> (c) \\", 2.6),
-    Label((5, 10), "up", 3, turned=True),
+    Label((5, 10), "up", 3, runs_upwards=True),
 )
 PAGE = PrintedPage(100, 120.5, "A & B", json.dumps({"kind": "<none>"}), SHAPES)
 SVG = "{http://www.w3.org/2000/svg}"

@@ -18,9 +18,9 @@ from smartcam.calibration import (
     calibrate_stereo,
 )
 from smartcam.calibration._stereo.errors import spacing_errors
-from smartcam.calibration._stereo.start import Lenses, as_moments, start
+from smartcam.calibration._stereo.start import Lenses, as_moments, guess_start
 from smartcam.geometry._inside import Code
-from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, remark_sides
+from tests.calibration.inside import Sight, check_fit, half_turned, moved_to_nominal, side_remarks
 from tests.calibration.lenskit import BOARD, LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
 
@@ -414,18 +414,18 @@ def test_calibrate_stereo_with_a_known_lens_of_another_size_raises() -> None:
 def test_start_is_near_the_truth() -> None:
     left, right = pairs(4)
     lenses = Lenses((LEFT, RIGHT), "plumb_bob", ())
-    moments, bundle, apart = start(as_moments(left, right), lenses)
+    moments, bundle, apart = guess_start(as_moments(left, right), lenses)
     assert [one[0] for one in moments] == left
     np.testing.assert_allclose(bundle.rig.rotation[0], RIG.rotation, atol=0.01)
     np.testing.assert_allclose(bundle.rig.translation[0], RIG.translation, atol=2e-3)
-    assert bundle.shared == 6
+    assert bundle.shared_count == 6
     assert apart == {}
 
 
 def test_start_names_the_pair_that_does_not_belong_together() -> None:
     left, right = pairs(6)
     views = [*right[:4], right[0], right[5]]
-    _, bundle, apart = start(as_moments(left, views), Lenses((LEFT, RIGHT), "plumb_bob", ()))
+    _, bundle, apart = guess_start(as_moments(left, views), Lenses((LEFT, RIGHT), "plumb_bob", ()))
     assert list(apart) == [4]
     assert apart[4] > 50
     np.testing.assert_allclose(bundle.rig.translation[0], RIG.translation, atol=2e-3)
@@ -463,5 +463,5 @@ def test_remark_sides_is_made_for_a_right_camera_on_the_left(
     turn: float, shift: list[float], codes: list[Code]
 ) -> None:
     rotation = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
-    remarks = remark_sides(Transform("right", "left", rotation, np.array(shift)))
+    remarks = side_remarks(Transform("right", "left", rotation, np.array(shift)))
     assert [one.code for one in remarks] == codes

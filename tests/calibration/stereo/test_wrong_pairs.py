@@ -11,7 +11,7 @@ import pytest
 
 from smartcam.calibration import StereoCalibration, TargetView, Transform, calibrate_stereo
 from smartcam.geometry._inside import Code, exp_rotation
-from tests.calibration.inside import check_apart
+from tests.calibration.inside import check_cameras_apart
 from tests.calibration.lens.test_wrong_views import flipped, mirrored
 from tests.calibration.lenskit import LEFT, RIG, RIGHT, pairs, poses, seen
 from tests.calibration.scenes import refused
@@ -81,9 +81,13 @@ def test_calibrate_stereo_of_one_camera_twice_is_refused(lens: Any) -> None:
 
 def test_cameras_stand_apart_by_more_than_chance() -> None:
     covariance = np.diag([1e-6] * 6)
-    check_apart(Transform("right", "left", np.eye(3), np.array([0.006, 0.0, 0.0])), covariance)
+    check_cameras_apart(
+        Transform("right", "left", np.eye(3), np.array([0.006, 0.0, 0.0])), covariance
+    )
     with refused("COINCIDENT", "5 mm from the other"):
-        check_apart(Transform("right", "left", np.eye(3), np.array([0.0, 0.005, 0.0])), covariance)
+        check_cameras_apart(
+            Transform("right", "left", np.eye(3), np.array([0.0, 0.005, 0.0])), covariance
+        )
 
 
 def test_calibrate_stereo_of_mirrored_right_images_is_refused() -> None:

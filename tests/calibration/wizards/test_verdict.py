@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FIELD = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
 SHIFT = np.array([0.4, -0.1])
-ALLOWED = Allowed(30.0, given=True)
+ALLOWED = Allowed(30.0, is_from_user=True)
 
 
 @pytest.mark.parametrize(
