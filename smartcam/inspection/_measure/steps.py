@@ -3,8 +3,8 @@
 The model is a step between two grey levels, blurred by the lens as by a Gaussian of width ``s``,
 and averaged over the area of square pixels. Projected along an edge at an angle, a pixel's area is
 a trapezoid: the convolution of two boxes with the widths sine and cosine of the angle. The share of
-a pixel after a step at distance d is the trapezoid convolved with the Gaussian's integral, with a
-closed form: differences of the Gaussian's second integral.
+a pixel that lies after a step at distance d is the trapezoid convolved with the Gaussian's
+integral. It has a closed form: differences of the Gaussian's second integral.
 
 The fit is by Levenberg and Marquardt. Its covariance is the Cramer-Rao bound with the noise of the
 residuals; no unbiased estimate can be better.
@@ -43,7 +43,7 @@ CONVERGED_PX = 1e-4
 """Largest change of places, pixels, in the last iteration of a fit."""
 
 MIN_SIDE_PX = 1e-3
-"""Least width of a box of a pixel, pixels; 0 would be a divisor."""
+"""Least width of a projected pixel, pixels; 0 would be a divisor."""
 
 START_BLURS_PX = (0.4, 0.8, 1.6, 3.2, 5.0)
 """Blurs, pixels, that are tried as the start of a fit."""
@@ -60,7 +60,7 @@ class StepFits(NamedTuple):
     cost: Array  # (N,), sum of the squared residuals
     hessian: Array  # (N, M, M)
     counts: Array  # (N,), number of pixels
-    settled: NDArray[np.bool_]  # (N,), whether the fit converged
+    converged: NDArray[np.bool_]  # (N,), whether the fit converged
 
     @property
     def steps(self) -> int:
@@ -110,8 +110,10 @@ class StepFits(NamedTuple):
         return covariance
 
 
-def share(distance: Array, blur: Array, sides: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-    """Return the share of pixels after a step, and its derivatives by distance and by blur."""
+def share_after_step(
+    distance: Array, blur: Array, sides: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Return the shares of pixels that lie after a step, with derivatives by distance and blur."""
     # With the trapezoid of half widths p = (a + b) / 2 and m = (a - b) / 2 the share is
     #     [R(d + p) - R(d + m) - R(d - m) + R(d - p)] / (a b),
     # R'' = F, the Gaussian's distribution: R = ((x^2 + s^2) F + s x f) / 2, R' = x F + s f, with f
@@ -128,13 +130,13 @@ def share(distance: Array, blur: Array, sides: tuple[Array, Array]) -> tuple[Arr
         (-1.0, distance - inner),
         (1.0, distance - outer),
     ):
-        part = at / blur
-        below = ndtr(part)
-        density = blur / math.sqrt(2 * math.pi) * np.exp(-0.5 * part * part)
-        rise = at * below + density
-        value = value + sign * 0.5 * (square * below + at * rise)
-        slope = slope + sign * rise
-        bend = bend + sign * below
+        normalized = at / blur
+        cumulative = ndtr(normalized)
+        density = blur / math.sqrt(2 * math.pi) * np.exp(-0.5 * normalized * normalized)
+        integral = at * cumulative + density
+        value = value + sign * 0.5 * (square * cumulative + at * integral)
+        slope = slope + sign * integral
+        bend = bend + sign * cumulative
     area = first * second
     return value / area, slope / area, blur * bend / area
 
@@ -142,7 +144,7 @@ def share(distance: Array, blur: Array, sides: tuple[Array, Array]) -> tuple[Arr
 def fit_steps(
     pixels: StripPixels, places: Array, *, tilted: bool, blurs: Array | None = None
 ) -> StepFits:
-    """Return the best fit of steps from start places (N, K) with errors of a pixel or two.
+    """Return the best fit of steps from start places (N, K) that may be wrong by a pixel or two.
 
     ``tilted``: whether the tilt is fitted, too; else it is 0. ``blurs`` (N,): approximate blurs;
     None: several are tried.
@@ -151,11 +153,11 @@ def fit_steps(
     starts = START_BLURS_PX if blurs is None else (blurs,)
     free = np.ones(2 * steps + 3, dtype=np.bool_)
     free[steps] = tilted
-    return _solve(pixels, _best_start(pixels, places, starts), free)
+    return _fit_from(pixels, _best_start(pixels, places, starts), free)
 
 
 def _best_start(pixels: StripPixels, places: Array, starts: Sequence[float | Array]) -> Array:
-    """Return start values (N, M) with the best one of several blurs, and fitted heights."""
+    """Return start values (N, M): the blur of ``starts`` that fits best, and fitted heights."""
     number, steps = places.shape
     best = np.zeros((number, 2 * steps + 3))
     least = np.full(number, np.inf)
@@ -178,22 +180,22 @@ def _normal_equations(pixels: StripPixels, values: Array) -> tuple[Array, Array,
     steps = (values.shape[1] - 3) // 2
     tilt, blur = values[:, [steps]], values[:, [steps + 1]]
     cosine = 1 / np.sqrt(1 + tilt * tilt)
-    sides = _sides(pixels.ahead, tilt, cosine)
+    sides = _sides(pixels.directions, tilt, cosine)
     columns = np.empty((len(values), values.shape[1], pixels.along.shape[1]))
     columns[:, steps : steps + 2] = 0.0
     model = values[:, [-1]] + np.zeros_like(pixels.along)
     for k in range(steps):
-        away = pixels.along - values[:, [k]] - tilt * pixels.beside
-        part, slope, by_blur = share(cosine * away, blur, sides)
+        offset = pixels.along - values[:, [k]] - tilt * pixels.across
+        share, slope, by_blur = share_after_step(cosine * offset, blur, sides)
         height = values[:, [steps + 2 + k]]
         columns[:, k] = -height * cosine * slope
-        # d = cosine (along - place - tilt beside) with cosine = (1 + tilt^2)^-1/2
+        # d = cosine (along - place - tilt across) with cosine = (1 + tilt^2)^-1/2
         columns[:, steps] += (
-            height * slope * cosine * (-pixels.beside - cosine * cosine * tilt * away)
+            height * slope * cosine * (-pixels.across - cosine * cosine * tilt * offset)
         )
         columns[:, steps + 1] += height * by_blur
-        columns[:, steps + 2 + k] = part
-        model += height * part
+        columns[:, steps + 2 + k] = share
+        model += height * share
     columns[:, -1] = 1.0
     columns *= pixels.weights[:, None]
     residuals = (pixels.levels - model) * pixels.weights
@@ -202,23 +204,23 @@ def _normal_equations(pixels: StripPixels, values: Array) -> tuple[Array, Array,
     return np.einsum("np,np->n", residuals, residuals), hessian, gradient
 
 
-def _sides(ahead: Array, tilt: Array, cosine: Array) -> tuple[Array, Array]:
+def _sides(directions: Array, tilt: Array, cosine: Array) -> tuple[Array, Array]:
     """Return the widths (N, P) of the two boxes of pixels, projected along a tilted edge."""
-    u, v = ahead[..., 0], ahead[..., 1]
+    u, v = directions[..., 0], directions[..., 1]
     return (
         np.maximum(np.abs(cosine * (u + tilt * v)), MIN_SIDE_PX),
         np.maximum(np.abs(cosine * (v - tilt * u)), MIN_SIDE_PX),
     )
 
 
-def _solve(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepFits:
+def _fit_from(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepFits:
     number, size = values.shape
     steps = (size - 3) // 2
     cost, hessian, gradient = _normal_equations(pixels, values)
     active = np.arange(number)
     damping = np.full(number, 1e-3)
-    settled = np.zeros(number, dtype=np.bool_)
-    part = pixels
+    converged = np.zeros(number, dtype=np.bool_)
+    active_pixels = pixels
     fixed = np.flatnonzero(~free)
     for _ in range(MAX_STEPS):
         slope, curve = gradient[active].copy(), hessian[active].copy()
@@ -235,21 +237,21 @@ def _solve(pixels: StripPixels, values: Array, free: NDArray[np.bool_]) -> StepF
         trial = values[active] + move
         trial[:, steps] = trial[:, steps].clip(-MAX_TILT, MAX_TILT)
         trial[:, steps + 1] = trial[:, steps + 1].clip(MIN_BLUR_PX, MAX_BLUR_PX)
-        tried = _normal_equations(part, trial)
+        tried = _normal_equations(active_pixels, trial)
         better = tried[0] <= cost[active] * (1 + 1e-12)
         moved = np.abs(trial - values[active])[:, : steps + 2].max(axis=1)
         chosen = active[better]
         values[chosen], cost[chosen] = trial[better], tried[0][better]
         hessian[chosen], gradient[chosen] = tried[1][better], tried[2][better]
         damping[active] *= np.where(better, 0.1, 10.0)
-        still = (moved < CONVERGED_PX) | (damping[active] > 1e8)
-        settled[active[still]] = True
-        if still.any():
-            active, part = active[~still], part.selected(~still)
+        is_finished = (moved < CONVERGED_PX) | (damping[active] > 1e8)
+        converged[active[is_finished]] = True
+        if is_finished.any():
+            active, active_pixels = active[~is_finished], active_pixels.selected(~is_finished)
         if not len(active):
             break
     if fixed.size:
         hessian[:, fixed, :] = 0.0
         hessian[:, :, fixed] = 0.0
         hessian[:, fixed, fixed] = 1.0
-    return StepFits(values, cost, hessian, pixels.counts, settled)
+    return StepFits(values, cost, hessian, pixels.counts, converged)
