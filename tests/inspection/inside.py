@@ -39,5 +39,5 @@ from smartcam.inspection._measure.values import (
 from smartcam.inspection._program import MAX_REASON_BYTES
 from smartcam.inspection._read import gs1
 from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
-from smartcam.inspection._read.gs1 import GS, elements
+from smartcam.inspection._read.gs1 import GS, split_elements
 from smartcam.inspection._read.tool import ReadSettings, ReadTool

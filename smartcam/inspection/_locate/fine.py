@@ -280,7 +280,7 @@ def _find_edges(fit: StepFit, settings: FineSettings) -> tuple[NDArray[np.bool_]
 
 
 def _relative_misfits(fit: StepFit, settings: FineSettings) -> Array:
-    """Return the RMS residual of each step beyond the noise, relative to the largest allowed RMS."""
+    """Return the RMS residual of each step beyond the noise, relative to the largest allowed."""
     # the scatter of a band's pixels varies by chance
     noise = settings.noise**2 * (1 + 3 * np.sqrt(2 / fit.freedoms))
     excess_rms = np.sqrt(np.maximum(fit.variances - noise, 0.0))

@@ -43,7 +43,7 @@ from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
 from smartcam.inspection._picture import Picture
-from smartcam.inspection._places import PixelPose, Region, place
+from smartcam.inspection._places import PixelPose, Region, place_region
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -434,7 +434,7 @@ def _region_mask(
     else:
         if region is not None:
             check_kind(region, Region, "region", "a Region, a mask or None", "PartModel.teach")
-        placed = place(region, None, picture.size)
+        placed = place_region(region, None, picture.size)
         if placed.is_empty:
             raise TeachingError(
                 TeachingTrouble.EMPTY,
