@@ -358,7 +358,7 @@ def test_a_calibration_of_ours_brings_its_covariance() -> None:
     assert (told > sure).all()
     focal = made(CameraChain.of(calibration), focal_sigma=3.0)
     np.testing.assert_allclose(
-        focal.sigma(flat, flat * 0),
+        focal.depth_sigma(flat, flat * 0),
         np.hypot(exact.depth_sigma(flat, flat * 0), 3 / pair.focal),
         rtol=0.01,
     )
