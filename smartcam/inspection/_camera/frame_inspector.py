@@ -179,7 +179,7 @@ class FrameInspector(Inspector):
 
     def begin(
         self,
-        run: InspectionOrder,
+        order: InspectionOrder,
         seen: Callable[[], None],
         done: Callable[[Values | None], None],
     ) -> None:
@@ -187,7 +187,7 @@ class FrameInspector(Inspector):
         self.cancel()
         loop = asyncio.get_running_loop()
         deadline = loop.call_later(FRAME_WAIT, self._end_without_frame)
-        self._run = _OrderedRun(run, seen, done, time.monotonic(), deadline)
+        self._run = _OrderedRun(order, seen, done, time.monotonic(), deadline)
         self._frame_wanted.set()
         if self.trouble:  # a restart of the device has cleared the condition there
             loop.call_soon(self._set_trouble, self.trouble)
