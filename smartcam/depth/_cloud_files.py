@@ -91,9 +91,8 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
         )
     try:
         with path.open("rb") as stream:
-            status = os.fstat(
-                stream.fileno()
-            )  # since read() allocates as many bytes as it is asked for
+            # read() allocates as many bytes as it is asked for, so the size is checked before
+            status = os.fstat(stream.fileno())
             is_readable_whole = stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE_BYTES
             data = stream.read(status.st_size if is_readable_whole else MAX_FILE_BYTES + 1)
     except OSError as exc:

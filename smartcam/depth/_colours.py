@@ -275,10 +275,8 @@ def _make_region(labels: NDArray[Any], label: int, box: tuple[slice, slice]) -> 
     )
     hull = cv2.convexHull(points.astype(np.int32))
     rectangle = cv2.minAreaRect(hull)
-    (width, height), angle = (
-        (side + 1 for side in rectangle[1]),
-        rectangle[2],
-    )  # between rims, not centres, of pixels
+    # sizes between the rims, not the centres, of the outer pixels
+    (width, height), angle = (side + 1 for side in rectangle[1]), rectangle[2]
     mask = np.zeros(labels.shape, bool)
     mask[box] = pixels
     return ColourRegion(

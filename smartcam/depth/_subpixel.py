@@ -188,9 +188,8 @@ def _linearize(
     left, right = pictures
     width = left.shape[1]
     right_columns = np.arange(width, dtype=np.float32) - disparity
-    is_inside = (
-        known & (right_columns >= 2) & (right_columns <= width - 4)
-    )  # interpolation uses six pixels
+    # interpolation uses six pixels
+    is_inside = known & (right_columns >= 2) & (right_columns <= width - 4)
     mask = is_inside.astype(np.float32)
     right_levels, slope = _interpolate(right, np.where(is_inside, right_columns, np.float32(2)))
     slope += np.gradient(left, axis=1)

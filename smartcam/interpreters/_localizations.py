@@ -196,9 +196,8 @@ class LocalizationsInterpreter(PlainInterpreter):
                 [value * by / over for value in column] for column, by, over in scales
             )
         if context.y_down:
-            y, theta = (
-                [0.0 - value for value in column] for column in (y, theta)
-            )  # avoids minus zero
+            # a difference, since a negation would give minus zero
+            y, theta = ([0.0 - value for value in column] for column in (y, theta))
         total = sum(quality) + sum(x) + sum(y) + sum(theta)  # not finite if one is not
         if not math.isfinite(total) or min(quality) < 0.0 or max(quality) > MAX_QUALITY:
             return None

@@ -25,9 +25,8 @@ _log: Final = logging.getLogger("smartcam.inspection")
 MAX_WAITING_PICTURES: Final = 16
 """Largest number of pictures that wait to be written; more are dropped and counted."""
 
-_FORBIDDEN: Final = re.compile(
-    r'[\x00-\x1f/\\:*?"<>|]'
-)  # characters that names of files cannot have
+# characters that names of files cannot have
+_FORBIDDEN: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')
 
 
 class PictureKeeper:

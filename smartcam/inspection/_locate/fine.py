@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 FIRST_BLURS_PX: Final = (3.0, 2.0)
-"""Blurs of the first steps of a fit, pixels: with a large blur, farther edges are found."""
+"""Blurs of the first iterations of a fit, pixels: with a large blur, farther edges are found."""
 
-MAX_STEPS: Final = 12
-"""Largest number of steps of a fit."""
+MAX_ITERATIONS: Final = 12
+"""Largest number of iterations of a fit."""
 
-GROUND_STEPS: Final = 2
-"""Number of further steps of a fit if the brightness beside the edges varies."""
+GROUND_ITERATIONS: Final = 2
+"""Number of further iterations of a fit if the brightness beside the edges varies."""
 
 CONVERGENCE_PX: Final = 2e-4
 """A fit ends when no segment moves by more than this many pixels."""
 
 MAX_SHIFT_PX: Final = 2.0
-"""Largest shift of a segment that one step of the fit takes into account, pixels."""
+"""Largest shift of a segment that one iteration of the fit takes into account, pixels."""
 
 MAX_BLUR_PX: Final = 4.0
 """Largest blur of edges that are fitted, pixels."""
@@ -83,8 +83,8 @@ CHANGE_SIGNIFICANCE: Final = 3.0
 """Least significance, in standard deviations, of a change of the part's shape that is fitted. With
 1.0 a bolt's errors were 1.32 times the bound, since each fitted change costs certainty."""
 
-FIRST_CHANGED_STEP: Final = 2
-"""Number of the first step that also fits changes of the part's shape."""
+FIRST_CHANGES_ITERATION: Final = 2
+"""Number of the first iteration that also fits changes of the part's shape."""
 
 MAX_INVERSE: Final = 1e8
 """Largest element of the inverse of the scaled equations; above it the edges do not determine the
@@ -162,13 +162,13 @@ def fit_pose(
     sigmas = np.array([size_sigma, STRETCH_SIGMA, STRETCH_SIGMA, GROWTH_SIGMA_PX])
     expected = ExpectedShape(start.scale, sigmas)
     extra_variance, pixels = 0.0, find_band_pixels(bands, _pose_matrix(start), levels)
-    for iteration in range(MAX_STEPS):
+    for iteration in range(MAX_ITERATIONS):
         if 0 < iteration < 4:
             pixels = find_band_pixels(bands, _pose_matrix(shape.pose), levels)
         first_blur = FIRST_BLURS_PX[iteration] if iteration < len(FIRST_BLURS_PX) else None
         fit, blurs = _fit_bands(pixels, segments, shape, extra_variance, first_blur)
         rows, weights, _, _ = _linearize((fit, blurs), segments, shape.pose, settings, iteration)
-        fits_changes = iteration >= FIRST_CHANGED_STEP
+        fits_changes = iteration >= FIRST_CHANGES_ITERATION
         free = np.array(
             [
                 True,
@@ -245,14 +245,14 @@ def _update_variance(extra_variance: float, widening: float, blur: float) -> flo
 
 
 def _linearize(
-    steps: tuple[StepFit, Array],
+    fit_and_blurs: tuple[StepFit, Array],
     segments: Segments,
     pose: PixelPose,
     settings: FineSettings,
     iteration: int,
 ) -> tuple[Array, Array, float, NDArray[np.bool_]]:
     """Return rows (N, 7) and weights (N,) of the equations, the noise, and the mask of edges."""
-    fit, blurs = steps
+    fit, blurs = fit_and_blurs
     is_edge, noise = _find_edges(fit, settings)
     cos, sin = math.cos(pose.angle), math.sin(pose.angle)
     rotation = np.array([[cos, sin], [-sin, cos]])
@@ -306,8 +306,10 @@ def _shift_sigmas(
     variances = np.where(has_structure, fit.variances, noise**2)
     # the structure may move the edge by its height over the step's steepest slope
     steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)
-    misfit = np.where(has_structure, fit.variances - noise**2, 0.0) / steepest**2
-    return np.sqrt(variances * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
+    misfit_variances = np.where(has_structure, fit.variances - noise**2, 0.0) / steepest**2
+    return np.sqrt(
+        variances * fit.sigmas**2 + misfit_variances + (pose.scale * segments.sigmas) ** 2
+    )
 
 
 Equations = tuple["Array", "Array", "Array"]
@@ -372,8 +374,10 @@ def _judge_pose(
 ) -> FinePose | None:
     """Return the final pose, its covariance and its score; None: too few edges agree."""
     free = np.array([True, True, settings.fits_angle, True, True, True, True])
-    fit, blurs = steps = _fit_bands(pixels, segments, shape, extra_variance, None)
-    rows, weights, noise, is_edge = _linearize(steps, segments, shape.pose, settings, MAX_STEPS)
+    fit, blurs = fit_and_blurs = _fit_bands(pixels, segments, shape, extra_variance, None)
+    rows, weights, noise, is_edge = _linearize(
+        fit_and_blurs, segments, shape.pose, settings, MAX_ITERATIONS
+    )
     # an edge counts more if it is near its segment, and if it fits a step well
     distances = np.abs(fit.shifts) / (
         SCORED_DISTANCE_PX + MAX_DEVIATION_SIGMAS * np.minimum(_sigmas_of(weights), 1.0)
@@ -388,14 +392,12 @@ def _judge_pose(
     if score >= settings.least_score:
         places, _ = _pixel_coordinates(pixels, segments, shape, extra_variance)
         ground = measure_ground(places, blurs[pixels.owners], pixels, segments, visible)
-        for _ in range(GROUND_STEPS if ground is not None else 0):
+        for _ in range(GROUND_ITERATIONS if ground is not None else 0):
             fit, _ = _fit_bands(pixels, segments, shape, extra_variance, None, ground, noise)
-            new_equations = _linearize((fit, blurs), segments, shape.pose, settings, MAX_STEPS)
-            rows, weights, noise = (
-                new_equations[0],
-                np.where(visible, new_equations[1], 0.0),
-                new_equations[2],
+            rows, weights, noise, _ = _linearize(
+                (fit, blurs), segments, shape.pose, settings, MAX_ITERATIONS
             )
+            weights = np.where(visible, weights, 0.0)
             equations = rows, fit.shifts, weights
             solved = _solve(equations, free, expected.deviations(shape), expected.sigmas)
             if solved is None:
@@ -449,9 +451,8 @@ def _solve_final(
         freedom = max(int(inliers.sum()) - 4, 1)
         chi_square = float((sigmas_off[inliers] ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
-    exceeds_chance = chi_square > 1 + 4 * math.sqrt(
-        2 / freedom
-    )  # the part differs from the taught one
+    # beyond this, the part differs from the taught one
+    exceeds_chance = chi_square > 1 + 4 * math.sqrt(2 / freedom)
     inlier_equations = rows[inliers], shifts[inliers], weights[inliers]
     solved = _solve_with_changes(inlier_equations, free, deviations, sigmas, max(chi_square, 1.0))
     if solved is None:
@@ -477,11 +478,10 @@ def _solve_with_changes(
         return None
     move, covariance = solved
     edge_variances = 1 / np.maximum(1 / np.diag(covariance)[3:] - 1 / sigmas**2, 1e-12)
-    significant_squares = (
-        deviations + move[3:]
-    ) ** 2 - CHANGE_SIGNIFICANCE**2 * chi_square * edge_variances
-    keeps_shape = (significant_squares <= 0) & np.isfinite(sigmas)
-    size_sigmas = np.minimum(np.sqrt(np.maximum(significant_squares, 1e-12)), sigmas)
+    min_squares = CHANGE_SIGNIFICANCE**2 * chi_square * edge_variances
+    excess_squares = (deviations + move[3:]) ** 2 - min_squares
+    keeps_shape = (excess_squares <= 0) & np.isfinite(sigmas)
+    size_sigmas = np.minimum(np.sqrt(np.maximum(excess_squares, 1e-12)), sigmas)
     size_sigmas = np.where(np.isfinite(sigmas), size_sigmas, sigmas)
     shifts = shifts + rows[:, 3:] @ np.where(keeps_shape, deviations, 0.0)
     still_free = free.copy()

@@ -320,10 +320,10 @@ def _find_candidates(
         min_slope = max(
             MIN_EDGE_SIGMAS * slope_noise, 0.5 * MIN_RELATIVE_HEIGHT * float(np.abs(row).max())
         )
-        peaks = [(at, side) for side in (row, -row) for at in _find_peaks(side, min_slope)]
+        peaks = [(index, side) for side in (row, -row) for index in _find_peaks(side, min_slope)]
         strongest = sorted(peaks, key=lambda peak: -peak[1][peak[0]])[:MAX_EDGES]
         candidates.append(
-            np.array(sorted(_refine_peak(side, at) - middle for at, side in strongest))
+            np.array(sorted(_refine_peak(side, index) - middle for index, side in strongest))
         )
         counts.append(len(peaks))
     return candidates, counts
@@ -332,38 +332,40 @@ def _find_candidates(
 def _filter_slopes(levels: Array, smoothing: float) -> Array:
     """Return profiles (N, T) filtered by a Gaussian's derivative, with constant continuation."""
     reach = math.ceil(4 * smoothing)
-    at = np.arange(-reach, reach + 1, dtype=np.float64)
-    kernel: Array = at * np.exp(-(at**2) / (2 * smoothing**2))
-    kernel = kernel / float((kernel * at).sum())  # so that a ramp of 1 has the slope 1
+    offsets = np.arange(-reach, reach + 1, dtype=np.float64)
+    kernel: Array = offsets * np.exp(-(offsets**2) / (2 * smoothing**2))
+    kernel = kernel / float((kernel * offsets).sum())  # so that a ramp of 1 has the slope 1
     padded = np.pad(levels, ((0, 0), (reach, reach)), mode="edge")
-    slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(at), axis=1) @ kernel
+    slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(offsets), axis=1) @ kernel
     return slopes
 
 
-def _find_peaks(slopes: Array, least: float) -> list[int]:
-    """Return the indices of peaks with a height of ``least`` and half of it as prominence."""
+def _find_peaks(slopes: Array, min_height: float) -> list[int]:
+    """Return the indices of peaks with a height of ``min_height`` and half of it as prominence."""
     after, before = np.append(slopes[1:], -np.inf), np.insert(slopes[:-1], 0, -np.inf)
     peaks = []
-    for at in np.flatnonzero((slopes > before) & (slopes >= after) & (slopes >= least)).tolist():
-        higher = np.flatnonzero(slopes > slopes[at])
-        left = higher[higher < at].max(initial=-1)
-        right = higher[higher > at].min(initial=len(slopes))
+    for index in np.flatnonzero(
+        (slopes > before) & (slopes >= after) & (slopes >= min_height)
+    ).tolist():
+        higher = np.flatnonzero(slopes > slopes[index])
+        left = higher[higher < index].max(initial=-1)
+        right = higher[higher > index].min(initial=len(slopes))
         # prominence: height above the higher one of the valleys between the peak and higher peaks
         # on both sides; the end of the strip is no valley
-        valleys = [slopes[left + 1 : at + 1].min()] if left >= 0 else []
-        valleys += [slopes[at:right].min()] if right < len(slopes) else []
-        if not valleys or slopes[at] - max(valleys) >= least / 2:
-            peaks.append(at)
+        valleys = [slopes[left + 1 : index + 1].min()] if left >= 0 else []
+        valleys += [slopes[index:right].min()] if right < len(slopes) else []
+        if not valleys or slopes[index] - max(valleys) >= min_height / 2:
+            peaks.append(index)
     return peaks
 
 
-def _refine_peak(slopes: Array, at: int) -> float:
+def _refine_peak(slopes: Array, peak: int) -> float:
     """Return the place of the maximum of a parabola through a peak and its neighbours."""
-    if not 0 < at < len(slopes) - 1:
-        return float(at)
-    before, top, after = slopes[at - 1 : at + 2]
+    if not 0 < peak < len(slopes) - 1:
+        return float(peak)
+    before, top, after = slopes[peak - 1 : peak + 2]
     bend = before - 2 * top + after
-    return at if bend >= 0 else at + 0.5 * float(before - after) / float(bend)
+    return peak if bend >= 0 else peak + 0.5 * float(before - after) / float(bend)
 
 
 class _EdgeGroup(NamedTuple):
@@ -381,7 +383,7 @@ class _FittedStep(NamedTuple):
     owner: int  # index of the strip
     edge: Edge
     side_length: float  # distance from the edge to the nearer end of its strip, pixels
-    misfit: float  # RMS residual, grey levels
+    rms_residual: float  # grey levels
     saturated: tuple[float, float]  # shares of pixels saturated at black and at white
     converged: bool
 
@@ -477,7 +479,7 @@ def _as_steps(
 ) -> list[_FittedStep]:
     counts = np.maximum(pixels.counts, 1.0)
     noises = np.maximum(np.sqrt(fits.variance), ROUNDING)
-    covariance = fits.unit_covariance()[:, : fits.steps + 1, : fits.steps + 1]
+    covariance = fits.unit_covariance()[:, : fits.step_count + 1, : fits.step_count + 1]
     steps = []
     for i, group in enumerate(groups):
         shared = covariance[i]
@@ -608,8 +610,11 @@ def _find_trouble(
         limit, share = ("black", black) if black > white else ("white", white)
         text = f"{100 * share:.0f} % of the pixels beside the edge are {limit} to the limit"
         return NotMeasuredError(NoValueReason.SATURATED, text)
-    if step.misfit > ALLOWED_MISFIT_NOISES * noise and step.misfit > MAX_RELATIVE_MISFIT * height:
-        text = f"the grey levels are {step.misfit:.1f} from a step of {height:.0f}"
+    if (
+        step.rms_residual > ALLOWED_MISFIT_NOISES * noise
+        and step.rms_residual > MAX_RELATIVE_MISFIT * height
+    ):
+        text = f"the grey levels are {step.rms_residual:.1f} from a step of {height:.0f}"
         return NotMeasuredError(NoValueReason.NO_STEP, text)
     if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _visible_blur(edge.blur)):
         text = f"noise leaves the edge open by {edge.sigma:.2f} px (one standard deviation)"

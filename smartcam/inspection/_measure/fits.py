@@ -36,8 +36,8 @@ OUTLIER_SIGMAS = 3.5
 MAX_ROUNDS = 10
 """Largest number of alternations between fitting and choosing inliers; two or three are usual."""
 
-MAX_STEPS = 30
-"""Largest number of steps of a fit; three to five are usual."""
+MAX_ITERATIONS = 30
+"""Largest number of iterations of a fit; three to five are usual."""
 
 MAX_OUTLIER_SHARE = 0.5
 """Largest share of outliers."""
@@ -261,7 +261,7 @@ def _refine_line(edges: Edges, start: Array, wanted_direction: Array) -> tuple[L
     angle = float(start[0])
     hessian: NDArray[Any] = np.eye(2)
     offset = float(start[1] - np.array([math.cos(angle), math.sin(angle)]) @ centroid)
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_ITERATIONS):
         normal = np.array([math.cos(angle), math.sin(angle)])
         along = offsets @ np.array([-normal[1], normal[0]])
         cosines = edges.normals @ normal
@@ -275,9 +275,8 @@ def _refine_line(edges: Edges, start: Array, wanted_direction: Array) -> tuple[L
     normal = np.array([math.cos(angle), math.sin(angle)])
     direction = np.array([normal[1], -normal[0]])
     covariance: Array = np.linalg.inv(hessian)
-    if (
-        direction @ wanted_direction < 0
-    ):  # offsets are along the normal, which flips with the direction
+    if direction @ wanted_direction < 0:
+        # offsets are along the normal, which flips with the direction
         direction, covariance = -direction, covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
     along = offsets @ direction
     middle = centroid + offset * normal
@@ -289,7 +288,7 @@ def _refine_circle(edges: Edges, start: Array) -> tuple[Circle, Array]:
     weights = 1 / edges.sigmas**2
     values = start.copy()
     hessian: NDArray[Any] = np.eye(3)
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_ITERATIONS):
         offsets = edges.points - values[:2]
         distances = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
         radial = offsets / distances[:, None]

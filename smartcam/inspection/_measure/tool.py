@@ -103,9 +103,8 @@ class Measure(Tool[MeasureSettings]):
 
     def __init__(self, settings: MeasureSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load(
-            "scipy.special", "measure needs"
-        )  # now, since the first picture should not wait for it
+        # loaded now, since the first picture should not wait for it
+        load("scipy.special", "measure needs")
         calibration, tolerance = setup.calibration, settings.tolerance
         unit = settings.unit
         if unit is None and tolerance is not None and tolerance.unit != "deg":
