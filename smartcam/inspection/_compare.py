@@ -39,7 +39,7 @@ EDGE_TOLERANCE_PX: Final = 0.75
 """Largest distance of an edge from its taught place, in pixels."""
 
 MAX_ITERATIONS: Final = 30
-"""Largest number of steps of the alignment."""
+"""Largest number of iterations of the alignment."""
 
 MIN_LIGHT_CORRELATION: Final = 0.5
 """Least correlation of taught and current levels at which a change of light is assumed."""
@@ -265,21 +265,24 @@ def _find_hidden(relit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
         return np.zeros(relit.shape, bool)
     cv2 = load("cv2", "inspection needs")
 
-    def differs(levels: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def compare_surroundings(
+        levels: NDArray[np.float32],
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         slopes = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
-        least = level + EDGE_TOLERANCE_PX * slopes
+        min_difference = level + EDGE_TOLERANCE_PX * slopes
         surroundings = np.ones((SURROUNDINGS_PX, SURROUNDINGS_PX), np.uint8)
         return (
-            cv2.dilate(levels, surroundings) - levels >= least,
-            levels - cv2.erode(levels, surroundings) >= least,
+            cv2.dilate(levels, surroundings) - levels >= min_difference,
+            levels - cv2.erode(levels, surroundings) >= min_difference,
         )
 
-    shown = np.clip(relit, 0, 255)
-    (darker, lighter), (seen_darker, seen_lighter) = differs(relit), differs(shown)
+    clipped = np.clip(relit, 0, 255)
+    darker, lighter = compare_surroundings(relit)
+    still_darker, still_lighter = compare_surroundings(clipped)
     # beside a visible edge, a pixel is between the levels of both sides
-    edge = cv2.morphologyEx(shown, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+    edge = cv2.morphologyEx(clipped, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
     is_flat = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
-    mask: NDArray[np.bool_] = ((darker & ~seen_darker) | (lighter & ~seen_lighter)) & is_flat
+    mask: NDArray[np.bool_] = ((darker & ~still_darker) | (lighter & ~still_lighter)) & is_flat
     return mask
 
 
@@ -296,11 +299,11 @@ def _fit_light(taught: NDArray[np.uint8], current: NDArray[np.uint8]) -> tuple[f
     for _ in range(LIGHT_FIT_ROUNDS):
         a, b = x[is_inlier], y[is_inlier]
         da, db = a - a.mean(), b - b.mean()
-        both, one, other = float(da @ db), float(da @ da), float(db @ db)
-        correlates = both > MIN_LIGHT_CORRELATION * math.sqrt(one * other) and one > len(a)
+        sum_xy, sum_xx, sum_yy = float(da @ db), float(da @ da), float(db @ db)
+        correlates = sum_xy > MIN_LIGHT_CORRELATION * math.sqrt(sum_xx * sum_yy) and sum_xx > len(a)
         if not correlates:
             return 1.0, 0.0
-        gain = min(max(both / one, 1 / MAX_GAIN), MAX_GAIN)
+        gain = min(max(sum_xy / sum_xx, 1 / MAX_GAIN), MAX_GAIN)
         offset = float(np.median(b - gain * a))
         residuals = np.abs(y - gain * x - offset)
         is_inlier = residuals <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(residuals)), 3.0)

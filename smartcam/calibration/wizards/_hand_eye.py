@@ -102,8 +102,9 @@ def hand_eye_wizard(
     ``target``: a description of the target on the sheet; the wizard then does not ask for the
     target.
 
-    Its result: ``name, file, path, good_for_mm, method, views, held_out_mm, mean_mm,
-    translation_error_mm, rotation_error_deg, remarks``, and lines that ``use`` it.
+    Its result has the entries ``name``, ``file``, ``path``, ``good_for_mm``, ``method``, ``views``,
+    ``held_out_mm``, ``mean_mm``, ``translation_error_mm``, ``rotation_error_deg``, ``remarks``, and
+    ``use`` (lines that use the result).
 
     Args:
         take_picture: function that takes a picture while the robot stands still; or an open source

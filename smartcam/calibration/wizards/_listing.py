@@ -24,9 +24,9 @@ MAX_CALIBRATIONS: Final = 200
 def listing(folder: Folder) -> list[dict[str, Any]]:
     """Return a row of JSON data for each calibration of a folder, sorted by name.
 
-    ``name, kind, written_at`` (UTC, ISO 8601)``, held_out_mm`` (RMS; None: not known)``,
-    checked_at`` and ``stale`` of the last check (None without a check)``, problem`` (None without
-    one). A file that cannot be read has only a ``problem``.
+    Its keys are ``name``, ``kind``, ``written_at`` (UTC, ISO 8601), ``held_out_mm`` (RMS; None: not
+    known), ``checked_at`` and ``stale`` of the last check (None without a check), and ``problem``
+    (None if the file can be read). A file that cannot be read has only a name and a ``problem``.
     """
     return [_listing_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
 

@@ -49,10 +49,11 @@ def plane_wizard(
     ``tool``, ``unit`` (mm, m), ``side``, ``touch_sigma`` (mm); ``feature``: only marks with this
     name count.
 
-    Its result: ``name, file, model, points, left_out`` (numbers of points, from 1)``, residual_mm,
-    held_out_mm, predicted_mm, remarks``, ``path`` of the file, ``good_for_mm`` (error that
-    95 of 100 new points do not exceed; None: not known, or not good), and ``use``: lines that use
-    the result, ``command`` and ``python``. Points that were left out count in none of the errors.
+    Its result has the entries ``name``, ``file``, ``model``, ``points``, ``left_out`` (numbers of
+    points, from 1), ``residual_mm``, ``held_out_mm``, ``predicted_mm``, ``remarks``, ``path`` (of
+    the file), ``good_for_mm`` (error that 95 of 100 new points do not exceed; None: not known, or
+    not good), and ``use`` (lines that use the result: ``command`` and ``python``). Points that were
+    left out count in none of the errors.
 
     Args:
         localize: function that takes a picture and localizes marks in it.

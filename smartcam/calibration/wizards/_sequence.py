@@ -121,13 +121,13 @@ class _ScriptRun:
         self, wizard: Wizard, parameters: Mapping[str, Any], entries: list[dict[str, Any]]
     ) -> None:
         self._coroutine = wizard.script(copy.deepcopy(dict(parameters)))
-        self.request: PendingStep | None = None
+        self.pending: PendingStep | None = None
         self.last: Step | None = None  # the step that was answered last
         self.result: Any = None
         self._send(None)
         for number, entry in enumerate(entries, 1):
-            if self.request is None or self.request.step.id != entry["step"]:
-                place = "the end" if self.request is None else f"step {self.request.step.id!r}"
+            if self.pending is None or self.pending.step.id != entry["step"]:
+                place = "the end" if self.pending is None else f"step {self.pending.step.id!r}"
                 self.close()
                 raise Code.WRONG_JOURNAL.refusal(
                     f"entry {number} is of step {entry['step']!r}, expected {place}: another "
@@ -140,16 +140,16 @@ class _ScriptRun:
         self._send(StepAnswer(copy.deepcopy(entry["answers"]), copy.deepcopy(entry["outcome"])))
 
     def _send(self, answer: StepAnswer | None) -> None:
-        self.last = None if self.request is None else self.request.step
+        self.last = None if self.pending is None else self.pending.step
         try:
-            request = self._coroutine.send(answer)
+            pending = self._coroutine.send(answer)
         except StopIteration as stop:
-            self.request, self.result = None, stop.value
+            self.pending, self.result = None, stop.value
             return
-        if not isinstance(request, PendingStep):
+        if not isinstance(pending, PendingStep):
             self._coroutine.close()
-            raise TypeError(f"a wizard awaits steps only, not {request!r}: that is for an action")
-        self.request = request
+            raise TypeError(f"a wizard awaits steps only, not {pending!r}: that is for an action")
+        self.pending = pending
 
     def close(self) -> None:
         self._coroutine.close()
@@ -174,6 +174,7 @@ class _SequenceLog:
     undone: Mapping[str, Any] | None = None
 
     def with_entry(self, entry: dict[str, Any]) -> _SequenceLog:
+        """Return the state after one more entry; raise KeyError if the entry lacks a key."""
         for name in _KEYS_BY_EVENT[entry["event"]]:
             _ = entry[name]
         match entry["event"]:
@@ -199,9 +200,9 @@ class WizardSession:
         wizard: the wizard.
         flow: name of this run, which its tokens begin with.
         parameters: the parameters with which the wizard was started.
-        resumed: ``since, last, done, parameters``: times at which the journal was begun and last
-            written, its answers, and its parameters; None for a new journal, and once the sequence
-            goes on.
+        resumed: facts about a resumed journal: ``since`` and ``last``, the times at which it was
+            begun and last written, ``done``, its answers, and its ``parameters``. None for a new
+            journal, and once the sequence goes on.
 
     Raises:
         CalibrationError: ``WRONG_JOURNAL``: the journal belongs to another wizard or version;
@@ -285,7 +286,7 @@ class WizardSession:
     @property
     def state(self) -> State:
         """State of the wizard."""
-        if self._log.state == "asking" and self._script_run.request is None:
+        if self._log.state == "asking" and self._script_run.pending is None:
             return "ended"
         return self._log.state
 
@@ -297,8 +298,8 @@ class WizardSession:
     @property
     def step(self) -> Step | None:
         """The current step; None at the end, and after an abort."""
-        request = self._script_run.request
-        return None if request is None or self.state != "asking" else request.step
+        pending = self._script_run.pending
+        return None if pending is None or self.state != "asking" else pending.step
 
     @property
     def busy(self) -> bool:
@@ -307,7 +308,10 @@ class WizardSession:
 
     @property
     def samples(self) -> list[dict[str, Any]]:
-        """Answers and outcomes that were not undone, in order: ``step, answers, outcome, at``."""
+        """Answers and outcomes that were not undone, in order.
+
+        Each has ``step``, ``answers``, ``outcome`` and ``at``.
+        """
         keys = ("step", "answers", "outcome", "at")
         return [{name: copy.deepcopy(entry[name]) for name in keys} for entry in self._log.entries]
 
@@ -321,13 +325,14 @@ class WizardSession:
         """The current step as JSON data, for a front-end to show.
 
         Returns:
-            ``flow, wizard, token, type, number`` (of the step, from 1)``, of`` (about how many
-            steps; None: not known)``, step`` (its id)``, title, description, button, notes,
-            verdict`` (``level, text``)``, preview, waiting, schema, defaults, errors`` (a text for
-            each input, ``base`` for other errors)``, can`` (the possible calls among ``undo,
-            repeat, abort``)``, result``. ``type`` is ``form`` (with inputs), ``confirm`` (without),
-            ``progress`` (its action is under way), ``result`` (with the verdict and the preview of
-            the last step) or ``abort``.
+            A dict with ``flow``, ``wizard``, ``token``, ``type``, ``number`` (of the step, from 1),
+            ``of`` (about how many steps; None: not known), ``step`` (its id), ``title``,
+            ``description``, ``button``, ``notes``, ``verdict`` (``level``, ``text``), ``preview``,
+            ``waiting``, ``schema``, ``defaults``, ``errors`` (a text for each input, ``base`` for
+            other errors), ``can`` (the possible calls among ``undo``, ``repeat``, ``abort``) and
+            ``result``. ``type`` is ``form`` (with inputs), ``confirm`` (without inputs),
+            ``progress`` (the step's action is under way), ``result`` (with the verdict and the
+            preview of the last step) or ``abort``.
         """
         view: dict[str, Any] = {
             "flow": self.flow,
@@ -400,14 +405,14 @@ class WizardSession:
         """
         given = {} if answers is None else answers
         async with self._lock:
-            if self._is_done("answer", token, given):
+            if self._is_repeated_call("answer", token, given):
                 return self.current
-            request = self._require_token(token)
+            pending = self._require_token(token)
             with self._keep_errors():
-                values = request.step.checked(self._fill_defaults(request.step, given))
-                outcome = await self._run_action(request, values)
+                values = pending.step.checked(self._fill_defaults(pending.step, given))
+                outcome = await self._run_action(pending, values)
                 self._accept_answer(
-                    self._script_run, self._make_entry("answer", request, values, outcome, given)
+                    self._script_run, self._make_entry("answer", pending, values, outcome, given)
                 )
             return self.current
 
@@ -425,7 +430,7 @@ class WizardSession:
         Cancellation: nothing is undone.
         """
         async with self._lock:
-            if self._is_done("undo", token):
+            if self._is_repeated_call("undo", token):
                 return self.current
             run = self._rerun_to_last_step("undo", token)
             self._commit(run, {"event": "undo", "token": token})
@@ -440,16 +445,16 @@ class WizardSession:
         Cancellation: the action is cancelled and the old outcome stays.
         """
         async with self._lock:
-            if self._is_done("repeat", token):
+            if self._is_repeated_call("repeat", token):
                 return self.current
             run, last = self._rerun_to_last_step("repeat", token), self._log.entries[-1]
-            request = run.request
-            if request is None or request.action is None:
+            pending = run.pending
+            if pending is None or pending.action is None:
                 raise self._impossible_error("repeat")
             with self._keep_errors():
-                outcome = await self._run_action(request, last["answers"])
+                outcome = await self._run_action(pending, last["answers"])
                 self._accept_answer(
-                    run, self._make_entry("repeat", request, last["answers"], outcome, None)
+                    run, self._make_entry("repeat", pending, last["answers"], outcome, None)
                 )
             return self.current
 
@@ -466,7 +471,7 @@ class WizardSession:
         if self._action_timeout is not None and token == self.token:
             self._action_timeout.reschedule(asyncio.get_running_loop().time())
         async with self._lock:
-            if self._is_done("abort", token):
+            if self._is_repeated_call("abort", token):
                 return self.current
             self._require_token(token)
             self._commit(self._script_run, {"event": "abort", "token": token})
@@ -479,7 +484,8 @@ class WizardSession:
         if self._journal is not None:
             self._journal.close()
 
-    def _is_done(self, event: str, token: str, given: object = None) -> bool:
+    def _is_repeated_call(self, event: str, token: str, given: object = None) -> bool:
+        """Return True if the last entry is already the result of this call."""
         last = self._all_entries[-1] if self._all_entries else None
         return (
             last is not None
@@ -489,8 +495,8 @@ class WizardSession:
         )
 
     def _require_token(self, token: str) -> PendingStep:
-        request = self._script_run.request
-        if self.state != "asking" or request is None:
+        pending = self._script_run.pending
+        if self.state != "asking" or pending is None:
             raise Code.NOT_POSSIBLE.refusal(
                 f"the sequence is over ({self.state}); expected one that asks", got=self.state
             )
@@ -498,7 +504,7 @@ class WizardSession:
             raise Code.STALE_STEP.refusal(
                 "the step has changed meanwhile: look at the current one", self.token, token
             )
-        return request
+        return pending
 
     def _rerun_to_last_step(self, label: str, token: str) -> _ScriptRun:
         """Run the coroutine again up to the last answered step; ``label`` names the call."""
@@ -513,13 +519,13 @@ class WizardSession:
             got=label,
         )
 
-    async def _run_action(self, request: PendingStep, values: Answers) -> Any:
-        if request.action is None:
+    async def _run_action(self, pending: PendingStep, values: Answers) -> Any:
+        if pending.action is None:
             return None
-        seconds = request.step.timeout
+        seconds = pending.step.timeout
         try:
             async with asyncio.timeout(seconds) as self._action_timeout:
-                return await request.action(copy.deepcopy(values))
+                return await pending.action(copy.deepcopy(values))
         except TimeoutError as exc:
             if self._action_timeout is None or not self._action_timeout.expired():
                 raise
@@ -528,18 +534,18 @@ class WizardSession:
             self._action_timeout = None
 
     def _make_entry(
-        self, event: str, request: PendingStep, values: Answers, outcome: Any, given: object
+        self, event: str, pending: PendingStep, values: Answers, outcome: Any, given: object
     ) -> dict[str, Any]:
         entry = {
             "event": event,
             "token": self.token,
-            "step": request.step.id,
+            "step": pending.step.id,
             "answers": values,
             "outcome": outcome,
-            "acted": request.action is not None,
+            "acted": pending.action is not None,
             "given": _digest(given) if event == "answer" else None,
         }
-        return _as_stored(entry, f"step {request.step.id!r}: its outcome")
+        return _as_stored(entry, f"step {pending.step.id!r}: its outcome")
 
     def _accept_answer(self, run: _ScriptRun, entry: dict[str, Any]) -> None:
         """Send an entry to a run; keep both if the coroutine accepts the answer."""

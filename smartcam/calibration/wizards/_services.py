@@ -75,8 +75,9 @@ class CalibrationService:
     def listing(self) -> list[dict[str, Any]]:
         """Rows of JSON data, one for each calibration.
 
-        ``name, kind, written_at, held_out_mm, checked_at, stale, problem``, with None for values
-        that are not known; a file that cannot be read has a ``problem``.
+        The keys are ``name``, ``kind``, ``written_at``, ``held_out_mm``, ``checked_at``, ``stale``
+        and ``problem``; values that are not known are None. A file that cannot be read has a
+        ``problem``.
         """
         return listing(self.folder)
 

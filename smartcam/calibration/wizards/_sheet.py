@@ -79,9 +79,9 @@ def sheet_wizard(
     (mm, m), ``side``, ``touch_sigma`` (mm); ``target``: a description of the target on the sheet;
     the wizard then does not ask for the target.
 
-    Its result: the entries of the plane's wizard, and ``seen`` (number of the target's points in
-    the picture), ``rms_px`` (RMS distance of these points from their fit); ``predicted_mm`` is the
-    predicted error, RMS over the points that were seen.
+    Its result has the entries of the plane wizard's result, and ``seen`` (number of the target's
+    points in the picture) and ``rms_px`` (RMS distance of these points from their fit).
+    ``predicted_mm`` is the predicted error, RMS over the points that were seen.
 
     Args:
         take_picture: function that takes a picture; or an open source of frames, whose first frame

@@ -69,9 +69,10 @@ def drift_wizard(
     Its parameters: ``name`` (of the calibration), ``feature`` (only marks with this name count),
     and as defaults of the first step ``unit`` (mm, m) and ``touch_sigma`` (mm).
 
-    Its result: ``name, stale, touches, offsets_mm`` (the length of each)``, rms_mm, expected_mm, z,
-    chance, needed`` (see :func:`touches_needed`, at the best mark)``, needed_at`` (number of this
-    mark's touch)``, file``.
+    Its result has the entries ``name``, ``stale``, ``touches``, ``offsets_mm`` (length of each
+    touch's offset), ``rms_mm``, ``expected_mm``, ``z``, ``chance``, ``needed`` (see
+    :func:`touches_needed`; at the best mark), ``needed_at`` (number of this mark's touch) and
+    ``file``.
 
     Each finished check is a line of a file, whose first line names its format: so the file shows a
     drift that is too slow for a single check. The calibration's own file is not changed. The file
