@@ -180,7 +180,7 @@ def _learn_measure(seen: Mapping[str, Finding], settings: Mapping[str, Any]) -> 
     sigmas = np.array([measurement.sigma for measurement in measured.values()]) / factor
     if unit == "deg":
         values = _unwrap_degrees(values)
-    is_outlier = _outliers(values, sigmas)
+    is_outlier = _find_outliers(values, sigmas)
     names = np.array([*measured], dtype=object)
     left_out |= {
         name: f"{value:.6g} {unit} is far from the others"
@@ -227,7 +227,7 @@ def _unwrap_degrees(values: Array) -> Array:
     return unwrapped
 
 
-def _outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _find_outliers(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return a mask of the outliers among values (N,)."""
     if not len(values):
         return np.zeros(0, dtype=bool)
@@ -284,13 +284,13 @@ def _left_out_text(left_out: Mapping[str, str]) -> str:
     """Return the sentence about pictures that were left out; "" if there are none."""
     if not left_out:
         return ""
-    named = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
-    more = (
+    named_pictures = [f"{name} ({why})" for name, why in left_out.items()][:MAX_PICTURES_IN_REMARK]
+    more_text = (
         f" and {len(left_out) - MAX_PICTURES_IN_REMARK} more"
         if len(left_out) > MAX_PICTURES_IN_REMARK
         else ""
     )
-    return f" Not learned from: {', '.join(named)}{more}."
+    return f" Not learned from: {', '.join(named_pictures)}{more_text}."
 
 
 def _pictures_text(count: int) -> str:

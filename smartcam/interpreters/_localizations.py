@@ -99,12 +99,12 @@ class LocalizationsInterpreter(PlainInterpreter):
         field_use = _field_use(self.layout.fields)
         self._defaults = repeat(field_use.defaults) if field_use.defaults else None
         self._reorder = field_use.reorder
-        self._z = field_use.z
+        self._z_index = field_use.z_index
         self._scales = field_use.scales
         self._checks = field_use.checks_unused
         self._sigmas = field_use.sigmas
         self._is_unusual = (
-            field_use.z is not None or field_use.checks_unused or field_use.sigmas is not None
+            field_use.z_index is not None or field_use.checks_unused or field_use.sigmas is not None
         )
         self._empty = bytes(self.layout.size)
         self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
@@ -127,13 +127,13 @@ class LocalizationsInterpreter(PlainInterpreter):
             rows = map(operator.concat, rows, self._defaults)
         if self._reorder is not None:
             rows = map(self._reorder, rows)
-        heights = self._heights(data, context) if self._z is not None else None
+        z_values = self._wire_z_values(data, context) if self._z_index is not None else None
         total, skipped, z = 0.0, 0, 0.0
         parts: list[Localization] = []
         try:
             for text, quality, photo_index, x, y, theta in rows:
-                if heights is not None:
-                    z = next(heights)
+                if z_values is not None:
+                    z = next(z_values)
                 if not x and self._is_empty(data, len(parts) + skipped):
                     skipped += 1
                     continue
@@ -193,7 +193,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         if self._scales is not None:
             scales = zip((quality, x, y, theta), *self._scales, strict=False)
             quality, x, y, theta = (
-                [value * by / over for value in column] for column, by, over in scales
+                [value * factor / divisor for value in column] for column, factor, divisor in scales
             )
         if context.y_down:
             # a difference, since a negation would give minus zero
@@ -204,7 +204,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         feature_ids: list[str | None] = list(map(self._names.get, texts))
         if None in feature_ids:
             feature_ids = list(map(self._feature_name, texts))
-        new, none, half = _new_tuple, repeat(0.0), [0.5 * angle for angle in theta]
+        new, zeros, half = _new_tuple, repeat(0.0), [0.5 * angle for angle in theta]
         numbers = range(context.number, context.number + len(counts))
         header_values = zip(
             numbers, repeat(context.received_at), repeat(context.camera), strict=False
@@ -212,8 +212,8 @@ class LocalizationsInterpreter(PlainInterpreter):
         headers: Iterable[Any] = map(new, repeat(Header), header_values)
         if counts.count(1) != len(counts):
             headers = itertools.chain.from_iterable(map(repeat, headers, counts))
-        positions = map(new, repeat(Position), zip(x, y, none, strict=False))
-        quaternions = zip(none, none, map(math.sin, half), map(math.cos, half), strict=False)
+        positions = map(new, repeat(Position), zip(x, y, zeros, strict=False))
+        quaternions = zip(zeros, zeros, map(math.sin, half), map(math.cos, half), strict=False)
         orientations = map(new, repeat(Quaternion), quaternions)
         poses = map(new, repeat(Pose), zip(headers, positions, orientations, strict=True))
         part_values = zip(feature_ids, quality, photo_index, poses, strict=True)
@@ -249,10 +249,10 @@ class LocalizationsInterpreter(PlainInterpreter):
                 result.append(part)
         return result
 
-    def _heights(self, data: bytes, context: Context) -> Iterator[float]:
+    def _wire_z_values(self, data: bytes, context: Context) -> Iterator[float]:
         """Return the values of ``z`` as they are on the wire."""
         rows = self.layout.wire_records(data, context.byte_order)
-        return map(operator.itemgetter(self._z), rows)
+        return map(operator.itemgetter(self._z_index), rows)
 
     def _is_empty(self, data: bytes, number: int) -> bool:
         begin = self.layout.head_size + number * self.layout.size
@@ -282,13 +282,13 @@ def _expectation(field: Field, value: float) -> str:
     return ""
 
 
-class _Use(NamedTuple):
+class _FieldUse(NamedTuple):
     """The use of each field of a record.
 
     Attributes:
         defaults: defaults of the fields that the record lacks, which are appended to its values.
         reorder: function that puts the values into the order of use; None if they are in order.
-        z: index of ``z``; None: the record has no ``z``, as is usual.
+        z_index: index of ``z``; None: the record has no ``z``, as is usual.
         scales: factors that convert the values to SI; None if they are in SI.
         checks_unused: whether unused texts and bools have to be checked, too.
         sigmas: indices of the errors of poses; None: the record has none.
@@ -296,7 +296,7 @@ class _Use(NamedTuple):
 
     defaults: tuple[Any, ...]
     reorder: Callable[[Any], Any] | None
-    z: int | None
+    z_index: int | None
     scales: _Scales | None
     checks_unused: bool
     sigmas: _SigmaUse | None
@@ -311,7 +311,7 @@ class _SigmaUse(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def _field_use(layout: tuple[Field, ...]) -> _Use:
+def _field_use(layout: tuple[Field, ...]) -> _FieldUse:
     """Return the use of each field of a layout's record.
 
     Raises:
@@ -323,7 +323,7 @@ def _field_use(layout: tuple[Field, ...]) -> _Use:
     missing_names = [name for name in _DEFAULTS if name not in fields]
     names = [*fields, *missing_names]
     indices = [names.index(name) for name in _DEFAULTS]
-    return _Use(
+    return _FieldUse(
         tuple(_DEFAULTS[name] for name in missing_names),
         None if indices == [*range(len(names))] else operator.itemgetter(*indices),
         [*fields].index("z") if "z" in fields else None,

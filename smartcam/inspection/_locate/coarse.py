@@ -161,8 +161,8 @@ class PyramidLevel:
         cv2 = load("cv2", "inspection needs")
         across, down = (component.astype(np.float32) for component in self.gradient)
         size = cv2.magnitude(across, down)
-        least = np.float32(self.least_response(contrast))
-        size[size < least] = np.inf
+        min_response = np.float32(self.least_response(contrast))
+        size[size < min_response] = np.inf
         return cv2.divide(across, size), cv2.divide(down, size)
 
     def agreement(self, contrast: float, *, any_polarity: bool) -> list[NDArray[np.uint8]]:
@@ -183,10 +183,10 @@ class PyramidLevel:
         for k in range(direction_count):
             agreement = spread_directions[k] * AGREEMENT[0]
             for apart in (1, 2):
-                both = (
+                both_sides = (
                     spread_directions[(k + apart) % direction_count] | spread_directions[k - apart]
                 )
-                agreement = np.maximum(agreement, both * AGREEMENT[apart])
+                agreement = np.maximum(agreement, both_sides * AGREEMENT[apart])
             agreements.append(agreement)
         return agreements
 
@@ -203,16 +203,16 @@ class PicturePyramid:
         self._levels = [PyramidLevel(grey, noise)]
         self._noise = noise
         self._agreement: dict[tuple[int, float, bool], list[NDArray[np.uint8]]] = {}
-        self._units: dict[tuple[int, float], tuple[NDArray[Any], NDArray[Any]]] = {}
+        self._unit_gradients: dict[tuple[int, float], tuple[NDArray[Any], NDArray[Any]]] = {}
 
     def level(self, number: int) -> PyramidLevel:
         """Return a level; 0 is the picture."""
         cv2 = load("cv2", "inspection needs")
         while len(self._levels) <= number:
-            below = self._levels[-1].grey
+            larger = self._levels[-1].grey
             # the first smaller level has 0.4 of the noise, each further level half of that
             noise = self._noise * (1.0 if number == 0 else 0.4 * 0.5 ** (len(self._levels) - 1))
-            self._levels.append(PyramidLevel(cv2.pyrDown(below), noise))
+            self._levels.append(PyramidLevel(cv2.pyrDown(larger), noise))
         return self._levels[number]
 
     def agreement(
@@ -228,9 +228,9 @@ class PicturePyramid:
     def unit_gradient(self, level: int, contrast: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return a level's gradient with a length of 1."""
         key = level, contrast
-        if key not in self._units:
-            self._units[key] = self.level(level).unit_gradient(contrast)
-        return self._units[key]
+        if key not in self._unit_gradients:
+            self._unit_gradients[key] = self.level(level).unit_gradient(contrast)
+        return self._unit_gradients[key]
 
 
 def find_candidates(
@@ -251,8 +251,8 @@ def find_candidates(
             break
         candidates = _refine_places(pyramid, model, ranges, level, candidates)
         most_kept = max(2 * most + 8, MAX_CANDIDATES >> (2 * (top - level)))
-        least = LOWER_SHARE * ranges.least_score
-        candidates, refused = _keep_best(candidates, least, 2.0**level, most_kept, refused)
+        min_score = LOWER_SHARE * ranges.least_score
+        candidates, refused = _keep_best(candidates, min_score, 2.0**level, most_kept, refused)
     return candidates, refused
 
 
@@ -266,17 +266,19 @@ def _search_top_level(
     points, normals = _thin_out(model.points[top], model.normals[top], MAX_TOP_POINTS)
     points = points / 2**top
     for scale in ranges.list_scales(TOP_STEP_PX / radius).tolist():
-        angles, closed = ranges.list_angles(TOP_STEP_PX / (radius * scale))
+        angles, wraps = ranges.list_angles(TOP_STEP_PX / (radius * scale))
         table = _AgreementTable(maps, math.ceil(radius * scale) + 1)
-        for part in np.array_split(
+        for some_angles in np.array_split(
             angles, max(1, -(-table.bytes * len(angles) // MAX_STACK_BYTES))
         ):
-            stack = table.sums(scale * points, normals, part)
-            least = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
-            closes = closed and len(part) == len(angles)
-            for turn, y, x, total in table.peaks(stack, least, closes=closes):
+            stack = table.sum_agreement(scale * points, normals, some_angles)
+            min_sum = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
+            part_wraps = wraps and len(some_angles) == len(angles)
+            for angle_index, y, x, total in table.find_peaks(stack, min_sum, wraps=part_wraps):
                 score = total / (4 * len(points))
-                yield RoughPlace(x * 2**top, y * 2**top, float(part[turn]), scale, score)
+                yield RoughPlace(
+                    x * 2**top, y * 2**top, float(some_angles[angle_index]), scale, score
+                )
 
 
 class _AgreementTable:
@@ -292,7 +294,7 @@ class _AgreementTable:
         self._flat = [map_.ravel() for map_ in padded]
         self.bytes = self._row_length * self._height
 
-    def sums(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
+    def sum_agreement(self, points: Array, normals: Array, angles: Array) -> NDArray[np.uint8]:
         """Return the summed agreement of all points, (A, H, W), for each angle and place."""
         stack = np.zeros((len(angles), self.bytes), np.uint8)
         count, size = len(self._flat), self.bytes
@@ -310,20 +312,20 @@ class _AgreementTable:
                 add(total, flat[direction_index][start : start + size], total)
         return stack.reshape(len(angles), self._height, self._row_length)
 
-    def peaks(
-        self, stack: NDArray[np.uint8], least: int, *, closes: bool
+    def find_peaks(
+        self, stack: NDArray[np.uint8], min_sum: int, *, wraps: bool
     ) -> list[tuple[int, int, int, int]]:
         """Return the highest peaks as tuples: index of the angle, row, column, and sum."""
         cv2 = load("cv2", "inspection needs")
         flat = stack.reshape(len(stack), -1)
         peaks_found: list[tuple[int, int, int, int]] = []
         neighbourhood = np.ones((3, 3), np.uint8)
-        for angle_index in np.flatnonzero(flat.max(axis=1) >= least).tolist():
-            high_indices = np.flatnonzero(flat[angle_index] >= least)
+        for angle_index in np.flatnonzero(flat.max(axis=1) >= min_sum).tolist():
+            high_indices = np.flatnonzero(flat[angle_index] >= min_sum)
             totals = flat[angle_index][high_indices]
             highest = totals >= cv2.dilate(stack[angle_index], neighbourhood).ravel()[high_indices]
             for other in (angle_index - 1, angle_index + 1):
-                if closes or 0 <= other < len(stack):
+                if wraps or 0 <= other < len(stack):
                     highest &= totals >= flat[other % len(stack)][high_indices]
             high_indices, totals = high_indices[highest], totals[highest]
             rows, columns = np.divmod(high_indices, self._row_length)
@@ -422,26 +424,26 @@ def _score_places(
 
 def _keep_best(
     places: list[RoughPlace],
-    least: float,
-    pixel: float,
+    min_score: float,
+    pixel_size: float,
     most: int,
     refused: RoughPlace | None,
 ) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places without duplicates, and the best place with too low a score."""
     best: list[RoughPlace] = []
     for place in sorted(places, key=lambda place: -place.score):
-        if place.score < least:
+        if place.score < min_score:
             if refused is None or place.score > refused.score:
                 refused = place
             break
         if len(best) == most:
             break
-        if not any(_is_same_place(place, other, pixel) for other in best):
+        if not any(_is_same_place(place, other, pixel_size) for other in best):
             best.append(place)
     return best, refused
 
 
-def _is_same_place(one: RoughPlace, other: RoughPlace, pixel: float) -> bool:
-    is_near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel
-    turned = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
-    return is_near and turned < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1
+def _is_same_place(one: RoughPlace, other: RoughPlace, pixel_size: float) -> bool:
+    is_near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel_size
+    angle_difference = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
+    return is_near and angle_difference < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1
