@@ -130,17 +130,17 @@ class _WindowSums:
         self._ramp = np.arange(side, dtype=np.float32) - side // 2
         self._border = self._cv2.BORDER_CONSTANT
 
-    def __call__(self, values: Field, across: int = 0, down: int = 0) -> Field:
+    def __call__(self, values: Field, x_power: int = 0, y_power: int = 0) -> Field:
         """Return sums of values, each times its offset from the window's middle to a power.
 
-        ``across`` and ``down``: powers of the horizontal and the vertical offset.
+        ``x_power`` and ``y_power``: powers of the horizontal and the vertical offset.
         """
-        if not (across or down):
+        if not (x_power or y_power):
             summed = self._cv2.boxFilter(
                 values, -1, self._side, normalize=False, borderType=self._border
             )
         else:
-            x, y = self._ramp**across, self._ramp**down
+            x, y = self._ramp**x_power, self._ramp**y_power
             summed = self._cv2.sepFilter2D(values, -1, x, y, borderType=self._border)
         return np.asarray(summed, dtype=np.float32)
 
@@ -166,11 +166,13 @@ def _fit_planes(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -
     yy = np.maximum(sums(mask, 0, 2) - y * y / count, 1)
     xy = sums(mask, 1, 1) - x * y / count
     xd, yd = sums(values, 1, 0) - total * x / count, sums(values, 0, 1) - total * y / count
-    scale = np.maximum(xx * yy - xy * xy, 1)
-    across: Field = (yy * xd - xy * yd) / scale
-    down: Field = (xx * yd - xy * xd) / scale
-    residual_squares -= across * xd + down * yd
-    return _DisparityPlane(across, down, np.sqrt(np.maximum(residual_squares, 0) / count), count)
+    determinant = np.maximum(xx * yy - xy * xy, 1)
+    slope_x: Field = (yy * xd - xy * yd) / determinant
+    slope_y: Field = (xx * yd - xy * xd) / determinant
+    residual_squares -= slope_x * xd + slope_y * yd
+    return _DisparityPlane(
+        slope_x, slope_y, np.sqrt(np.maximum(residual_squares, 0) / count), count
+    )
 
 
 class _LinearMatch(NamedTuple):
@@ -308,18 +310,18 @@ def _correlation_factor(fit: _RefinedDisparity, trusted: NDArray[np.bool_]) -> f
     e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))
     height, width = e.shape
 
-    def products(one: Field, other: Field, u: int, v: int) -> float:
+    def lagged_product(one: Field, other: Field, u: int, v: int) -> float:
         first = one[v:, max(u, 0) : width + min(u, 0)]
         second = other[: height - v, max(-u, 0) : width + min(-u, 0)]
         return float(np.einsum("ij,ij->", first, second))
 
-    power = products(e, e, 0, 0) * products(g, g, 0, 0)
+    power = lagged_product(e, e, 0, 0) * lagged_product(g, g, 0, 0)
     if power <= 0:
         return 1.0
     total = 1.0
     for v in range(MAX_NOISE_LAG_PX + 1):
         for u in range(-MAX_NOISE_LAG_PX if v else 1, MAX_NOISE_LAG_PX + 1):
-            both = products(e, e, u, v) * products(g, g, u, v)
-            crossed = products(e, g, u, v) * products(g, e, u, v)
-            total += 2 * (both + crossed) / power
+            direct = lagged_product(e, e, u, v) * lagged_product(g, g, u, v)
+            crossed = lagged_product(e, g, u, v) * lagged_product(g, e, u, v)
+            total += 2 * (direct + crossed) / power
     return max(total, MIN_NOISE_FACTOR)

@@ -153,14 +153,14 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
         ".json",
         ignore_names(samples.parse_json),
         samples.compose_json,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
     "moveit_yaml": Format(
         "samples of MoveIt's hand-eye panel, YAML",
         ".yaml",
         ignore_names(samples.parse_yaml),
         samples.compose_yaml,
-        most=MAX_YAML_BYTES,
+        max_bytes=MAX_YAML_BYTES,
     ),
 }
 """Formats of samples of a hand-eye calibration; these formats have no names of frames."""
@@ -171,14 +171,14 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_asl,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
     "euroc": Format(
         "EuRoC: nanoseconds, the quaternion's real part first",
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_euroc,
-        most=MAX_FILE_BYTES,
+        max_bytes=MAX_FILE_BYTES,
     ),
 }
 """Formats of poses over time; both are read in the same way: the file's header tells them apart."""
@@ -323,4 +323,4 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"
     )
-    return file_format.head + comment + file_format.text(transform)
+    return file_format.head + comment + file_format.to_text(transform)

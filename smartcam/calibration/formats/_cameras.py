@@ -464,7 +464,9 @@ def _camera_format(
     parse: Callable[..., CameraChain | UnscaledValue[CameraChain]],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE_BYTES)
+    return Format(
+        title=name, suffix=".yaml", parse=parse, compose=compose, max_bytes=MAX_FILE_BYTES
+    )
 
 
 def _foreign_format(
@@ -500,7 +502,7 @@ FORMS: Final[Mapping[str, Format[CameraChain]]] = {
     "ros_ini": _foreign_format("ros_ini", foreign.parse_ros_ini),
     "euroc": _foreign_format("euroc", foreign.parse_euroc),
     "mrcal": dataclasses.replace(
-        _foreign_format("mrcal", foreign.parse_mrcal), most=MAX_MRCAL_BYTES
+        _foreign_format("mrcal", foreign.parse_mrcal), max_bytes=MAX_MRCAL_BYTES
     ),
     "colmap": _foreign_format("colmap", foreign.parse_colmap),
     "basalt": _foreign_format("basalt", foreign.parse_basalt),

@@ -56,7 +56,7 @@ class Format(Generic[T]):
     # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
     compose: Callable[[T], str] | None = None
     head: str = ""  # text at the beginning of each file
-    most: int = MAX_TEXT_BYTES  # largest number of bytes of a file
+    max_bytes: int = MAX_TEXT_BYTES  # largest size of a file
 
     def read(
         self,
@@ -69,10 +69,10 @@ class Format(Generic[T]):
         ``unit``: unit of the file's lengths; None for the unit that the file or its format names.
         """
         with Path(path).open("rb") as stream:
-            body = stream.read(self.most + 1)
+            body = stream.read(self.max_bytes + 1)
         try:
-            if len(body) > self.most:
-                raise malformed_error("file", f"{self.most} bytes at most")
+            if len(body) > self.max_bytes:
+                raise malformed_error("file", f"{self.max_bytes} bytes at most")
             try:
                 text = body.decode("utf-8-sig")
             except UnicodeDecodeError as exc:
@@ -101,9 +101,9 @@ class Format(Generic[T]):
 
     def write(self, path: str | os.PathLike[str], value: T) -> None:
         """Write a file, whole or not at all; errors are those of ``compose``, and NOT_WRITTEN."""
-        replace_file(Path(path), (self.head + self.text(value)).encode())
+        replace_file(Path(path), (self.head + self.to_text(value)).encode())
 
-    def text(self, value: T) -> str:
+    def to_text(self, value: T) -> str:
         """Return a value as text, without ``head``; raise UNKNOWN_FORMAT if it can only be read."""
         if self.compose is None:
             raise Code.UNKNOWN_FORMAT.refusal(

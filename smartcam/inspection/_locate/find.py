@@ -126,11 +126,11 @@ class Located:
 
     Attributes:
         parts: found parts, the best first.
-        nearest: best refused part; None: there was no candidate.
+        best_refused: best refused part; None: there was no candidate.
     """
 
     parts: tuple[LocatedPart, ...]
-    nearest: LocatedPart | None
+    best_refused: LocatedPart | None
 
 
 def locate(
@@ -206,17 +206,19 @@ class _SearchedPicture:
         refused_parts = (
             []
             if refused_place is None
-            else [_refused_part(model, self._in_picture(refused_place), search, "")]
+            else [_make_refused_part(model, self._in_picture(refused_place), search, "")]
         )
         parts: list[LocatedPart] = []
         for index, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
             place = self._in_picture(candidate)
             if time.monotonic() > deadline and index:
                 refused_parts.append(
-                    _refused_part(model, place, search, "there was no time left to look at it")
+                    _make_refused_part(model, place, search, "there was no time left to look at it")
                 )
                 break
-            if _is_enough(parts, place, search) or any(_is_near(place, other) for other in parts):
+            if _cannot_improve(parts, place, search) or any(
+                _is_near(place, other) for other in parts
+            ):
                 continue
             part = self._judge_candidate(model, place, search, allowed)
             if part.refusal:
@@ -252,8 +254,8 @@ class _SearchedPicture:
         start = PixelPose(place.x, place.y, place.angle, place.scale)
         fine = self._fit(model, start, search)
         if fine is None:
-            return _refused_part(model, place, search, "too few of its edges agree on a pose")
-        part = _located_part(model, fine)
+            return _make_refused_part(model, place, search, "too few of its edges agree on a pose")
+        part = _make_located_part(model, fine)
         pose = part.pose
         refusal = ""
         if part.score < search.least_score:
@@ -308,7 +310,7 @@ def least_contrasts(model: PartModel, search: PartSearch) -> Array:
     return np.maximum(MIN_CONTRAST, CONTRAST_SHARE * heights)
 
 
-def _located_part(model: PartModel, fine: FinePose) -> LocatedPart:
+def _make_located_part(model: PartModel, fine: FinePose) -> LocatedPart:
     pose = fine.pose
     if model.symmetry.fold == 0:
         pose = pose._replace(angle=0.0)
@@ -345,7 +347,9 @@ def _low_score_text(score: float, fine: FinePose, search: PartSearch) -> str:
     return text
 
 
-def _refused_part(model: PartModel, place: RoughPlace, search: PartSearch, why: str) -> LocatedPart:
+def _make_refused_part(
+    model: PartModel, place: RoughPlace, search: PartSearch, reason: str
+) -> LocatedPart:
     pose = PixelPose(
         place.x, place.y, math.remainder(place.angle, model.symmetry.period), place.scale
     )
@@ -354,7 +358,7 @@ def _refused_part(model: PartModel, place: RoughPlace, search: PartSearch, why: 
         pose=pose,
         covariance=np.full((4, 4), np.nan),
         score=place.score,
-        refusal=why
+        refusal=reason
         or f"about {100 * place.score:.0f} % of its edges agree, expected "
         f"{100 * search.least_score:.0f} %",
         hull=pose.to_picture(model.hull),
@@ -377,8 +381,8 @@ def _is_in_scales(pose: PixelPose, search: PartSearch) -> bool:
     return least * (1 - margin) <= pose.scale <= most * (1 + margin)
 
 
-def _is_enough(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
-    """Return True if the wanted parts were found, and a place cannot be better than they are."""
+def _cannot_improve(parts: Sequence[LocatedPart], place: RoughPlace, search: PartSearch) -> bool:
+    """Return True if enough parts were found, and a place cannot be better than they are."""
     best = sorted(part.score for part in parts)[-search.most :]
     return len(best) == search.most and place.score < best[0] - SCORE_MARGIN
 

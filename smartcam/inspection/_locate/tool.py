@@ -180,13 +180,13 @@ class Locate(Tool[LocateSettings]):
     def _complaint(self, located: Located, poses: list[PlanePose]) -> str:
         """Return the reason why the found parts are not ok; "" if they are ok."""
         least, most = self._count_limits
-        count, nearest = len(located.parts), located.nearest
+        count, best_refused = len(located.parts), located.best_refused
         if not least <= count <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
             wanted = f"{least} or more" if self.settings.count is None else wanted
             text = f"{count} found, expected {wanted}"
             if count < least:
-                text += _refusal_text(nearest, len(self.models) > 1)
+                text += _refusal_text(best_refused, len(self.models) > 1)
             return text
         for part, pose in zip(located.parts, poses, strict=True):
             if part.doubt:
@@ -202,10 +202,10 @@ class Locate(Tool[LocateSettings]):
         marks = [Drawing("polygon", _points(view.region.corners), "region")]
         for part in located.parts:
             marks += _marks(part, "wrong" if wrong else "found")
-        if not located.parts and located.nearest is not None:
-            nearest_part = located.nearest
-            text = f"{nearest_part.name}: {100 * nearest_part.score:.0f} %"
-            marks.append(Drawing("polygon", _points(nearest_part.hull), "hint", text))
+        if not located.parts and located.best_refused is not None:
+            refused = located.best_refused
+            text = f"{refused.name}: {100 * refused.score:.0f} %"
+            marks.append(Drawing("polygon", _points(refused.hull), "hint", text))
         return marks
 
 
@@ -246,16 +246,18 @@ def _record(part: LocatedPart, pose: PlanePose, unit: str) -> dict[str, Any]:
 
 def _result_values(located: Located) -> dict[str, Any]:
     best = located.parts[0].score if located.parts else None
-    if best is None and located.nearest is not None:
-        best = located.nearest.score
+    if best is None and located.best_refused is not None:
+        best = located.best_refused.score
     return {"count": len(located.parts), "best_score": 0.0 if best is None else best}
 
 
-def _refusal_text(nearest: LocatedPart | None, with_name: bool) -> str:
-    if nearest is None:
+def _refusal_text(best_refused: LocatedPart | None, with_name: bool) -> str:
+    if best_refused is None:
         return "; nothing in the picture resembles it"
-    name = f"{nearest.name} " if with_name else ""
-    return f"; {name}at {nearest.pose.x:.0f}, {nearest.pose.y:.0f}: {nearest.refusal}"
+    name = f"{best_refused.name} " if with_name else ""
+    return (
+        f"; {name}at {best_refused.pose.x:.0f}, {best_refused.pose.y:.0f}: {best_refused.refusal}"
+    )
 
 
 def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
