@@ -22,7 +22,7 @@ import numpy as np
 
 from smartcam.calibration._files.store import replace_file
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.calibration.formats import _foreign_format as foreign
+from smartcam.calibration.formats import _foreign as foreign
 from smartcam.calibration.formats._file_format import MAX_FILE_BYTES as MAX_MRCAL_BYTES
 from smartcam.calibration.formats._file_format import Format, UnscaledValue
 from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix

@@ -22,8 +22,8 @@ from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
 from smartcam.calibration._hand_eye.closed_forms import MIN_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
 from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
-from smartcam.calibration._named_views import TargetView
 from smartcam.calibration._verdict import VIEW_CURES, Judgement, refused
+from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
     MAX_PREVIEW_BYTES,

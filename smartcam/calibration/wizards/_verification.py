@@ -17,7 +17,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._plane.calibration import STALE_LEVEL, PlaneCalibration
-from smartcam.calibration._verdict_step import CalibrationVerdict
+from smartcam.calibration._verdict import CalibrationVerdict
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MarkCamera
 from smartcam.calibration.wizards._sequence import Wizard, ask

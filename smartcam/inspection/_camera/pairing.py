@@ -53,14 +53,13 @@ class JudgedResults(Observer):
         *,
         max_kept: int = MAX_PICTURES_KEPT,
     ) -> None:
-        self._get_session, self._received, self._on_found = session, received, on_found
+        self._get_session, self._count_received, self._on_found = session, received, on_found
         self._max_kept = max_kept
         self._session_number = 0  # 0: no session
         self._sent_count = 0  # number of containers sent in the session
         self._report: LastReport | None = None
-        self._received_before = (
-            0  # number of containers that the client received before the session
-        )
+        # number of containers that the client received before the session
+        self._received_before = 0
         self._pending: dict[int, _SentContainer] = {}  # containers by their count in the session
         self._judged: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
@@ -81,7 +80,7 @@ class JudgedResults(Observer):
     def on_state(self, event: CameraEvent) -> None:
         """Restart the count with each session."""
         if isinstance(event, (Connected, Reconnected)):
-            self._received_before = self._received()
+            self._received_before = self._count_received()
         elif isinstance(event, Disconnected):
             self._pending.clear()
 
