@@ -417,34 +417,34 @@ class ThesisCalibration:
         save_to = self._files.folder.calibration
         can_read_robot = bool(sequence.start_request.tf_frame_robot_tcp)
 
-        async def take() -> Any:
+        async def take_picture() -> Any:
             return await self._take_picture(sequence, source)
 
-        async def tip() -> Pose:
+        async def read_tip_pose() -> Pose:
             tip = await self._read_robot_pose(sequence, None)
             return replace(tip, at=tip.at or datetime.now(UTC)).pose()
 
-        async def flange() -> Transform:
+        async def read_flange_pose() -> Transform:
             return await self._read_robot_pose(sequence, sequence.picture_time)
 
         if not fixed:
             return hand_eye_wizard(
-                take_picture=take,
+                take_picture=take_picture,
                 save_to=save_to,
-                read_robot=flange if can_read_robot else None,
+                read_robot=read_flange_pose if can_read_robot else None,
                 camera=lens,
             )
         if source != SMARTCAMERA:
             return sheet_wizard(
-                take_picture=take,
+                take_picture=take_picture,
                 save_to=save_to,
-                read_robot=tip if can_read_robot else None,
+                read_robot=read_tip_pose if can_read_robot else None,
                 camera=lens,
             )
         return plane_wizard(
             localize=self._localize,
             save_to=save_to,
-            read_robot=tip if can_read_robot else None,
+            read_robot=read_tip_pose if can_read_robot else None,
             y_down=None if self._camera is None else self._camera.y_down,
         )
 

@@ -105,12 +105,12 @@ def fit_on_ground(
     values, inverse, variances, freedoms = _solve_bands(
         np.stack(columns), pixels, np.column_stack(priors)
     )
-    good = variances > 0
-    heights = np.where(good, values[:, 1], 0.0)
+    is_usable = variances > 0
+    heights = np.where(is_usable, values[:, 1], 0.0)
     safe_heights = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
-    infinite = np.where(good, 0.0, np.inf)
+    infinite = np.where(is_usable, 0.0, np.inf)
     return StepFit(
-        np.where(good, -values[:, 2] / safe_heights, 0.0),
+        np.where(is_usable, -values[:, 2] / safe_heights, 0.0),
         np.sqrt(np.maximum(inverse[:, 2, 2], 0.0)) / np.abs(safe_heights) + infinite,
         heights,
         np.sqrt(np.maximum(inverse[:, 1, 1], 0.0)) + infinite,
@@ -166,6 +166,6 @@ def _solve_bands(
     residual_squares = np.bincount(owners, (levels - fitted) ** 2, count)
     fitted_count: Array = size - (np.diagonal(inverse, axis1=1, axis2=2) * priors).sum(axis=1)
     freedoms = pixel_counts - fitted_count
-    good = (pixel_counts >= MIN_BAND_PIXELS) & (freedoms >= 2)
-    variances: Array = np.where(good, residual_squares / np.maximum(freedoms, 1.0), 0.0)
+    is_usable = (pixel_counts >= MIN_BAND_PIXELS) & (freedoms >= 2)
+    variances: Array = np.where(is_usable, residual_squares / np.maximum(freedoms, 1.0), 0.0)
     return values, inverse, variances, np.maximum(freedoms, 1.0)

@@ -221,9 +221,9 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     is_usable = (pixel_counts >= MIN_BAND_PIXELS) & (
         determinant > 1e-9 * np.maximum(rr * ss, 1e-12)
     )
-    det = np.where(is_usable, determinant, 1.0)
-    heights = np.where(is_usable, (ss * ry - rs * sy) / det, 0.0)
-    slope_values = np.where(is_usable, (rr * sy - rs * ry) / det, 0.0)
+    safe_determinant = np.where(is_usable, determinant, 1.0)
+    heights = np.where(is_usable, (ss * ry - rs * sy) / safe_determinant, 0.0)
+    slope_values = np.where(is_usable, (rr * sy - rs * ry) / safe_determinant, 0.0)
     residual_squares = np.maximum(yy - heights * ry - slope_values * sy, 0.0)
     freedoms = np.maximum(pixel_counts - 3.0, 1.0)
     variances = np.maximum(residual_squares / freedoms, ROUNDING**2)
@@ -231,16 +231,18 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
     infinite = np.where(is_usable, 0.0, np.inf)
     # eliminate heights and shifts from the effect of a wider blur and from the pixels
     wr, ws = sums(widen, rise), sums(widen, slope)
-    square = sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / det
+    square = (
+        sums(widen, widen) - (ss * wr * wr - 2 * rs * wr * ws + rr * ws * ws) / safe_determinant
+    )
     grown = sums(widen, levels) - heights * wr - slope_values * ws
     weights = np.where(is_usable, 1 / variances, 0.0)
     weights[np.abs(heights) < np.median(np.abs(heights))] = 0.0
     total = float((weights * heights**2 * square).sum())
     return StepFit(
         -slope_values / safe_heights,
-        np.sqrt(np.maximum(rr / det, 0.0)) / np.abs(safe_heights) + infinite,
+        np.sqrt(np.maximum(rr / safe_determinant, 0.0)) / np.abs(safe_heights) + infinite,
         heights,
-        np.sqrt(np.maximum(ss / det, 0.0)) + infinite,
+        np.sqrt(np.maximum(ss / safe_determinant, 0.0)) + infinite,
         variances,
         freedoms,
         -float((weights * heights * grown).sum()) / total if total > 0 else 0.0,

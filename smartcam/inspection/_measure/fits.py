@@ -120,42 +120,50 @@ def fit_circle(edges: Edges, used: Mask | None = None) -> CurveFit[Circle]:
 def _fit_robustly(
     edges: Edges,
     used: Mask | None,
-    through: Callable[[Array], Array],
+    curves_through: Callable[[Array], Array],
     fit: Callable[[Edges, Array], tuple[CurveT, Array]],
     min_edges: int,
 ) -> CurveFit[CurveT]:
-    """Return a robust fit; ``through`` computes H shapes (H, 3) from points (H, min_edges, 2)."""
-    number = len(edges.points)
-    if number <= min_edges:
-        text = f"{number} edges, more than {min_edges} are needed"
+    """Return a robust fit.
+
+    ``curves_through`` computes H curves (H, 3) from points (H, min_edges, 2).
+    """
+    edge_count = len(edges.points)
+    if edge_count <= min_edges:
+        text = f"{edge_count} edges, more than {min_edges} are needed"
         raise NotMeasuredError(NoValueReason.FEW_EDGES, text)
     if used is not None:
         return _fit_inliers(
-            edges, used, fit, _best_start(edges.selected(used), through, min_edges), min_edges
+            edges,
+            used,
+            fit,
+            _best_start(edges.selected(used), curves_through, min_edges),
+            min_edges,
         )
-    start = _best_start(edges, through, min_edges)
-    all_edges = np.ones(number, dtype=np.bool_)
+    start = _best_start(edges, curves_through, min_edges)
+    all_edges = np.ones(edge_count, dtype=np.bool_)
     fitted = _fit_inliers(edges, all_edges, fit, start, min_edges)
     deviations = np.abs(fitted.residuals) / edges.sigmas
     if fitted.excess == 1.0 and deviations.max() <= OUTLIER_SIGMAS:
         return fitted
     # outliers of the start may be inliers of the fit
     deviations = np.abs(_distances(start[None], edges)[0]) / edges.sigmas
-    agree = deviations <= OUTLIER_SIGMAS * max(
-        1.4826 * (1 + 5 / (number - min_edges)) * float(np.median(deviations)), 1.0
+    inliers = deviations <= OUTLIER_SIGMAS * max(
+        1.4826 * (1 + 5 / (edge_count - min_edges)) * float(np.median(deviations)), 1.0
     )
     seen_masks = set()
     for _ in range(MAX_ROUNDS):
-        if np.count_nonzero(agree) < max(min_edges, math.ceil((1 - MAX_OUTLIER_SHARE) * number)):
-            text = f"{np.count_nonzero(agree)} of {number} edges agree, half of them are needed"
+        count = np.count_nonzero(inliers)
+        if count < max(min_edges, math.ceil((1 - MAX_OUTLIER_SHARE) * edge_count)):
+            text = f"{count} of {edge_count} edges agree, half of them are needed"
             raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
-        fitted = _fit_inliers(edges, agree, fit, start, min_edges)
+        fitted = _fit_inliers(edges, inliers, fit, start, min_edges)
         deviations = np.abs(fitted.residuals) / edges.sigmas
-        next_agree = deviations <= OUTLIER_SIGMAS * _spread(deviations[agree])
-        if (next_agree == agree).all() or next_agree.tobytes() in seen_masks:
+        next_inliers = deviations <= OUTLIER_SIGMAS * _spread(deviations[inliers])
+        if (next_inliers == inliers).all() or next_inliers.tobytes() in seen_masks:
             break
-        seen_masks.add(agree.tobytes())
-        agree = next_agree
+        seen_masks.add(inliers.tobytes())
+        inliers = next_inliers
     return fitted
 
 
@@ -188,17 +196,17 @@ def _fit_inliers(
     return CurveFit(curve, used, residuals, excess)
 
 
-def _best_start(edges: Edges, through: Callable[[Array], Array], min_edges: int) -> Array:
-    """Return the shape (3,) with the least median residual, in sigmas."""
-    number = len(edges.points)
-    if math.comb(number, min_edges) <= MAX_STARTS:
-        samples = np.array(list(itertools.combinations(range(number), min_edges)))
+def _best_start(edges: Edges, curves_through: Callable[[Array], Array], min_edges: int) -> Array:
+    """Return the curve (3,) with the least median residual, in sigmas."""
+    edge_count = len(edges.points)
+    if math.comb(edge_count, min_edges) <= MAX_STARTS:
+        samples = np.array(list(itertools.combinations(range(edge_count), min_edges)))
     else:
         # a fixed seed, so that results are repeatable; each edge comes from another section
-        generator = np.random.default_rng(number)
-        samples = np.argsort(generator.random((MAX_STARTS, number)), axis=1)[:, :min_edges]
+        generator = np.random.default_rng(edge_count)
+        samples = np.argsort(generator.random((MAX_STARTS, edge_count)), axis=1)[:, :min_edges]
     with np.errstate(all="ignore"):
-        values = through(edges.points[samples])
+        values = curves_through(edges.points[samples])
         deviations = np.abs(_distances(values, edges)) / edges.sigmas
         median = np.median(deviations, axis=1)
     median = np.where(np.isfinite(median), median, np.inf)
@@ -210,22 +218,22 @@ def _best_start(edges: Edges, through: Callable[[Array], Array], min_edges: int)
 
 
 def _distances(values: Array, edges: Edges) -> Array:
-    """Return the distances (H, N) of edges from H shapes along the edges' normals.
+    """Return the distances (H, N) of edges from H curves along the edges' normals.
 
     ``values`` (H, 3): for lines the angle of the unit normal, the offset along it and NaN; for
     circles the centre and the radius.
     """
     points, normals = edges.points, edges.normals
     first, second, third = values.T[:, :, None]
-    lines = np.isnan(third)
+    is_line = np.isnan(third)
     normal = np.stack([np.cos(first), np.sin(first)], axis=-1)
     offsets = points[None] - np.stack([first, second], axis=-1)
     radii = np.hypot(offsets[..., 0], offsets[..., 1])
     curve_normals = np.where(
-        lines[..., None], normal, offsets / np.maximum(radii, 1e-12)[..., None]
+        is_line[..., None], normal, offsets / np.maximum(radii, 1e-12)[..., None]
     )
     offsets_from_curve = np.where(
-        lines, (normal * points[None]).sum(axis=-1) - second, radii - third
+        is_line, (normal * points[None]).sum(axis=-1) - second, radii - third
     )
     cosines = np.abs((curve_normals * normals[None]).sum(axis=-1))
     distances: Array = offsets_from_curve / np.maximum(cosines, 0.1)

@@ -179,13 +179,13 @@ class _EdgeFinder:
         self.reference = view.reference
         self._image = view.picture.levels
         self._top = 2**view.picture.depth - 1
-        self._ends = view.picture.ends
+        self._saturation_levels = view.picture.ends
         self._clipped = view.picture.clipped
         self._regions: list[Array] = []  # corners of each region
         self._edges: list[Array] = []
         self._left_out: list[Array] = []
         self._missed: list[str] = []
-        self._shapes: list[Array] = []
+        self._curves: list[Array] = []
 
     def to_picture(self, places: object) -> Array:
         """Convert coordinates of the settings to the picture's pixels."""
@@ -197,8 +197,8 @@ class _EdgeFinder:
             smoothing=search.smoothing,
             contrast=search.contrast * self._top / 255,
             most_blur=search.blur,
-            black=float(self._ends[0]),
-            white=float(self._ends[1]),
+            black=float(self._saturation_levels[0]),
+            white=float(self._saturation_levels[1]),
             cut_off=search.cut_off,
             clipped=self._clipped,
         )
@@ -245,7 +245,7 @@ class _EdgeFinder:
         )
         fit = fit_line_in_plane(found_line, ends, PIXELS)
         line = fit.curve
-        self._shapes.append(line.to_picture + np.outer([-line.reach, line.reach], line.direction))
+        self._curves.append(line.to_picture + np.outer([-line.reach, line.reach], line.direction))
         self._add_details(found_line, fit)
         return found_line, fit
 
@@ -270,7 +270,7 @@ class _EdgeFinder:
         )
         circle = circle._replace(inliers=fit_circle_in_plane(circle, self.plane).inliers)
         fit = fit_circle_in_plane(circle, PIXELS)
-        self._shapes.append(fit.curve.centre + fit.curve.radius * rim)
+        self._curves.append(fit.curve.centre + fit.curve.radius * rim)
         self._add_details(circle, fit)
         return circle, fit
 
@@ -280,13 +280,13 @@ class _EdgeFinder:
         self._missed += map(str, curve_edges.troubles)
 
     def details(
-        self, found_value: Value | None, unit: str, why: NoValueReason | None
+        self, found_value: Value | None, unit: str, reason: NoValueReason | None
     ) -> Measurement:
         """Return the details of the measurement."""
         no_places = [np.zeros((0, 2))]
         value, sigma = (math.nan, math.nan) if found_value is None else found_value
         return Measurement(
-            trouble=why,
+            trouble=reason,
             value=value,
             sigma=sigma,
             unit=unit,
@@ -304,7 +304,7 @@ class _EdgeFinder:
         marks += [
             Drawing("points", _corners(edges), "hint") for edges in self._left_out if len(edges)
         ]
-        marks += [Drawing("line", _corners(shape), role) for shape in self._shapes]
+        marks += [Drawing("line", _corners(curve), role) for curve in self._curves]
         if text and self._edges:
             marks.append(Drawing("text", _corners(self._edges[0][:1]), role, text))
         return marks
@@ -342,7 +342,7 @@ def _edge(finder: _EdgeFinder, search: Across) -> _MeasuredValue:
     edge = finder.edge(search)
     start = finder.to_picture(search.across[0])
 
-    def place(plane: Plane) -> Value:
+    def edge_place(plane: Plane) -> Value:
         point = point_in_plane(edge, plane)
         offset = point.position - plane.map_points(start[None])[0]
         length = max(math.hypot(*offset), 1e-12)
@@ -350,7 +350,9 @@ def _edge(finder: _EdgeFinder, search: Across) -> _MeasuredValue:
 
     x, y = edge.pixel.tolist()
     pose = _pose(edge.pixel, edge.strip.directions[0])
-    return _MeasuredValue(measure_with_calibration(place, finder.plane), {"x": x, "y": y}, pose)
+    return _MeasuredValue(
+        measure_with_calibration(edge_place, finder.plane), {"x": x, "y": y}, pose
+    )
 
 
 def _line(finder: _EdgeFinder, search: LineSearch) -> _MeasuredValue:
@@ -358,10 +360,10 @@ def _line(finder: _EdgeFinder, search: LineSearch) -> _MeasuredValue:
     ends, line = finder.to_picture(search.along), fit.curve
     axis = np.array([math.cos(finder.reference.angle), math.sin(finder.reference.angle)])
 
-    def turned(plane: Plane) -> Value:
+    def line_angle(plane: Plane) -> Value:
         return direction(fit_line_in_plane(found_line, ends, plane).curve, line.middle, axis, plane)
 
-    value = measure_with_calibration(turned, finder.plane)
+    value = measure_with_calibration(line_angle, finder.plane)
     return _MeasuredValue(
         value, _position_fields(line.middle, fit), _pose(line.middle, line.direction)
     )
