@@ -274,8 +274,8 @@ class PartModel:
         noise_factor = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
         sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else noise_factor)
         arms, normals = self.segments.middles, self.segments.normals
-        turned = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
-        rows = np.column_stack([normals, turned]) / sigmas[:, None]
+        torques = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
+        rows = np.column_stack([normals, torques]) / sigmas[:, None]
         parameter_count = 2 if self.symmetry.fold == 0 else 3
         covariance = np.linalg.inv(rows[:, :parameter_count].T @ rows[:, :parameter_count])
         worst = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
@@ -314,9 +314,9 @@ class PartModel:
         """Polygons (K, 2) to be drawn, within a pixel of the edges, the longest first."""
         cv2 = load("cv2", "inspection needs")
         low = np.floor(self.outline.min(axis=0)).astype(int) - 3
-        at = np.rint(self.outline - low).astype(int)
-        mask = np.zeros(at.max(axis=0)[::-1] + 4, np.uint8)
-        mask[at[:, 1], at[:, 0]] = 1
+        pixels = np.rint(self.outline - low).astype(int)
+        mask = np.zeros(pixels.max(axis=0)[::-1] + 4, np.uint8)
+        mask[pixels[:, 1], pixels[:, 0]] = 1
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         contours, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         outer = [

@@ -66,7 +66,8 @@ class Locate(Tool[LocateSettings]):
 
     def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
         super().__init__(settings, setup)
-        load("scipy.special", "locate needs")  # now: not with the first picture
+        # loaded now, since the first picture should not wait for it
+        load("scipy.special", "locate needs")
         self.models = [PartModel.read(setup.folder / model) for model in settings.models]
         if settings.taught is not None:
             file = setup.folder / settings.taught
@@ -86,8 +87,8 @@ class Locate(Tool[LocateSettings]):
         for model in self.models:  # computed here, so that the first picture takes no longer
             _ = model.bands_at(settings.scale[0]), model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
-        calibrated = kind in {"plane", "sheet"}
-        self._plane = robot_plane(setup.calibration) if calibrated else PIXELS
+        has_plane = kind in {"plane", "sheet"}
+        self._plane = robot_plane(setup.calibration) if has_plane else PIXELS
         self._search = PartSearch(
             angles=settings.angles,
             scales=settings.scale,
@@ -271,8 +272,8 @@ def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
         for number, contour in enumerate(part.contours or (part.hull,))
     ]
     marks.append(Drawing("line", _points(axes), role))
-    shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
-    for places, role_of_places in shown:
+    groups: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
+    for places, role_of_places in groups:
         if len(places):
             chosen = (
                 np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
