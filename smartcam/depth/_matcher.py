@@ -57,9 +57,7 @@ class _WholeParameter(NamedTuple):
 
     def __str__(self) -> str:
         step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
-        return (
-            f"{self.low} to {self.high}{step.get(self.every, f', a multiple of {self.multiple}')}"
-        )
+        return f"{self.low} to {self.high}{step.get(self.multiple, f', a multiple of {self.multiple}')}"
 
     def check(self, value: object) -> int | None:
         """Return a value for OpenCV; None if it is not allowed."""

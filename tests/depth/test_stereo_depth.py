@@ -329,7 +329,7 @@ def test_the_sigma_of_the_calibration_is_in_that_of_the_depth() -> None:
         found.append(z - (points @ turns[0].T)[:, 2])
     whole = np.zeros((SIZE[1], SIZE[0]), np.float32)
     whole[spots[:, 1], spots[:, 0]] = depth
-    told = made(CHAIN, covariance).sigma(whole, np.zeros_like(whole))
+    told = made(CHAIN, covariance).depth_sigma(whole, np.zeros_like(whole))
     np.testing.assert_allclose(told[spots[:, 1], spots[:, 0]], np.std(found, axis=0), rtol=0.02)
 
 

@@ -146,7 +146,7 @@ class Edge(NamedTuple):
     # (K + 1, K + 1), covariance for noise of one grey level of the places of K edges, which were
     # fitted together, and of their tilt; the K edges share this array
     unit_covariance: Array
-    index: int  # index of the edge among the K edges
+    row: int  # row of the edge in the covariance
     noise: float  # standard deviation of the pixels about the fit, grey levels
     height: float  # grey levels after minus before the edge
     blur: float  # standard deviation of the lens' blur, pixels
@@ -161,7 +161,7 @@ class Edge(NamedTuple):
     @property
     def unit_sigma(self) -> float:
         """Standard deviation of the place for noise of one grey level, pixels."""
-        return math.sqrt(float(self.unit_covariance[self.index, self.index]))
+        return math.sqrt(float(self.unit_covariance[self.row, self.row]))
 
 
 class JudgedEdge(NamedTuple):

@@ -245,7 +245,7 @@ class _EdgeFinder:
         )
         fit = fit_line_in_plane(found_line, ends, PIXELS)
         line = fit.curve
-        self._curves.append(line.to_picture + np.outer([-line.reach, line.reach], line.direction))
+        self._curves.append(line.middle + np.outer([-line.reach, line.reach], line.direction))
         self._add_details(found_line, fit)
         return found_line, fit
 

@@ -157,7 +157,7 @@ def _joint_parameters(first: FoundPoint, second: FoundPoint) -> tuple[Array, Arr
     for i, edge in enumerate(edges):
         for j, other in enumerate(edges):
             if i == j or share_fit:
-                rows, columns = [edge.index, -1], [other.index, -1]
+                rows, columns = [edge.row, -1], [other.row, -1]
                 part = edge.unit_covariance[np.ix_(rows, columns)] * edge.noise * other.noise
                 covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = part
     return values, covariance
