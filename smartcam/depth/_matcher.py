@@ -56,8 +56,9 @@ class _WholeParameter(NamedTuple):
     multiple: int = 1  # values are ``low`` plus a multiple of this number
 
     def __str__(self) -> str:
-        step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
-        return f"{self.low} to {self.high}{step.get(self.multiple, f', a multiple of {self.multiple}')}"
+        other_step = f", a multiple of {self.multiple}"
+        step = {1: "", 2: ", odd" if self.low % 2 else ", even"}.get(self.multiple, other_step)
+        return f"{self.low} to {self.high}{step}"
 
     def check(self, value: object) -> int | None:
         """Return a value for OpenCV; None if it is not allowed."""

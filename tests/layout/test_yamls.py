@@ -120,7 +120,7 @@ def test_scenario_with_many_mistakes_tells_some(
         asked.append(given)
         return meant(*given)
 
-    monkeypatch.setattr(yaml_files, "_meant", counted)
+    monkeypatch.setattr(yaml_files, "_field_hint", counted)
     path = tmp_path / "a.yaml"
     path.write_text("".join(f"no{n}: 1\n" for n in range(500)))
     with pytest.raises(ConfigurationError, match="no0"):
