@@ -218,7 +218,7 @@ class Interpreter(ABC):
     """Text of the layout that is used if the user gives no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
-    """``none`` if a layout must not be given, ``optional`` if it may be, ``required`` if it must be."""
+    """``none``: no layout must be given; ``optional``: one may be; ``required``: one must be."""
 
     def __init__(self, layout: Layout | None = None) -> None:
         name = type(self).__name__.removesuffix("Interpreter").lower()
